@@ -1,0 +1,30 @@
+"""Error room: the one family of errors a user is meant to read, each naming the culprit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class LccError(Exception):
+    """Base of every error caused by input: a file, a row, a key or an option."""
+
+
+class DataError(LccError, ValueError):
+    """A trajectory, profile or driver file is not what was expected."""
+
+
+class ConfigError(LccError, ValueError):
+    """A setting is unknown, impossible or contradicts another setting."""
+
+
+class ResultsError(LccError, RuntimeError):
+    """A result, policy or checkpoint file is missing, damaged or of another version."""
+
+
+def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
+    """Build the error for an unknown name, listing the valid ones and the nearest."""
+    options = sorted(valid)
+    near = get_close_matches(name, options, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options)}.{hint}")

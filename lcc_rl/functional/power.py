@@ -1,0 +1,84 @@
+"""Motor power, energy and traction force of the controlled car (A1–A2, Table I)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Table I of the ALCC paper: the car whose longitudinal dynamics A1 describes.
+
+    Args:
+        mass: mass m [kg].
+        drag_coefficient: air drag coefficient C_D.
+        frontal_area: frontal area A_f [m²].
+        rolling_resistance: rolling resistance coefficient f.
+        air_density: density of air ρ [kg/m³].
+        gravity: gravitational acceleration g [m/s²].
+        wheel_radius: wheel radius [m].
+        rotating_mass: rotating-mass factor δ.
+    """
+
+    mass: float = 1005.0
+    drag_coefficient: float = 0.3
+    frontal_area: float = 2.02
+    rolling_resistance: float = 0.015
+    air_density: float = 1.206
+    gravity: float = 9.81
+    wheel_radius: float = 0.28
+    rotating_mass: float = 1.02
+
+
+PAPER_VEHICLE = Vehicle()
+
+# Rows: power of v; columns: power of a; the fit of A2 [W].
+POWER_COEFFICIENTS = (
+    (110.3, 1213.0, 2911.0),
+    (422.9, 2484.0, 25.19),
+    (-0.0279, 1.374, 0.0),
+    (0.3557, 0.0, 0.0),
+)
+
+
+def motor_power(speed: Tensor, acceleration: Tensor, recuperation: bool = True) -> Tensor:
+    """Electric power drawn by the motor, Σ p_ij v^i a^j (A2).
+
+    Args:
+        speed: speed at the start of the step, any shape [m/s].
+        acceleration: executed acceleration, same shape [m/s²].
+        recuperation: count negative (braking) power; otherwise it is cut off at zero.
+
+    Returns:
+        Power [W], same shape; negative where braking feeds the battery.
+    """
+    (p00, p01, p02), (p10, p11, p12), (p20, p21, _), (p30, _, _) = POWER_COEFFICIENTS
+    constant = p00 + speed * (p10 + speed * (p20 + speed * p30))
+    linear = p01 + speed * (p11 + speed * p21)
+    quadratic = p02 + speed * p12
+    result = constant + acceleration * (linear + acceleration * quadratic)
+    return result if recuperation else result.clamp(min=0.0)
+
+
+def kinetic_energy(speed: Tensor, vehicle: Vehicle = PAPER_VEHICLE) -> Tensor:
+    """Kinetic energy ½ δ m v² including rotating parts [J] of a car at ``speed`` [m/s]."""
+    return 0.5 * vehicle.rotating_mass * vehicle.mass * speed * speed
+
+
+def traction_force(speed: Tensor, acceleration: Tensor, vehicle: Vehicle = PAPER_VEHICLE) -> Tensor:
+    """Force at the wheels F = δma + mgf + ½ C_D A_f ρ v² (A1).
+
+    Args:
+        speed: speed, any shape [m/s].
+        acceleration: acceleration, same shape [m/s²].
+        vehicle: the car.
+
+    Returns:
+        Force [N], same shape; negative when braking.
+    """
+    inertia = vehicle.rotating_mass * vehicle.mass * acceleration
+    rolling = vehicle.mass * vehicle.gravity * vehicle.rolling_resistance
+    drag = 0.5 * vehicle.drag_coefficient * vehicle.frontal_area * vehicle.air_density
+    return inertia + rolling + drag * speed * speed

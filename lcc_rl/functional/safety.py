@@ -1,0 +1,44 @@
+"""Surrogate safety and efficiency measures: time-to-collision and time gap (A10–A13)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def time_to_collision(
+    gap: Tensor, approach_rate: Tensor, floor: float = 0.01, ceiling: float = 1e3
+) -> Tensor:
+    """Time until contact at constant speeds (A10).
+
+    Args:
+        gap: bumper-to-bumper gap [m].
+        approach_rate: v − v_ahead, positive when closing [m/s].
+        floor: smallest value returned; a collision has it too [s].
+        ceiling: value where the gap does not close, or closes later than this [s].
+
+    Returns:
+        Time-to-collision [s], finite everywhere so that logs and gradients are too.
+    """
+    closing = approach_rate > 0.0
+    # where() on both sides of the division keeps the gradient free of 0·inf.
+    rate = torch.where(closing, approach_rate, torch.ones_like(approach_rate))
+    time = (gap / rate).clamp(floor, ceiling)
+    time = torch.where(closing, time, torch.full_like(time, ceiling))
+    return torch.where(gap <= 0.0, torch.full_like(time, floor), time)
+
+
+def time_gap(gap: Tensor, speed: Tensor, speed_floor: float = 1.0, ceiling: float = 1e3) -> Tensor:
+    """Time gap d/v to the vehicle ahead (A12).
+
+    Args:
+        gap: bumper-to-bumper gap [m].
+        speed: speed of the follower [m/s].
+        speed_floor: speeds below this count as this, so that standing in a jam is not punished;
+            0 gives the literal rule, in which the time gap at standstill is infinite [m/s].
+        ceiling: largest value returned [s].
+
+    Returns:
+        Time gap [s], finite everywhere.
+    """
+    return (gap / speed.clamp(min=max(speed_floor, 1e-6))).clamp(max=ceiling)
