@@ -94,7 +94,7 @@ def idm_acceleration(
 
 
 def power(base: Tensor, exponent: float) -> Tensor:
-    """Raise to the exponent δ; the usual 4 as two multiplications, which is several times faster."""
+    """Raise to the exponent δ; the usual 4 by squaring, several times faster."""
     if exponent == 4.0:
         square = base * base
         return square * square
@@ -161,9 +161,7 @@ def simulate_follower(
     speeds, gaps, accelerations = [speed], [gap], []
     for step in range(leader_speed.shape[0] - 1):
         ahead, ahead_reached = leader_speed[step], leader_speed[step + 1]
-        command = idm_acceleration(
-            speed, gap, speed - ahead, desired_speed, time_gap, constants
-        )
+        command = idm_acceleration(speed, gap, speed - ahead, desired_speed, time_gap, constants)
         if noise is not None:
             command = command * (1.0 + noise(step))
         reached, executed = advance_speed(speed, command, time_step)

@@ -1,0 +1,1 @@
+"""Calibration room: from observed episodes to a population of IDM drivers."""

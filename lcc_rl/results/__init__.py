@@ -1,0 +1,1 @@
+"""Result room: parquet files, tables and figures."""

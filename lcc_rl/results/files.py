@@ -1,0 +1,115 @@
+"""File room: every file is written whole or not at all, and says what wrote it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+
+from lcc_rl.errors import ResultsError
+
+SCHEMA_VERSION = "1"
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` that replaces it only when the block succeeds.
+
+    Args:
+        path: the final path; its folder is made where it does not exist.
+
+    Raises:
+        ResultsError: if the file cannot be written (disk full, folder read-only …); what stood
+            at ``path`` before is untouched and no temporary file stays behind.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_parquet(
+    frame: pd.DataFrame, path: str | Path, metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write a table atomically, with schema and package version in its metadata.
+
+    Args:
+        frame: the table; its index is not kept.
+        path: destination.
+        metadata: further entries, such as a config hash.
+
+    Raises:
+        ResultsError: if the file cannot be written.
+    """
+    from lcc_rl import __version__
+
+    own = {"lcc_rl.schema": SCHEMA_VERSION, "lcc_rl.version": __version__}
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    table = table.replace_schema_metadata(
+        {**(table.schema.metadata or {}), **own, **(metadata or {})}
+    )
+    with atomic_path(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd")
+
+
+def read_parquet(path: str | Path) -> pd.DataFrame:
+    """Read a table.
+
+    Raises:
+        ResultsError: if the file is missing, damaged or of a newer schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ResultsError(f"{path}: no such file")
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise ResultsError(f"{path}: not a readable parquet file: {error}") from error
+    version = (table.schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
+    if not version.isdigit() or int(version) > int(SCHEMA_VERSION):
+        raise ResultsError(f"{path}: schema version {version}; this package reads {SCHEMA_VERSION}")
+    return table.to_pandas()
+
+
+def parquet_metadata(path: str | Path) -> dict[str, str]:
+    """Return the text metadata of a parquet file, without pandas' own entry."""
+    raw = pq.read_schema(path).metadata or {}
+    return {key.decode(): value.decode() for key, value in raw.items() if key != b"pandas"}
+
+
+def write_torch(content: Any, path: str | Path) -> None:
+    """Write tensors atomically, in a form that loads with ``weights_only=True``."""
+    with atomic_path(path) as temporary:
+        torch.save(content, temporary)
+
+
+def read_torch(path: str | Path) -> Any:
+    """Read tensors; code in the file is never run.
+
+    Raises:
+        ResultsError: if the file is missing, damaged or holds anything but tensors and plain
+            containers.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ResultsError(f"{path}: no such file")
+    try:
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch raises many kinds for damaged or malicious files
+        raise ResultsError(f"{path}: not a readable weights file: {error}") from error
