@@ -1,0 +1,137 @@
+"""Statistics room: what the leaders of a set of car-following episodes drive like.
+
+The same definitions hold for real and synthetic episodes. Speed: every sample of every episode.
+Acceleration: forward difference of speed within an episode. Energy: the sum of P·T by A2 over
+consecutive 30 s windows from the start of each episode; what remains of an episode is left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.functional.power import motor_power
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+WINDOW_S = 30.0
+UNITS = {"speed": "m/s", "acceleration": "m/s²", "energy": "kJ"}
+# What is compared beside the quantiles; the mean of acceleration is zero but for end effects.
+LEVEL = {"speed": "mean", "acceleration": "std", "energy": "mean"}
+ROLES = ("leader", "follower")
+
+
+def motion(episodes: pd.DataFrame, role: str = "leader") -> dict[str, NDArray[np.float64]]:
+    """Collect speed, acceleration and 30 s energy over all episodes.
+
+    Args:
+        episodes: one row per sample: episode (or event), time_s, leader_speed_mps,
+            follower_speed_mps.
+        role: whose motion, ``leader`` or ``follower``.
+
+    Returns:
+        ``speed`` [m/s], ``acceleration`` [m/s²] and ``energy`` [kJ], each a flat array.
+
+    Raises:
+        ConfigError: if the role is neither of the two.
+        DataError: if a column is missing or there is no episode of two samples.
+    """
+    if role not in ROLES:
+        raise ConfigError(f"role must be one of {', '.join(ROLES)}, got {role!r}")
+    frame = _ordered(episodes, f"{role}_speed_mps")
+    episode, time, speed = (frame[name].to_numpy() for name in frame.columns)
+    same = episode[1:] == episode[:-1]
+    if not same.any():
+        raise DataError("episode table: no episode has two samples")
+    step = round(float(np.median(np.diff(time)[same])), 6)
+    acceleration = (np.diff(speed) / step)[same]
+    energy = _window_energy(episode[:-1][same], speed[:-1][same], acceleration, step)
+    return {"speed": speed, "acceleration": acceleration, "energy": energy}
+
+
+def leader_statistics(episodes: pd.DataFrame, role: str = "leader") -> pd.DataFrame:
+    """Summarise the motion of all leaders.
+
+    Args:
+        episodes: see :func:`motion`.
+        role: whose motion, ``leader`` or ``follower``.
+
+    Returns:
+        One row per quantity (index ``speed`` [m/s], ``acceleration`` [m/s²], ``energy`` [kJ]);
+        columns count, mean, std and the quantiles q05, q25, q50, q75, q95; NaN where an episode
+        set has no window of 30 s.
+
+    Raises:
+        ConfigError, DataError: see :func:`motion`.
+    """
+    rows = {name: _summary(values) for name, values in motion(episodes, role).items()}
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("quantity")
+
+
+def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """Compare two tables of :func:`leader_statistics`.
+
+    Args:
+        reference: usually of real episodes.
+        other: usually of synthetic ones.
+
+    Returns:
+        One row per compared number: quantity, statistic, unit, reference, other and deviation.
+        The deviation of the mean speed, the standard deviation of acceleration and the mean
+        energy is a share of the reference value; that of a quantile is a share of the 5–95 %
+        span of the reference.
+    """
+    rows = []
+    for quantity, unit in UNITS.items():
+        span = _cell(reference, quantity, "q95") - _cell(reference, quantity, "q05")
+        for statistic in (LEVEL[quantity], *map(_label, QUANTILES)):
+            one, two = (_cell(table, quantity, statistic) for table in (reference, other))
+            scale = one if statistic == LEVEL[quantity] else span
+            rows.append((quantity, statistic, unit, one, two, (two - one) / scale))
+    columns = ["quantity", "statistic", "unit", "reference", "other", "deviation"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _ordered(episodes: pd.DataFrame, speed: str) -> pd.DataFrame:
+    """Columns episode, time_s and the speed, episode by episode along time."""
+    frame = episodes
+    if "episode" not in frame.columns:
+        frame = frame.rename(columns={"event": "episode"})
+    names = ["episode", "time_s", speed]
+    missing = [name for name in names if name not in frame.columns]
+    if missing:
+        raise DataError(f"episode table: missing column(s) {', '.join(missing)}")
+    frame = frame[names].sort_values(names[:2], kind="stable", ignore_index=True)
+    return frame.astype({"time_s": np.float64, speed: np.float64})
+
+
+def _window_energy(
+    episode: NDArray, speed: NDArray, acceleration: NDArray, step: float
+) -> NDArray[np.float64]:
+    """Energy of every complete window [kJ]."""
+    power = motor_power(torch.from_numpy(speed), torch.from_numpy(acceleration)).numpy()
+    table = pd.DataFrame({"episode": episode, "energy": power * step / 1000.0})
+    length = round(WINDOW_S / step)
+    window = table.groupby("episode", sort=False).cumcount() // length
+    sums = table.groupby(["episode", window], sort=False)["energy"].agg(["sum", "size"])
+    return sums.loc[sums["size"] == length, "sum"].to_numpy(dtype=np.float64)
+
+
+def _summary(values: NDArray[np.float64]) -> dict[str, float]:
+    """Count, mean, standard deviation and quantiles."""
+    if not len(values):
+        return {"count": 0, **dict.fromkeys(("mean", "std", *map(_label, QUANTILES)), np.nan)}
+    quantiles = zip(map(_label, QUANTILES), np.quantile(values, QUANTILES), strict=True)
+    return {"count": len(values), "mean": values.mean(), "std": values.std(), **dict(quantiles)}
+
+
+def _cell(table: pd.DataFrame, quantity: str, statistic: str) -> float:
+    """One number of a table of statistics."""
+    return float(table[statistic].to_dict()[quantity])
+
+
+def _label(quantile: float) -> str:
+    """Column name of a quantile."""
+    return f"q{100 * quantile:02.0f}"
