@@ -1,0 +1,234 @@
+"""Calibration room: a genetic algorithm that evolves many independent problems at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError
+
+Objective = Callable[[Tensor], Tensor]
+Progress = Callable[[int, int, str], None]
+
+
+_LEAST = {"population": 4, "generations": 1, "founders": 1, "tournament": 1, "patience": 1}
+
+
+@dataclass(frozen=True)
+class GeneticSettings:
+    """How a population evolves.
+
+    Args:
+        population: individuals per problem.
+        generations: generations at most.
+        founders: size of the first generation, in populations; its fittest found the next.
+        elites: share of a generation that may survive into the next by its fitness.
+        tournament: individuals drawn per tournament; the fittest becomes a parent.
+        blend: how far a child may lie outside its parents' interval (BLX-α), as a share of it.
+        difference_rate: probability that a child is shifted by the difference of two individuals.
+        mutation_rate: probability that a gene is mutated by Gaussian noise.
+        mutation_start: standard deviation of that noise at first, as a share of the bounds.
+        mutation_end: the same in the last generation; it falls geometrically in between.
+        patience: stop when no problem has improved for this many generations.
+        tolerance: relative improvement of the best fitness that counts as one.
+
+    Raises:
+        ConfigError: if a setting is out of its range.
+    """
+
+    population: int = 32
+    generations: int = 20
+    founders: int = 8
+    elites: float = 0.5
+    tournament: int = 2
+    blend: float = 0.5
+    difference_rate: float = 1.0
+    mutation_rate: float = 0.3
+    mutation_start: float = 0.1
+    mutation_end: float = 1e-4
+    patience: int = 5
+    tolerance: float = 1e-5
+
+    def __post_init__(self) -> None:
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"genetic setting {name!r} must be at least {least}")
+        for name in ("elites", "difference_rate", "mutation_rate"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ConfigError(f"genetic setting {name!r} must lie in 0…1")
+        for name in ("mutation_start", "mutation_end"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"genetic setting {name!r} must be positive")
+        if self.blend < 0.0 or self.patience < 1 or self.tolerance < 0.0:
+            raise ConfigError(
+                "genetic settings 'blend', 'patience', 'tolerance' must not be below 0"
+            )
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """What a run of the algorithm found.
+
+    Args:
+        best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
+        fitness: its objective, ``[problems]``.
+        generations: generations evolved before the stopping rule ended the run.
+        evaluations: objective evaluations per problem.
+    """
+
+    best: Tensor
+    fitness: Tensor
+    generations: int
+    evaluations: int
+
+
+def minimise(
+    objective: Objective,
+    lower: Tensor,
+    upper: Tensor,
+    problems: int,
+    generator: torch.Generator,
+    settings: GeneticSettings | None = None,
+    progress: Progress | None = None,
+) -> Evolution:
+    """Minimise an objective inside a box, for all problems at once.
+
+    Selection by tournament, blend crossover (Eshelman & Schaffer 1993), a mutation by population
+    differences and an annealed Gaussian one, and survival of the elite among parents beside the
+    fittest children. All problems share the random numbers of a generation, while fitness decides
+    per problem: a problem's result does not depend on which others run beside it.
+
+    Args:
+        objective: maps ``[problems, population, dims]`` to ``[problems, population]``; where it
+            is not finite, the individual is unfit.
+        lower: lower bounds, ``[dims]``.
+        upper: upper bounds, ``[dims]``; the device and dtype of the search are those of ``lower``.
+        problems: number of problems.
+        generator: source of all randomness (on the CPU, so that devices agree).
+        settings: how to evolve.
+        progress: called as ``progress(generation, total, text)`` after each generation.
+
+    Returns:
+        The fittest individuals.
+
+    Raises:
+        ConfigError: if the bounds are empty or crossed.
+    """
+    settings = settings or GeneticSettings()
+    if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
+        raise ConfigError("bounds must be two vectors of one length with lower < upper")
+    dice = _Dice(generator, lower)
+    # Genes live in the unit box, so that one mutation strength suits every parameter.
+    genes = _latin_hypercube(dice, settings.founders * settings.population, lower.numel())
+    genes = genes.expand(problems, -1, -1).contiguous()
+    evaluate = _in_units(objective, lower, upper)
+    genes, fitness = _fittest(genes, evaluate(genes), settings.population)
+    best, stale, generation = fitness[:, 0], 0, 0
+    for generation in range(1, settings.generations + 1):
+        children = _children(genes, fitness, dice, settings, generation)
+        genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
+        improved = bool((fitness[:, 0] < best * (1.0 - settings.tolerance)).any())
+        best, stale = fitness[:, 0], 0 if improved else stale + 1
+        if progress is not None:
+            progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
+        if stale >= settings.patience:
+            break
+    return Evolution(
+        best=lower + genes[:, 0] * (upper - lower),
+        fitness=fitness[:, 0],
+        generations=generation,
+        evaluations=settings.population * (settings.founders + generation),
+    )
+
+
+class _Dice:
+    """Random numbers on the CPU from one generator, delivered where the search runs."""
+
+    def __init__(self, generator: torch.Generator, like: Tensor) -> None:
+        self.generator, self.like = generator, like
+
+    def uniform(self, *shape: int) -> Tensor:
+        return torch.rand(shape, generator=self.generator).to(self.like)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator).to(self.like)
+
+    def index(self, high: int, *shape: int) -> Tensor:
+        draw = torch.randint(high, shape, generator=self.generator)
+        return draw.to(self.like.device)
+
+    def permutation(self, count: int) -> Tensor:
+        return torch.randperm(count, generator=self.generator).to(self.like.device)
+
+
+def _latin_hypercube(dice: _Dice, count: int, dims: int) -> Tensor:
+    """Spread ``count`` individuals so that every parameter's range is covered evenly."""
+    strata = torch.stack([dice.permutation(count) for _ in range(dims)], dim=1)
+    return (strata + dice.uniform(count, dims)) / count
+
+
+def _in_units(objective: Objective, lower: Tensor, upper: Tensor) -> Objective:
+    """Wrap the objective: genes of the unit box in, finite fitness out."""
+    span = upper - lower
+
+    def evaluate(genes: Tensor) -> Tensor:
+        return objective(lower + genes * span).nan_to_num(nan=math.inf, posinf=math.inf)
+
+    return evaluate
+
+
+def _children(
+    genes: Tensor, fitness: Tensor, dice: _Dice, settings: GeneticSettings, generation: int
+) -> Tensor:
+    """Breed one child per individual: selection, crossover, mutation."""
+    _, count, dims = genes.shape
+    first = _tournament(genes, fitness, dice, settings.tournament)
+    second = _tournament(genes, fitness, dice, settings.tournament)
+    weight = dice.uniform(count, dims) * (1.0 + 2.0 * settings.blend) - settings.blend
+    child = first + weight * (second - first)
+    # The population's own spread scales this step: wide at first, fine once it contracts.
+    shift = genes[:, dice.permutation(count)] - genes[:, dice.permutation(count)]
+    chosen = dice.uniform(count, 1) < settings.difference_rate
+    child = child + torch.where(chosen, dice.uniform(count, 1), 0.0) * shift
+    chosen = dice.uniform(count, dims) < settings.mutation_rate
+    noise = dice.normal(count, dims) * _mutation_strength(settings, generation)
+    child = child + torch.where(chosen, noise, 0.0)
+    # Clamped, not reflected: an optimum on a bound is then reached exactly and can be flagged.
+    return child.clamp_(0.0, 1.0)
+
+
+def _mutation_strength(settings: GeneticSettings, generation: int) -> float:
+    """Standard deviation of the Gaussian mutation, falling geometrically."""
+    share = (generation - 1) / max(settings.generations - 1, 1)
+    return settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
+
+
+def _tournament(genes: Tensor, fitness: Tensor, dice: _Dice, size: int) -> Tensor:
+    """Draw one parent per place: the fittest of ``size`` random individuals."""
+    count = genes.shape[1]
+    entrants = dice.index(count, count, size)
+    winner = fitness[:, entrants].argmin(-1, keepdim=True)
+    parents = entrants.expand(genes.shape[0], -1, -1).gather(-1, winner)
+    return genes.gather(1, parents.expand(-1, -1, genes.shape[-1]))
+
+
+def _survivors(
+    genes: Tensor, fitness: Tensor, children: Tensor, born: Tensor, settings: GeneticSettings
+) -> tuple[Tensor, Tensor]:
+    """Let the elite of the parents compete with the children; sorted, fittest first."""
+    count = genes.shape[1]
+    elites = max(1, round(settings.elites * count))
+    # The parents come sorted, so their elite stands first.
+    everyone = torch.cat([genes[:, :elites], children], 1)
+    return _fittest(everyone, torch.cat([fitness[:, :elites], born], 1), count)
+
+
+def _fittest(genes: Tensor, fitness: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The ``count`` fittest individuals of every problem, fittest first."""
+    order = fitness.argsort(dim=1, stable=True)[:, :count]
+    index = order.unsqueeze(-1).expand(-1, -1, genes.shape[-1])
+    return genes.gather(1, index), fitness.gather(1, order)

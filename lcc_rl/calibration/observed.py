@@ -1,0 +1,227 @@
+"""Calibration room: observed car-following episodes as tensors, longest first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError, DataError
+
+IDENTITY = ("recording", "follower_id", "leader_id")
+NUMERIC = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
+RENAMED = {"event": "episode", "period": "recording"}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which episodes are fit for calibration; the rest are dropped and counted.
+
+    Args:
+        min_gap_m: drop an episode whose gap ever falls below this, also beyond the part used: it
+            is a sign of a broken reconstruction [m].
+        max_duration_s: use the first so many seconds of each; None uses everything [s].
+        min_duration_s: drop shorter episodes [s].
+        min_mean_speed_mps: drop episodes that mostly stand still; RMSPE divides by speed [m/s].
+
+    Raises:
+        ConfigError: if a limit is negative or the durations are crossed.
+    """
+
+    min_gap_m: float = 1.0
+    max_duration_s: float | None = 60.0
+    min_duration_s: float = 10.0
+    min_mean_speed_mps: float = 0.5
+
+    def __post_init__(self) -> None:
+        if min(self.min_gap_m, self.min_duration_s, self.min_mean_speed_mps) < 0.0:
+            raise ConfigError("limits of the selection must not be negative")
+        if self.max_duration_s is not None and self.max_duration_s < self.min_duration_s:
+            raise ConfigError("selection: max_duration_s must not be below min_duration_s")
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Episodes side by side, sorted by falling length so that the running ones are a prefix.
+
+    Args:
+        leader_speed: ``[time, episodes]`` [m/s]; beyond an episode's end, zero.
+        follower_speed: the same for the follower [m/s].
+        gap: initial gap, ``[episodes]`` [m].
+        samples: samples per episode, falling, on the CPU.
+        identity: one row per episode: episode, recording, follower_id, leader_id.
+        time_step: sampling interval [s].
+        report: what was dropped and why, in plain lines.
+    """
+
+    leader_speed: Tensor
+    follower_speed: Tensor
+    gap: Tensor
+    samples: np.ndarray
+    identity: pd.DataFrame
+    time_step: float
+    report: list[str] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        """Number of episodes."""
+        return len(self.samples)
+
+    def segments(self, steps: int | None = None) -> Iterator[tuple[int, int, int]]:
+        """Cut time where episodes end, so that none is simulated beyond its end.
+
+        Args:
+            steps: cut every so many steps instead; episodes may then end within a piece.
+
+        Yields:
+            First step, step after the last, number of episodes (a prefix) still running.
+        """
+        last = int(self.samples[0]) - 1
+        ends = np.unique(self.samples) - 1 if steps is None else range(steps, last + steps, steps)
+        start = 0
+        for stop in ends:
+            yield start, int(stop), int((self.samples - 1 > start).sum())
+            start = int(stop)
+
+    def to(self, device: torch.device | str, dtype: torch.dtype) -> Observed:
+        """Return a copy on another device and in another precision."""
+        return replace(
+            self,
+            leader_speed=self.leader_speed.to(device, dtype),
+            follower_speed=self.follower_speed.to(device, dtype),
+            gap=self.gap.to(device, dtype),
+        )
+
+
+def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Observed:
+    """Turn an episode table into tensors, dropping what cannot be calibrated.
+
+    Args:
+        episodes: one row per sample: episode, time_s, follower_speed_mps, leader_speed_mps,
+            gap_m and, where known, recording, follower_id, leader_id (event and period are
+            understood as episode and recording).
+        selection: which episodes to use.
+
+    Returns:
+        The episodes in float64 on the CPU.
+
+    Raises:
+        DataError: if a column is missing or not numeric, or no episode remains.
+    """
+    selection = selection or Selection()
+    frame = _canonical(episodes)
+    step = _time_step(frame)
+    frame["least_gap"] = frame.groupby("episode", sort=False)["gap_m"].transform("min")
+    frame = _truncate(frame, selection.max_duration_s)
+    table = _summary(frame, step)
+    table, report = _select(table, selection)
+    table = table.sort_values("samples", ascending=False, kind="stable")
+    length, count = int(table["samples"].iloc[0]), len(table)
+    leader, follower = np.zeros((length, count)), np.zeros((length, count))
+    speeds = frame[["leader_speed_mps", "follower_speed_mps"]].to_numpy(np.float64)
+    for column, (start, samples) in enumerate(
+        zip(table["start"].to_numpy(), table["samples"].to_numpy(), strict=True)
+    ):
+        leader[:samples, column] = speeds[start : start + samples, 0]
+        follower[:samples, column] = speeds[start : start + samples, 1]
+    return Observed(
+        leader_speed=torch.from_numpy(leader),
+        follower_speed=torch.from_numpy(follower),
+        gap=torch.from_numpy(table["first_gap"].to_numpy(np.float64).copy()),
+        samples=table["samples"].to_numpy(np.int64),
+        identity=table[["episode", *IDENTITY]].reset_index(drop=True),
+        time_step=step,
+        report=report,
+    )
+
+
+def _canonical(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Check columns and types; order by episode and time."""
+    aliases = {old: new for old, new in RENAMED.items() if new not in episodes.columns}
+    frame = episodes.rename(columns=aliases)
+    missing = [name for name in ("episode", *NUMERIC) if name not in frame.columns]
+    if missing:
+        raise DataError(f"episode table: missing column(s) {', '.join(missing)}")
+    if frame.empty:
+        raise DataError("episode table: no rows")
+    for name in NUMERIC:
+        if not pd.api.types.is_numeric_dtype(frame[name]):
+            raise DataError(f"episode table: column {name!r} is not numeric")
+    for name in IDENTITY:
+        if name not in frame.columns:
+            frame = frame.assign(**{name: "" if name == "recording" else -1})
+    return frame.sort_values(["episode", "time_s"], kind="stable", ignore_index=True)
+
+
+def _time_step(frame: pd.DataFrame) -> float:
+    """Sampling interval of the table: the median over all of it [s]."""
+    difference = frame.groupby("episode", sort=False)["time_s"].diff()
+    step = float(difference.median())
+    if not step > 0.0:
+        raise DataError(f"episode table: time_s does not advance (median step {step} s)")
+    # Time stamps carry rounding noise that must not enter the simulation.
+    return round(step, 6)
+
+
+def _truncate(frame: pd.DataFrame, duration: float | None) -> pd.DataFrame:
+    """Keep the first seconds of each episode."""
+    if duration is None:
+        return frame
+    elapsed = frame["time_s"] - frame.groupby("episode", sort=False)["time_s"].transform("first")
+    return frame[elapsed <= duration + 1e-6].reset_index(drop=True)
+
+
+def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
+    """One row per episode: where it starts and what the selection looks at."""
+    values = frame[list(NUMERIC)]
+    frame = frame.assign(
+        finite=np.isfinite(values.to_numpy(np.float64)).all(axis=1)
+        & (values[["follower_speed_mps", "leader_speed_mps"]] >= 0.0).all(axis=1),
+        uneven=(frame.groupby("episode", sort=False)["time_s"].diff() - step).abs() > 0.1 * step,
+        row=np.arange(len(frame)),
+    )
+    return (
+        frame.groupby("episode", sort=False)
+        .agg(
+            recording=("recording", "first"),
+            follower_id=("follower_id", "first"),
+            leader_id=("leader_id", "first"),
+            start=("row", "first"),
+            samples=("row", "size"),
+            first_gap=("gap_m", "first"),
+            least_gap=("least_gap", "first"),
+            mean_speed=("follower_speed_mps", "mean"),
+            finite=("finite", "all"),
+            uneven=("uneven", "any"),
+            duration=("time_s", lambda time: time.iloc[-1] - time.iloc[0]),
+        )
+        .reset_index()
+    )
+
+
+def _select(table: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, list[str]]:
+    """Drop what cannot be calibrated; every episode is counted under the first reason."""
+    reasons = {
+        "missing, infinite or negative values": ~table["finite"],
+        "uneven sampling": table["uneven"],
+        f"shorter than {selection.min_duration_s:g} s": table["duration"]
+        < selection.min_duration_s - 1e-6,
+        f"gap below {selection.min_gap_m:g} m": table["least_gap"] < selection.min_gap_m,
+        f"mean speed below {selection.min_mean_speed_mps:g} m/s": table["mean_speed"]
+        < selection.min_mean_speed_mps,
+    }
+    keep = pd.Series(True, index=table.index)
+    lines = []
+    for reason, bad in reasons.items():
+        dropped = int((keep & bad).sum())
+        keep &= ~bad
+        if dropped:
+            lines.append(f"{dropped} of {len(table)} episodes dropped: {reason}")
+    if not keep.any():
+        raise DataError(f"no episode is fit for calibration: {'; '.join(lines)}")
+    lines.append(f"{int(keep.sum())} of {len(table)} episodes used for calibration")
+    return table[keep], lines
