@@ -1,0 +1,245 @@
+"""Configuration room: schemas of the entry points, and the one way from a node to an object."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.utils import get_object
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from lcc_rl.errors import ConfigError, LccError, unknown_name
+
+TARGET = "_target_"
+CONF = "lcc_rl.conf"
+
+
+@dataclass
+class ScenarioConfig:
+    """A scenario: its clock and its pieces, in the order in which they act."""
+
+    name: str = MISSING
+    horizon: int = MISSING
+    time_step: float = MISSING
+    followers: int = MISSING
+    pieces: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class RewardConfig:
+    """The reward: named terms."""
+
+    terms: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class TrainingConfig:
+    """Length and bookkeeping of a training; the algorithm's own settings are the agent's."""
+
+    episodes: int = MISSING
+    environments: int = MISSING
+    checkpoint_every: int = MISSING
+
+
+@dataclass
+class EvaluationConfig:
+    """Size of the Monte Carlo evaluation."""
+
+    profiles: int | None = MISSING
+    drivers: int | None = MISSING
+    batch_size: int = MISSING
+    seed: int = MISSING
+    sample_episodes: int = MISSING
+
+
+@dataclass
+class StudyConfig:
+    """What every entry point that drives a controlled car shares."""
+
+    variant: str = MISSING
+    seed: int = MISSING
+    device: str = MISSING
+    threads: int = MISSING
+    data: Any = MISSING
+    drivers: Any = MISSING
+    split: Any = MISSING
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
+    observation: Any = MISSING
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    agent: Any = MISSING
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+@dataclass
+class TrainConfig(StudyConfig):
+    """``python -m lcc_rl.train``."""
+
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    resume: str | None = None
+
+
+@dataclass
+class EvaluateConfig(StudyConfig):
+    """``python -m lcc_rl.evaluate``."""
+
+    policy: str | None = None
+    compare: list[str] = field(default_factory=list)
+
+
+@dataclass
+class PipelineConfig(TrainConfig):
+    """``python -m lcc_rl.pipeline``."""
+
+    calibration: Any = MISSING
+    variants: list[str] = MISSING
+
+
+def register_schemas() -> None:
+    """Make the schemas known to Hydra; each yaml names its own first in its defaults."""
+    store = ConfigStore.instance()
+    for name, schema in (
+        ("train_schema", TrainConfig),
+        ("evaluate_schema", EvaluateConfig),
+        ("pipeline_schema", PipelineConfig),
+    ):
+        store.store(name=name, node=schema)
+
+
+register_schemas()
+
+
+def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Compose a configuration in Python exactly as the command line would.
+
+    Args:
+        entry: entry point: ``"train"``, ``"evaluate"``, ``"calibrate"`` or ``"pipeline"``.
+        overrides: what one would type after the command.
+
+    Raises:
+        ConfigError: if an override is unknown or of the wrong type.
+    """
+    try:
+        if GlobalHydra.instance().is_initialized():
+            return compose(entry, overrides=list(overrides))
+        with initialize_config_module(CONF, version_base="1.3"):
+            return compose(entry, overrides=list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(str(error)) from error
+
+
+def build(node: Any, where: str, **resources: Any) -> Any:
+    """Construct the object that a configuration node describes.
+
+    The keys of the node are the arguments of its ``_target_``; arguments that the node does not
+    give are taken from ``resources`` where the names match, else the constructor's defaults
+    stand. Nested nodes are built first, in the same way.
+
+    Args:
+        node: a mapping with ``_target_``.
+        where: the node's place in the configuration, for messages.
+        **resources: what the caller has to offer: profiles, population, time_step …
+
+    Raises:
+        ConfigError: if the target is unknown, a key is none of its arguments, one is missing, or
+            a value has the wrong type.
+    """
+    settings = dict(OmegaConf.to_container(node, resolve=True)) if OmegaConf.is_config(node) else node
+    if not isinstance(settings, Mapping) or TARGET not in settings:
+        raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}")
+    target = _find(str(settings[TARGET]), where)
+    signature = inspect.signature(target).parameters
+    given = {key: value for key, value in settings.items() if not key.startswith("_")}
+    for key in given:
+        if key not in signature:
+            raise unknown_name(f"setting of {where}", key, signature)
+    _check_types(target, given, where)
+    offered = {k: v for k, v in resources.items() if k in signature and k not in given}
+    arguments = {
+        key: build(value, f"{where}.{key}", **resources)
+        if isinstance(value, Mapping) and TARGET in value
+        else value
+        for key, value in given.items()
+    }
+    required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}
+    missing = sorted(required - set(arguments) - set(offered))
+    if missing:
+        raise ConfigError(f"{where}: missing {', '.join(missing)} of {settings[TARGET]}")
+    return target(**arguments, **offered)
+
+
+def _find(target: str, where: str) -> Any:
+    try:
+        return get_object(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}") from error
+
+
+SIMPLE: dict[Any, tuple[type, ...]] = {float: (float, int), int: (int,), bool: (bool,), str: (str,)}
+
+
+def _check_types(target: Any, given: Mapping[str, Any], where: str) -> None:
+    """Check numbers, flags and text against the annotations of the constructor."""
+    function = target.__init__ if inspect.isclass(target) else target
+    try:
+        hints = typing.get_type_hints(function)
+    except (NameError, TypeError):
+        return
+    for key, value in given.items():
+        accepted = _accepted(hints.get(key))
+        # bool is an int to Python, but not to a reader of a configuration.
+        wrong = isinstance(value, bool) and bool not in accepted
+        if accepted and (wrong or not isinstance(value, accepted)):
+            wanted = " or ".join(sorted({kind.__name__ for kind in accepted}))
+            raise ConfigError(f"{where}.{key} must be {wanted}, got {value!r}")
+
+
+def _accepted(hint: Any) -> tuple[type, ...]:
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        parts = [_accepted(part) for part in typing.get_args(hint)]
+        return tuple(kind for part in parts for kind in part) if all(parts) else ()
+    if hint is type(None):
+        return (type(None),)
+    return SIMPLE.get(hint, ())
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """Return a configuration as plain, resolved containers."""
+    return typing.cast(
+        dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    )
+
+
+def config_hash(config: Any) -> str:
+    """Return a short hash of what a configuration says, independent of the order of its keys."""
+    text = json.dumps(plain(config), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise a ConfigError with the message unless the condition holds."""
+    if not condition:
+        raise ConfigError(message)
+
+
+__all__ = [
+    "EvaluateConfig",
+    "LccError",
+    "PipelineConfig",
+    "TrainConfig",
+    "build",
+    "config_hash",
+    "load",
+    "plain",
+    "require",
+]

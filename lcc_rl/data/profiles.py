@@ -1,0 +1,202 @@
+"""Speed profiles of leaders: cut from episodes, split into training and evaluation, windowed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError, DataError
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Speed records of leaders, stored end to end.
+
+    Args:
+        speeds: all records, shape ``[samples]``, float32 [m/s].
+        offsets: where each record starts, shape ``[profiles]``, int64.
+        lengths: samples of each record, shape ``[profiles]``, int64.
+        names: a readable identity of each record: recording, vehicle and start.
+        recordings: the recording that each record comes from.
+        time_step: time between samples [s].
+    """
+
+    speeds: Tensor
+    offsets: Tensor
+    lengths: Tensor
+    names: tuple[str, ...]
+    recordings: tuple[str, ...]
+    time_step: float
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def record(self, index: int) -> Tensor:
+        """Return one speed record, shape ``[samples]`` [m/s]."""
+        start = int(self.offsets[index])
+        return self.speeds[start : start + int(self.lengths[index])]
+
+    def select(self, indices: Iterable[int]) -> Profiles:
+        """Return the records with the given indices, in that order."""
+        chosen = list(indices)
+        return from_records(
+            [self.record(i) for i in chosen],
+            [self.names[i] for i in chosen],
+            [self.recordings[i] for i in chosen],
+            self.time_step,
+        )
+
+    def windows(self, horizon: int, limit: int | None = None) -> Profiles:
+        """Cut the records into consecutive windows of ``horizon`` steps that do not overlap.
+
+        Args:
+            horizon: steps per window; a window has one sample more.
+            limit: keep at most this many, spread evenly over all; None keeps every window.
+
+        Raises:
+            DataError: if no record is long enough.
+        """
+        cuts = [
+            (index, start)
+            for index in range(len(self))
+            for start in range(0, int(self.lengths[index]) - horizon, horizon + 1)
+        ]
+        if not cuts:
+            raise DataError(self._too_short(horizon))
+        if limit is not None and limit < len(cuts):
+            keep = np.linspace(0, len(cuts) - 1, limit).round().astype(int)
+            cuts = [cuts[i] for i in keep]
+        return from_records(
+            [self.record(i)[start : start + horizon + 1] for i, start in cuts],
+            [f"{self.names[i]}+{start * self.time_step:g}s" for i, start in cuts],
+            [self.recordings[i] for i, _ in cuts],
+            self.time_step,
+        )
+
+    def at_least(self, horizon: int) -> Profiles:
+        """Return the records that hold at least ``horizon`` steps.
+
+        Raises:
+            DataError: if none does.
+        """
+        long = [i for i in range(len(self)) if int(self.lengths[i]) > horizon]
+        if not long:
+            raise DataError(self._too_short(horizon))
+        return self.select(long)
+
+    def _too_short(self, horizon: int) -> str:
+        longest = int(self.lengths.max()) - 1 if len(self) else 0
+        return (
+            f"profile shorter than the horizon: the longest of {len(self)} speed profiles has "
+            f"{longest} steps ({longest * self.time_step:g} s), an episode needs {horizon} "
+            f"({horizon * self.time_step:g} s); lower scenario.horizon or give longer data"
+        )
+
+
+def from_records(
+    records: Sequence[Tensor],
+    names: Sequence[str],
+    recordings: Sequence[str],
+    time_step: float,
+) -> Profiles:
+    """Build profiles from separate speed records.
+
+    Raises:
+        DataError: if there is none, or one holds a negative or missing speed.
+    """
+    if not records:
+        raise DataError("no speed profile left: at least one leader's record is needed")
+    for name, record in zip(names, records, strict=True):
+        if not bool(torch.isfinite(record).all()) or bool((record < 0).any()):
+            raise DataError(f"profile {name}: speeds must be finite and not negative")
+    lengths = torch.tensor([len(record) for record in records])
+    return Profiles(
+        speeds=torch.cat([record.to(torch.float32) for record in records]),
+        offsets=torch.cumsum(lengths, 0) - lengths,
+        lengths=lengths,
+        names=tuple(names),
+        recordings=tuple(recordings),
+        time_step=time_step,
+    )
+
+
+def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
+    """Take the leader's speed record of every episode.
+
+    Args:
+        episodes: the SI table of episodes (see :mod:`lcc_rl.data.episodes`).
+        time_step: step of the scenario [s].
+
+    Raises:
+        DataError: if the table is sampled at another step, or holds no episode.
+    """
+    records, names, recordings = [], [], []
+    for number, episode in episodes.groupby("episode", sort=True):
+        time = episode["time_s"].to_numpy()
+        if len(time) > 1 and not np.allclose(np.diff(time), time_step, atol=0.1 * time_step):
+            raise DataError(
+                f"episode {number}: samples are {np.median(np.diff(time)):g} s apart (or not "
+                f"evenly spaced), the scenario's time_step is {time_step:g} s"
+            )
+        recording, leader = str(episode["recording"].iloc[0]), int(episode["leader_id"].iloc[0])
+        records.append(torch.tensor(episode["leader_speed_mps"].to_numpy(np.float32)))
+        names.append(f"{recording}/{leader}@{time[0]:.1f}s")
+        recordings.append(recording)
+    return from_records(records, names, recordings, time_step)
+
+
+@dataclass(frozen=True)
+class Split:
+    """How profiles are divided so that nothing seen in training is met in evaluation.
+
+    Args:
+        by: ``"recording"`` holds out whole recordings (no shared traffic wave at all);
+            ``"vehicle"`` holds out leaders within every recording.
+        evaluation_share: share of the recordings or vehicles held out, 0…1.
+
+    Raises:
+        ConfigError: if a setting is unknown or out of range.
+    """
+
+    by: str = "recording"
+    evaluation_share: float = 0.34
+
+    def __post_init__(self) -> None:
+        if self.by not in ("recording", "vehicle"):
+            raise ConfigError(f"split.by must be 'recording' or 'vehicle', got {self.by!r}")
+        if not 0.0 < self.evaluation_share < 1.0:
+            raise ConfigError(
+                f"split.evaluation_share must lie between 0 and 1, got {self.evaluation_share}"
+            )
+
+    def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
+        """Return the training and the evaluation profiles.
+
+        Raises:
+            DataError: if there are not at least two recordings (or vehicles) to divide.
+        """
+        # The vehicle is the part of the name before the time, so that two episodes behind the
+        # same leader never end up on both sides.
+        groups = [
+            name if self.by == "recording" else vehicle.rsplit("@", 1)[0]
+            for name, vehicle in zip(profiles.recordings, profiles.names, strict=True)
+        ]
+        distinct = sorted(set(groups))
+        if len(distinct) < 2:
+            raise DataError(
+                f"cannot split {len(profiles)} profiles by {self.by}: only {distinct} found; "
+                "use split.by=vehicle or give more data"
+            )
+        held = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
+        # Evenly spread over the sorted groups, the last always among them: deterministic and
+        # independent of any seed, so that every run holds out the same data.
+        picks = np.linspace(len(distinct) - 1, 0, held, endpoint=False).round().astype(int)
+        evaluation = {distinct[i] for i in picks}
+        inside = [i for i, group in enumerate(groups) if group in evaluation]
+        outside = [i for i, group in enumerate(groups) if group not in evaluation]
+        return profiles.select(outside), profiles.select(inside)

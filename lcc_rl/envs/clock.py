@@ -1,0 +1,102 @@
+"""The clock: the thin environment under every scenario; it owns time, the action and done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from lcc_rl.errors import ConfigError
+
+SEED = ("episode", "seed")
+STEP = ("episode", "step")
+
+
+class Clock(EnvBase):
+    """Counts steps, truncates at the horizon and gives every episode a seed of its own.
+
+    Everything random in an episode is a function of that seed (see
+    :mod:`lcc_rl.functional.random`), so the generator of this class is the only random state of
+    an environment. ``env.reset(TensorDict({("episode", "seed"): ...}))`` replays an episode.
+
+    Args:
+        horizon: steps per episode, after which it is truncated.
+        batch_size: shape of the batch of episodes.
+        action_shape: shape of one action; its entries lie in [−1, 1].
+        seed: seed of the generator that draws the episodes' seeds.
+        device: where the tensors live.
+
+    Raises:
+        ConfigError: if the horizon is not positive.
+    """
+
+    def __init__(
+        self,
+        horizon: int,
+        batch_size: Sequence[int] | int = (),
+        action_shape: Sequence[int] = (1,),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+    ) -> None:
+        if horizon < 1:
+            raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
+        batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
+        super().__init__(device=device, batch_size=batch)
+        self.horizon = horizon
+        self.generator = torch.Generator()
+        count = Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=self.device)
+        self.observation_spec = Composite(
+            episode=Composite(seed=count.clone(), step=count.clone(), shape=batch),
+            shape=batch,
+            device=self.device,
+        )
+        self.state_spec = Composite(
+            episode=Composite(seed=count.clone(), step=count.clone(), shape=batch),
+            shape=batch,
+            device=self.device,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, *action_shape), device=self.device)
+        self.full_reward_spec = Composite(shape=batch, device=self.device)
+        self.full_done_spec = Composite(
+            done=flag.clone(),
+            terminated=flag.clone(),
+            truncated=flag.clone(),
+            shape=batch,
+            device=self.device,
+        )
+        self.set_seed(seed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator.manual_seed(0 if seed is None else seed)
+
+    def _draw_seeds(self) -> torch.Tensor:
+        shape = (*self.batch_size, 1)
+        seeds = torch.randint(2**31, shape, generator=self.generator, dtype=torch.int64)
+        return seeds.to(self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        seeds = tensordict.get(SEED, None) if tensordict is not None else None
+        if seeds is None:
+            seeds = self._draw_seeds()
+        return self._moment(seeds, torch.zeros_like(seeds))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self._moment(tensordict.get(SEED), tensordict.get(STEP) + 1)
+
+    def _moment(self, seeds: torch.Tensor, step: torch.Tensor) -> TensorDictBase:
+        truncated = step >= self.horizon
+        episode = TensorDict({"seed": seeds, "step": step}, self.batch_size, device=self.device)
+        return TensorDict(
+            {
+                "episode": episode,
+                "truncated": truncated,
+                "terminated": torch.zeros_like(truncated),
+                "done": truncated,
+            },
+            self.batch_size,
+            device=self.device,
+        )

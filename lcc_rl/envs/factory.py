@@ -1,0 +1,160 @@
+"""The factory: from a configuration to an environment, a policy and what they need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from torchrl.envs import Compose, TransformedEnv
+
+from lcc_rl.config import build, load
+from lcc_rl.data.profiles import Profiles, leader_profiles
+from lcc_rl.envs.clock import Clock
+from lcc_rl.pieces import Piece, TotalReward
+from lcc_rl.pieces.vehicles import Population
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a study is made from: profiles to train and to evaluate on, and drivers.
+
+    Args:
+        training: speed profiles for training.
+        evaluation: speed profiles held out, as windows of one horizon.
+        population: the human drivers.
+        report: what was read and dropped, as plain lines.
+    """
+
+    training: Profiles
+    evaluation: Profiles
+    population: Population
+    report: tuple[str, ...] = ()
+
+
+def load_inputs(cfg: DictConfig, episodes: Any = None, population: Any = None) -> Inputs:
+    """Read the trajectories, split their leaders' profiles and build the population.
+
+    Args:
+        cfg: configuration of a study.
+        episodes: table of episodes if already at hand; else ``cfg.data`` is read.
+        population: drivers if already at hand; else ``cfg.drivers`` is built.
+
+    Raises:
+        DataError, ConfigError: naming the file, row or option at fault.
+    """
+    report: Sequence[str] = ()
+    if episodes is None:
+        loaded = build(cfg.data, "data").load()
+        episodes, report = loaded.episodes, loaded.report
+    scenario = cfg.scenario
+    profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
+    training, evaluation = build(cfg.split, "split")(profiles)
+    if population is None:
+        population = build(cfg.drivers, "drivers")
+    return Inputs(
+        training,
+        evaluation.windows(scenario.horizon, cfg.evaluation.profiles),
+        population,
+        tuple(report),
+    )
+
+
+def build_env(
+    cfg: DictConfig,
+    profiles: Profiles,
+    population: Population,
+    batch_size: Sequence[int] | int = (),
+    seed: int = 0,
+    device: torch.device | str | None = None,
+) -> TransformedEnv:
+    """Build the environment of a configuration.
+
+    Args:
+        cfg: configuration with the nodes ``scenario``, ``observation`` and ``reward``.
+        profiles: speed profiles of the leader.
+        population: the human drivers.
+        batch_size: episodes side by side.
+        seed: seed of the episodes' seeds.
+        device: where the tensors live.
+
+    Returns:
+        A TorchRL environment; see the README for its entries.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    scenario = cfg.scenario
+    resources = {
+        "profiles": profiles,
+        "population": population,
+        "time_step": scenario.time_step,
+        "horizon": scenario.horizon,
+    }
+    pieces: list[Piece] = [
+        build(node, f"scenario.pieces.{name}", **resources)
+        for name, node in scenario.pieces.items()
+    ]
+    pieces.append(build(cfg.observation, "observation", **resources))
+    pieces += [
+        build(node, f"reward.terms.{name}", name=name, **resources)
+        for name, node in cfg.reward.terms.items()
+    ]
+    pieces.append(TotalReward(list(cfg.reward.terms)))
+    clock = Clock(scenario.horizon, batch_size, seed=seed, device=device)
+    env = TransformedEnv(clock, Compose(*pieces))
+    return env.to(device) if device is not None else env
+
+
+def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Any:
+    """Build the agent of a configuration: something with ``policy`` and ``learns``.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    cav = cfg.scenario.pieces.get("cav")
+    observation: Piece = build(cfg.observation, "observation")
+    return build(
+        cfg.agent,
+        "agent",
+        population=population,
+        observation_size=observation.event_shape[0],
+        action_size=1,
+        max_acceleration=cav.max_acceleration if cav is not None else 1.0,
+        seed=cfg.seed,
+        device=device,
+    )
+
+
+def make_env(
+    variant: str = "alcc",
+    batch_size: Sequence[int] | int = (),
+    overrides: Sequence[str] = (),
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    held_out: bool = False,
+) -> TransformedEnv:
+    """Build the environment of a variant, as the command line would.
+
+    Args:
+        variant: ``"alcc"``, ``"reference"``, ``"idm"`` … (``conf/variant``).
+        batch_size: episodes side by side.
+        overrides: further command-line overrides, e.g. ``["scenario.horizon=100"]``.
+        seed: seed of the episodes' seeds.
+        device: where the tensors live.
+        held_out: play the evaluation profiles instead of the training ones.
+
+    Raises:
+        ConfigError: if the variant or an override is unknown.
+
+    Examples:
+        >>> env = make_env("alcc", batch_size=1024)  # doctest: +SKIP
+        >>> env.rollout(300)["next", "reward"].shape  # doctest: +SKIP
+        torch.Size([1024, 300, 1])
+    """
+    cfg = load("train", [f"variant={variant}", *overrides])
+    inputs = load_inputs(cfg)
+    profiles = inputs.evaluation if held_out else inputs.training
+    return build_env(cfg, profiles, inputs.population, batch_size, seed, device)
