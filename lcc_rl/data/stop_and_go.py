@@ -17,11 +17,13 @@ Array = NDArray[np.float64]
 class StopAndGo:
     """Leaders that chase a speed which jumps, as drivers do in stop-and-go waves.
 
-    Every leader has a congestion level, Gaussian over leaders. After exponentially distributed
-    times it aims at a new speed, Gaussian about its level and cut off at zero, where it stands.
-    It approaches that speed as a critically damped second-order system, so that acceleration is
-    continuous, within the limits of ordinary driving. The jumps, rather than a Gaussian process,
-    make the many calm and few strong accelerations of recorded traffic.
+    Every leader has a congestion level, Gaussian over leaders. It aims at the sum of its level, a
+    wave and a ripple, cut off at zero, where it stands. Wave and ripple each take a new Gaussian
+    value after exponentially distributed times, the wave seldom and large, the ripple often and
+    small: no driver holds a speed exactly. The leader approaches the speed aimed at as a
+    critically damped second-order system, so that acceleration is continuous, within the limits
+    of ordinary driving. The jumps, rather than a Gaussian process, make the many calm and few
+    strong accelerations of recorded traffic.
 
     The default values are fitted to NGSIM I-80 by ``tools/fit_stream.py``: they minimise the
     distance between the leaders of the synthetic pairs and those of 264 real pairs in the
@@ -31,8 +33,10 @@ class StopAndGo:
     Args:
         mean_speed_mps: mean of the levels [m/s].
         level_spread_mps: standard deviation of the levels over leaders [m/s].
-        wave_spread_mps: standard deviation of the speeds aimed at about a level [m/s].
-        dwell_s: mean time between two jumps [s].
+        wave_spread_mps: standard deviation of the waves [m/s].
+        wave_s: mean time that a wave holds [s].
+        ripple_spread_mps: standard deviation of the ripples [m/s].
+        ripple_s: mean time that a ripple holds [s].
         response_s: time constant of the response to a jump [s].
         acceleration_limit: largest acceleration [m/s²].
         braking_limit: largest deceleration, positive [m/s²].
@@ -44,10 +48,12 @@ class StopAndGo:
     mean_speed_mps: float = 5.12
     level_spread_mps: float = 2.22
     wave_spread_mps: float = 3.49
-    dwell_s: float = 4.12
+    wave_s: float = 4.12
+    ripple_spread_mps: float = 0.5
+    ripple_s: float = 1.5
     response_s: float = 1.40
-    acceleration_limit: float = 2.0
-    braking_limit: float = 3.0
+    acceleration_limit: float = 2.5
+    braking_limit: float = 3.5
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -74,20 +80,17 @@ class StopAndGo:
             Speeds ``[steps + 1, count]`` [m/s] and levels ``[count]`` [m/s].
         """
         level = self.mean_speed_mps + self.level_spread_mps * stratified_normal(count, generator)
-        jump = generator.random((steps + 1, count)) < time_step / self.dwell_s
-        jump[0] = True
-        aim = np.zeros_like(jump, dtype=np.float64)
-        aim[jump] = self.wave_spread_mps * stratified_normal(int(jump.sum()), generator)
-        aim = np.where(jump, np.maximum(aim + level, 0.0), aim)
-        return self._chase(aim, jump, time_step), level
+        shape = (steps + 1, count)
+        wave = self.wave_spread_mps * jumps(shape, time_step / self.wave_s, generator)
+        ripple = self.ripple_spread_mps * jumps(shape, time_step / self.ripple_s, generator)
+        return self._chase(np.maximum(level + wave + ripple, 0.0), time_step), level
 
-    def _chase(self, aim: Array, jump: NDArray[np.bool_], time_step: float) -> Array:
+    def _chase(self, aim: Array, time_step: float) -> Array:
         """Speeds of leaders that respond to the speeds aimed at, both ``[steps + 1, count]``."""
-        target = speed = aim[0]
+        speed = aim[0]
         acceleration = np.zeros_like(speed)
         speeds = [speed]
-        for step in range(1, len(aim)):
-            target = np.where(jump[step], aim[step], target)
+        for target in aim[1:]:
             pull = (target - speed) / self.response_s**2 - 2.0 * acceleration / self.response_s
             wanted = acceleration + time_step * pull
             wanted = np.clip(wanted, -self.braking_limit, self.acceleration_limit)
@@ -97,6 +100,25 @@ class StopAndGo:
             speed = reached
             speeds.append(speed)
         return np.stack(speeds)
+
+
+def jumps(shape: tuple[int, int], rate: float, generator: np.random.Generator) -> Array:
+    """Standard normal values that hold until the next jump.
+
+    Args:
+        shape: steps and number of processes.
+        rate: probability of a jump in a step.
+        generator: source of all randomness.
+
+    Returns:
+        Values of the given shape; all of them together are a stratified sample.
+    """
+    jump = generator.random(shape) < rate
+    jump[0] = True
+    values = np.zeros(shape)
+    values[jump] = stratified_normal(int(jump.sum()), generator)
+    last = np.maximum.accumulate(np.where(jump, np.arange(shape[0])[:, None], 0), axis=0)
+    return np.take_along_axis(values, last, axis=0)
 
 
 def stratified_normal(count: int, generator: np.random.Generator) -> Array:

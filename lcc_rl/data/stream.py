@@ -17,10 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lcc_rl.calibration.population import DriverPopulation
 from lcc_rl.data.stop_and_go import StopAndGo
 from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.idm import IDMConstants, equilibrium_gap, simulate_follower
+from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
 
 Array = NDArray[np.float64]
 
@@ -41,8 +42,8 @@ class Stream:
         samples: one row per vehicle and frame in SI units, with the columns that
             :func:`lcc_rl.data.ngsim.write_ngsim` needs; time_s as well. Positions are of the
             front bumper; acceleration is the one that took the vehicle to its speed.
-        truth: one row per IDM driver: recording, vehicle, preceding, desired_speed_mps,
-            time_gap_s.
+        truth: one row per IDM driver: recording, vehicle, preceding, and its parameters
+            desired_speed_mps, time_gap_s, acceleration_mps2, deceleration_mps2, min_gap_m.
     """
 
     samples: pd.DataFrame
@@ -58,7 +59,6 @@ class Lane:
         vehicles: vehicles per platoon, the stochastic leader included.
         duration_s: range from which the time that a platoon is seen is drawn evenly [s].
         leader: the stochastic leader.
-        constants: IDM parameters that all drivers share.
         noise: the executed acceleration of a driver is a(1 + ξ), ξ ~ U(0, noise) (A18).
 
     Raises:
@@ -69,7 +69,6 @@ class Lane:
     vehicles: int = 4
     duration_s: tuple[float, float] = (35.0, 85.0)
     leader: StopAndGo = field(default_factory=StopAndGo)
-    constants: IDMConstants = field(default_factory=IDMConstants)
     noise: float = 0.05
 
     def __post_init__(self) -> None:
@@ -83,11 +82,11 @@ class Lane:
         if not 0.0 <= self.noise < 1.0:
             raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise}")
 
-    def drive(self, drivers: pd.DataFrame, name: str, generator: np.random.Generator) -> Stream:
+    def drive(self, drivers: DriverPopulation, name: str, generator: np.random.Generator) -> Stream:
         """Drive one recording.
 
         Args:
-            drivers: population to draw from, columns desired_speed_mps and time_gap_s.
+            drivers: population to draw from.
             name: name of the recording.
             generator: source of all randomness.
 
@@ -100,69 +99,82 @@ class Lane:
         steps = warm_up + int(seen.max())
         ahead, level = self.leader.drive(self.platoons, steps, FRAME, generator)
         shape = (self.vehicles - 1, self.platoons)
-        chosen = draw_drivers(drivers, level, shape, generator)
-        xi = generator.uniform(0.0, self.noise, (steps, *shape))
-        speed, gap = self._follow(torch.from_numpy(ahead), chosen, torch.from_numpy(xi))
-        mean, spread, shortest, longest = LENGTHS_M
-        length = generator.normal(mean, spread, (self.vehicles, self.platoons))
-        length = np.clip(length, shortest, longest)
-        position = _positions(speed, gap, length)
-        samples = _table(speed, position, length, warm_up, seen).assign(recording=name)
-        return Stream(samples, self._truth(chosen).assign(recording=name))
-
-    def _follow(self, ahead: Tensor, chosen: Tensor, xi: Tensor) -> tuple[Array, Array]:
-        """Speeds ``[time, vehicles, platoons]`` and gaps ``[time, vehicles − 1, platoons]``."""
-        speeds, gaps = [ahead], []
-        for rank, (desired_speed, time_gap) in enumerate(chosen):
-            ahead = speeds[-1]
-            start = equilibrium_gap(ahead[0], desired_speed, time_gap, self.constants)
-            speed, gap, _ = simulate_follower(
-                ahead,
-                ahead[0],
-                start,
-                desired_speed,
-                time_gap,
-                self.constants,
-                FRAME,
-                xi[:, rank].__getitem__,
-            )
-            speeds.append(speed)
-            gaps.append(gap)
-        return torch.stack(speeds, 1).numpy(), torch.stack(gaps, 1).numpy()
-
-    def _truth(self, chosen: Tensor) -> pd.DataFrame:
-        """Ground truth of the drivers ``[vehicles − 1, (v0, T), platoons]``."""
-        vehicle = _identity(self.vehicles, self.platoons)[1:].T.reshape(-1)
-        values = chosen.permute(2, 0, 1).reshape(-1, 2).numpy()
-        return pd.DataFrame(
-            {
-                "vehicle": vehicle,
-                "preceding": vehicle - 1,
-                "desired_speed_mps": values[:, 0],
-                "time_gap_s": values[:, 1],
-            }
-        )
+        ranks = [drivers.select(row) for row in draw_drivers(drivers, level, shape, generator)]
+        xi = torch.from_numpy(generator.uniform(0.0, self.noise, (steps, *shape)))
+        speed, gap = follow(torch.from_numpy(ahead), ranks, xi)
+        length = _lengths((self.vehicles, self.platoons), generator)
+        samples = _samples(speed, _positions(speed, gap, length), length, warm_up, seen)
+        return Stream(samples.assign(recording=name), _truth(ranks).assign(recording=name))
 
 
 def draw_drivers(
-    drivers: pd.DataFrame, level: Array, shape: tuple[int, int], generator: np.random.Generator
+    drivers: DriverPopulation, level: Array, shape: tuple[int, int], generator: np.random.Generator
 ) -> Tensor:
-    """Draw (v0, T) pairs of drivers that can keep up with their platoon.
+    """Draw drivers that can keep up with their platoon.
 
     Args:
-        drivers: population, columns desired_speed_mps and time_gap_s.
+        drivers: the population.
         level: congestion level of every platoon ``[platoons]`` [m/s].
         shape: drivers per platoon and platoons.
         generator: source of all randomness.
 
     Returns:
-        Float64 ``[drivers per platoon, 2, platoons]``: v0 [m/s] and T [s].
+        Indices into the population, of the given shape; where no driver is fast enough, the
+        fastest.
     """
-    pairs = drivers.sort_values("desired_speed_mps", kind="stable")
-    values = pairs[["desired_speed_mps", "time_gap_s"]].to_numpy(dtype=np.float64)
-    slowest = np.searchsorted(values[:, 0], KEEPS_UP * level).clip(max=len(values) - 1)
-    row = slowest + (generator.random(shape) * (len(values) - slowest)).astype(np.int64)
-    return torch.from_numpy(values[row].transpose(0, 2, 1).copy())
+    order = torch.argsort(drivers.desired_speed, stable=True)
+    ascending = drivers.desired_speed[order].numpy()
+    slowest = np.searchsorted(ascending, KEEPS_UP * level).clip(max=len(drivers) - 1)
+    place = slowest + generator.random(shape) * (len(drivers) - slowest)
+    return order[torch.from_numpy(place.astype(np.int64))]
+
+
+def follow(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
+    """Drive platoons behind their leaders, from the equilibrium at the first speed.
+
+    Args:
+        ahead: speeds of the leaders ``[time + 1, platoons]`` [m/s].
+        ranks: the drivers, one population of ``platoons`` drivers for each place in the platoon.
+        xi: relative error of the executed acceleration ``[time, ranks, platoons]`` (A18).
+
+    Returns:
+        Speeds ``[time + 1, vehicles, platoons]``, the leaders' included [m/s], and gaps
+        ``[time + 1, ranks, platoons]`` [m].
+    """
+    speeds, gaps = [ahead], []
+    for rank, drivers in enumerate(ranks):
+        own, leading = (drivers.desired_speed.double(), drivers.time_gap.double()), speeds[-1]
+        start = equilibrium_gap(leading[0], *own, drivers.constants)
+        noise = xi[:, rank].__getitem__
+        speed, gap, _ = simulate_follower(
+            leading, leading[0], start, *own, drivers.constants, FRAME, noise
+        )
+        speeds.append(speed)
+        gaps.append(gap)
+    return torch.stack(speeds, 1).numpy(), torch.stack(gaps, 1).numpy()
+
+
+def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
+    """Parameters of all drivers, in the order of their ids."""
+    vehicle = _identity(len(ranks) + 1, len(ranks[0]))[1:]
+    constants = [drivers.constants for drivers in ranks]
+    shape = torch.ones(len(ranks[0]), dtype=torch.float64)
+    columns = {
+        "desired_speed_mps": [drivers.desired_speed for drivers in ranks],
+        "time_gap_s": [drivers.time_gap for drivers in ranks],
+        "acceleration_mps2": [shape * entry.acceleration for entry in constants],
+        "deceleration_mps2": [shape * entry.deceleration for entry in constants],
+        "min_gap_m": [shape * entry.min_gap for entry in constants],
+    }
+    values = {name: torch.stack(rows).double().T.flatten() for name, rows in columns.items()}
+    identity = {"vehicle": vehicle.T.ravel(), "preceding": vehicle.T.ravel() - 1}
+    return pd.DataFrame(identity | {name: column.numpy() for name, column in values.items()})
+
+
+def _lengths(shape: tuple[int, int], generator: np.random.Generator) -> Array:
+    """Lengths of automobiles [m]."""
+    mean, spread, shortest, longest = LENGTHS_M
+    return np.clip(generator.normal(mean, spread, shape), shortest, longest)
 
 
 def _positions(speed: Array, gap: Array, length: Array) -> Array:
@@ -178,7 +190,7 @@ def _identity(vehicles: int, platoons: int) -> NDArray[np.int64]:
     return np.arange(1, vehicles * platoons + 1).reshape(platoons, vehicles).T
 
 
-def _table(
+def _samples(
     speed: Array, position: Array, length: Array, warm_up: int, seen: NDArray[np.int64]
 ) -> pd.DataFrame:
     """Rows of the recorded part; platoon after platoon along the time of the recording."""

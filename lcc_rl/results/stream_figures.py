@@ -1,0 +1,126 @@
+"""Stream figure room: leaders of two sets of episodes side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from lcc_rl.data.statistics import UNITS, WINDOW_S, motion
+from lcc_rl.errors import ConfigError
+from lcc_rl.results.files import atomic_path
+
+COLOURS = ("#1b6ca8", "#d1661f")  # blue and orange, distinct without red-green vision and in grey
+LABELS = {
+    "speed": "leader speed",
+    "acceleration": "leader acceleration",
+    "energy": f"leader energy in {WINDOW_S:.0f} s",
+}
+SAMPLES = {"speed": "samples", "acceleration": "samples", "energy": "windows"}
+BINS = {"speed": 40, "acceleration": 40, "energy": 20}  # there are far fewer windows
+TAIL = 0.003  # share cut off at either end of a histogram, so that outliers do not set the scale
+TRACES = 4
+TRACE_S = 90.0
+
+
+def figure_leaders(sets: Mapping[str, pd.DataFrame]) -> Figure:
+    """Draw the distributions of the leaders' motion, and some of their speed traces.
+
+    Args:
+        sets: exactly two named episode tables, see :func:`lcc_rl.data.statistics.motion`; the
+            first is drawn filled.
+
+    Returns:
+        A figure with three distributions above and traces of each set below; the traces are of
+        episodes spread evenly over the order of their mean speed.
+
+    Raises:
+        ConfigError: if there are not two sets.
+        DataError: if a table lacks a column or has no episode.
+    """
+    if len(sets) != 2:
+        raise ConfigError(f"a figure of leaders compares two sets of episodes, got {len(sets)}")
+    figure = Figure(figsize=(10.0, 6.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, below = np.asarray(figure.subfigures(2, 1)).flat
+    motions = {name: motion(episodes) for name, episodes in sets.items()}
+    for axes, quantity in zip(above.subplots(1, 3).flat, UNITS, strict=True):
+        _distribution(axes, quantity, {name: found[quantity] for name, found in motions.items()})
+    panels = below.subplots(1, 2, sharex=True, sharey=True).flat
+    for axes, (name, episodes), colour in zip(panels, sets.items(), COLOURS, strict=True):
+        _traces(axes, name, episodes, colour)
+    panels[0].set_ylabel("leader speed [m/s]")
+    panels[0].set_ylim(bottom=0.0)
+    panels[0].set_xlim(0.0, TRACE_S)
+    return figure
+
+
+def save_leaders(sets: Mapping[str, pd.DataFrame], path: str | Path) -> None:
+    """Write the figure of :func:`figure_leaders` atomically.
+
+    Args:
+        sets: two named episode tables.
+        path: destination; its ending chooses the format (png, pdf, svg).
+
+    Raises:
+        ConfigError: if there are not two sets, or the ending is no format.
+        DataError: if a table lacks a column or has no episode.
+        ResultsError: if the file cannot be written.
+    """
+    figure = figure_leaders(sets)
+    path = Path(path)
+    kind = path.suffix.lstrip(".")
+    known = figure.canvas.get_supported_filetypes()
+    if kind not in known:
+        raise ConfigError(f"{path}: the ending must be one of {', '.join(sorted(known))}")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=kind, dpi=150)
+
+
+def _distribution(axes: Axes, quantity: str, values: Mapping[str, NDArray[np.float64]]) -> None:
+    """Densities of one quantity in both sets."""
+    both = np.concatenate(list(values.values()))
+    low, high = np.quantile(both, TAIL), np.quantile(both, 1.0 - TAIL)
+    edges = np.linspace(low, high, BINS[quantity] + 1)
+    for (name, found), colour, filled in zip(
+        values.items(), COLOURS, ("stepfilled", "step"), strict=True
+    ):
+        axes.hist(
+            found,
+            bins=edges.tolist(),
+            density=True,
+            histtype=filled,  # type: ignore[arg-type]
+            color=colour,
+            alpha=0.45 if filled == "stepfilled" else 1.0,
+            linewidth=1.6,
+            label=f"{name}, {len(found):,} {SAMPLES[quantity]}",
+        )
+    unit = UNITS[quantity]
+    axes.set_xlabel(f"{LABELS[quantity]} [{unit}]")
+    axes.set_ylabel(f"density [1/({unit})]" if "/" in unit else f"density [1/{unit}]")
+    axes.set_ylim(top=1.3 * axes.get_ylim()[1])  # room for the legend
+    axes.legend(frameon=False, fontsize="small", loc="upper right")
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _traces(axes: Axes, name: str, episodes: pd.DataFrame, colour: str) -> None:
+    """Speed traces of a few leaders."""
+    key = "episode" if "episode" in episodes.columns else "event"
+    groups = episodes.groupby(key)
+    order = groups["leader_speed_mps"].mean().sort_values(kind="stable").index
+    places = (np.arange(TRACES) + 0.5) / TRACES * len(order)
+    chosen = list(dict.fromkeys(order[places.astype(int)]))
+    for rank, episode in enumerate(chosen):
+        trace = groups.get_group(episode)
+        time = trace["time_s"] - trace["time_s"].iloc[0]
+        shade = 1.0 - 0.6 * rank / max(len(chosen) - 1, 1)
+        axes.plot(time, trace["leader_speed_mps"], color=colour, alpha=shade, linewidth=1.3)
+    axes.set_title(f"{name}: {len(chosen)} of {len(order)} leaders", fontsize="medium")
+    axes.set_xlabel("time since the episode began [s]")
+    axes.spines[["top", "right"]].set_visible(False)
