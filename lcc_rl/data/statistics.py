@@ -81,7 +81,7 @@ def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataF
         One row per compared number: quantity, statistic, unit, reference, other and deviation.
         The deviation of the mean speed, the standard deviation of acceleration and the mean
         energy is a share of the reference value; that of a quantile is a share of the 5–95 %
-        span of the reference.
+        span of the reference. NaN where the reference has no such scale, or no value.
     """
     rows = []
     for quantity, unit in UNITS.items():
@@ -89,7 +89,8 @@ def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataF
         for statistic in (LEVEL[quantity], *map(_label, QUANTILES)):
             one, two = (_cell(table, quantity, statistic) for table in (reference, other))
             scale = one if statistic == LEVEL[quantity] else span
-            rows.append((quantity, statistic, unit, one, two, (two - one) / scale))
+            deviation = (two - one) / scale if scale else np.nan
+            rows.append((quantity, statistic, unit, one, two, deviation))
     columns = ["quantity", "statistic", "unit", "reference", "other", "deviation"]
     return pd.DataFrame(rows, columns=columns)
 
