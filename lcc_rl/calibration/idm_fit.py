@@ -228,7 +228,7 @@ def fit(
         raise unknown_name("calibration mode", mode, MODES)
     if choose_constants and mode != "local":
         raise ConfigError("choose_constants applies to local calibration only")
-    limits = _checked_bounds(bounds)
+    limits = checked_bounds(bounds)
     constants = constants or IDMConstants()
     genetic = genetic or DEFAULT_GENETIC[mode]
     observed = episodes if isinstance(episodes, Observed) else observe(episodes, selection)
@@ -250,8 +250,12 @@ def fit(
     return Calibration(drivers, report, constants, found.generations, found.evaluations)
 
 
-def _checked_bounds(bounds: Mapping[str, Sequence[float]] | None) -> dict[str, tuple[float, float]]:
-    """Fill in default bounds and check the given ones."""
+def checked_bounds(bounds: Mapping[str, Sequence[float]] | None) -> dict[str, tuple[float, float]]:
+    """Fill in default bounds and check the given ones.
+
+    Raises:
+        ConfigError: if a parameter is unknown or its bounds are not 0 < lower < upper.
+    """
     limits = dict(DEFAULT_BOUNDS)
     for name, pair in (bounds or {}).items():
         if name not in COLUMNS:

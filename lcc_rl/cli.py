@@ -1,0 +1,115 @@
+"""Command-line room: what every Hydra entry point does around its own work."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from lcc_rl.errors import ConfigError, LccError
+
+# OSError: Hydra cannot make the run's folder, a disk is full, a file is not ours to read.
+INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
+TRACEBACK = "HYDRA_FULL_ERROR"
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+    """Make a function of a configuration a command: Hydra around it, clear errors around Hydra.
+
+    Whatever is wrong with the input (an option, a file, a row) ends in one line on stderr and
+    exit code 2; Ctrl-C in exit code 130. A bug still shows its traceback. In a sweep a failed job
+    lets the others finish first. ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
+
+    Args:
+        config_name: the entry point's configuration in ``lcc_rl.conf``, without suffix.
+    """
+
+    def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        @wraps(function)
+        def job(config: DictConfig) -> Any:
+            # In a sweep Hydra collects failures, so they must reach it as exceptions.
+            if HydraConfig.get().mode is RunMode.MULTIRUN:
+                return function(config)
+            return main_guard(function)(config)
+
+        command = hydra.main(
+            version_base="1.3", config_path="pkg://lcc_rl.conf", config_name=config_name
+        )(job)
+
+        @wraps(function)
+        def main() -> None:
+            wanted = TRACEBACK in os.environ
+            # Makes Hydra hand errors over instead of printing them in its own way.
+            os.environ.setdefault(TRACEBACK, "1")
+            try:
+                command() if wanted else main_guard(command)()
+            finally:
+                if not wanted:
+                    os.environ.pop(TRACEBACK, None)
+
+        return main
+
+    return decorate
+
+
+def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Turn errors of the input into one line on stderr and exit code 2."""
+
+    @wraps(function)
+    def guarded(*arguments: Any, **settings: Any) -> Any:
+        try:
+            return function(*arguments, **settings)
+        except INPUT_ERRORS as error:
+            _stop(error)
+        except KeyboardInterrupt:
+            print("lcc_rl: interrupted", file=sys.stderr)
+            sys.exit(INTERRUPTED)
+
+    return guarded
+
+
+def _stop(error: Exception) -> NoReturn:
+    """Print an error in one line; Hydra wraps those of a constructor, which says more."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, LccError):
+        cause = cause.__cause__
+    text = " ".join(str(cause or error).split())
+    print(f"lcc_rl: error: {text}", file=sys.stderr)
+    sys.exit(BAD_INPUT)
+
+
+def run_folder() -> Path:
+    """The folder of the present run, made by Hydra (the run's or the sweep job's)."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def prepare_torch(cfg: DictConfig) -> torch.device:
+    """Check ``seed``, ``threads`` and ``device`` of a study, set the threads, return the device.
+
+    Raises:
+        ConfigError: if one of them is of the wrong type or impossible on this machine.
+    """
+    for name, least in (("seed", 0), ("threads", 1)):
+        value = cfg.get(name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise ConfigError(f"{name} must be a whole number from {least} up, got {value!r}")
+    try:
+        device = torch.device(cfg.device)
+        torch.empty(0, device=device)
+    # Which error torch raises depends on how it was built.
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise ConfigError(f"device {cfg.device!r} is not available: {error}") from error
+    torch.set_num_threads(cfg.threads)
+    return device
