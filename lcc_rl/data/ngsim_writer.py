@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +97,7 @@ def _start_times(frame: pd.DataFrame, path: str) -> dict[str, int]:
         starts[str(name)] = FIRST_START_MS + untold * HOUR_MS if told is None else told
         untold += told is None
     ordered = sorted(starts.values())
-    if any(later - earlier <= 5000 for earlier, later in zip(ordered, ordered[1:], strict=False)):
+    if any(later - earlier <= 5000 for earlier, later in pairwise(ordered)):
         raise DataError(
             f"{path}: two recordings start at the same time, and the 18-column layout has nothing "
             f"else to tell them apart; write one file each. Recordings: {', '.join(starts)}"

@@ -1,0 +1,209 @@
+"""Episode room: the one table of car-following episodes that everything downstream reads."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from lcc_rl.errors import DataError, ResultsError
+from lcc_rl.results.files import read_parquet, write_parquet
+
+SCHEMA: dict[str, str] = {
+    "episode": "int32",
+    "recording": "str",
+    "follower_id": "int64",
+    "leader_id": "int64",
+    "time_s": "float64",
+    "follower_position_m": "float32",
+    "follower_speed_mps": "float32",
+    "leader_position_m": "float32",
+    "leader_speed_mps": "float32",
+    "leader_length_m": "float32",
+    "gap_m": "float32",
+}
+COLUMNS = tuple(SCHEMA)
+ALIASES = {"event": "episode", "period": "recording"}
+NUMBERS = tuple(name for name, kind in SCHEMA.items() if kind != "str")
+SPEEDS = ("follower_speed_mps", "leader_speed_mps")
+PLAUSIBLE_SPEED = 70.0  # m/s; above it a column is in km/h or ft/s rather than driven that fast
+
+
+def read_episodes(path: str | Path) -> pd.DataFrame:
+    """Read an episode table from a parquet file and validate it.
+
+    Args:
+        path: parquet file with the columns of ``SCHEMA``; ``event`` and ``period`` are taken for
+            ``episode`` and ``recording``. Further columns are left out.
+
+    Returns:
+        Columns ``SCHEMA`` in SI: episode, recording, follower_id, leader_id, time_s, follower and
+        leader position (front bumper), speed, leader length and gap (bumper to bumper).
+
+    Raises:
+        DataError: if the file cannot be read or its content is not a valid episode table.
+    """
+    try:
+        frame = read_parquet(path)
+    except (ResultsError, ValueError, NotImplementedError) as error:
+        raise DataError(f"{path}: is not a readable episode table: {error}") from error
+    names = {old: new for old, new in ALIASES.items() if new not in frame.columns}
+    return validate_episodes(frame.rename(columns=names), str(path))
+
+
+def write_episodes(frame: pd.DataFrame, path: str | Path) -> None:
+    """Validate an episode table and write it atomically as parquet.
+
+    Raises:
+        DataError: if the table is not valid.
+        ResultsError: if the file cannot be written.
+    """
+    write_parquet(validate_episodes(frame, str(path)), path)
+
+
+def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
+    """Check an episode table and give it the types of ``SCHEMA``.
+
+    Args:
+        frame: the table; rows of one episode must be consecutive and in order of time.
+        source: where it comes from, for messages.
+
+    Returns:
+        The columns of ``SCHEMA`` in their order and types, with a fresh index.
+
+    Raises:
+        DataError: naming the source, the row (from 0) and the column, if a column is missing or
+            holds NaN, text or an impossible value; if an episode is split, a single row, stands
+            for several pairs, or its time does not advance by one constant step.
+    """
+    _check_columns(frame, source)
+    if frame.empty:
+        raise DataError(f"{source}: has no episodes; expected at least one row")
+    frame = frame[list(COLUMNS)].reset_index(drop=True)
+    for name in NUMBERS:
+        frame[name] = _checked_numbers(frame[name], source)
+    if frame["recording"].isna().any():
+        raise _at(source, frame["recording"].isna(), "recording", "is blank; expected a name")
+    for name in SPEEDS:
+        _check_speed(frame[name], source)
+    _check_positive(frame["leader_length_m"] >= 0, "leader_length_m", source)
+    _check_episodes(frame, source)
+    return frame.astype({**SCHEMA, "recording": str})
+
+
+def split_episodes(frame: pd.DataFrame) -> list[dict[str, NDArray]]:
+    """Split a validated table into one dictionary of arrays per episode, without copying rows.
+
+    Returns:
+        For each episode, in order: every column of the table as an array of shape ``[time]``.
+    """
+    starts = _starts(frame["episode"].to_numpy())
+    stops = [*starts[1:], len(frame)]
+    arrays = {str(name): frame[name].to_numpy() for name in frame.columns}
+    return [
+        {name: values[start:stop] for name, values in arrays.items()}
+        for start, stop in zip(starts, stops, strict=True)
+    ]
+
+
+def _check_columns(frame: pd.DataFrame, source: str) -> None:
+    present = [str(name) for name in frame.columns]
+    for name in COLUMNS:
+        if present.count(name) > 1:
+            raise DataError(f"{source}: has column {name!r} twice; expected it once")
+        if name not in present:
+            near = get_close_matches(name, present, n=1)
+            hint = f"; the nearest is {near[0]!r}" if near else ""
+            raise DataError(f"{source}: has no column {name!r}{hint}. It has: {', '.join(present)}")
+
+
+def _at(source: str, wrong: pd.Series | NDArray[np.bool_], name: str, message: str) -> DataError:
+    row = int(np.argmax(np.asarray(wrong)))
+    return DataError(f"{source}: row {row}, column {name!r} {message}")
+
+
+def _checked_numbers(column: pd.Series, source: str) -> pd.Series:
+    """The column as finite numbers within its type."""
+    name = str(column.name)
+    if pd.api.types.is_bool_dtype(column) or pd.api.types.is_datetime64_any_dtype(column):
+        raise DataError(f"{source}: column {name!r} holds {column.dtype}; expected numbers")
+    try:
+        numbers = pd.to_numeric(column, errors="coerce").astype("float64")
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{source}: column {name!r} does not hold numbers: {error}") from error
+    wrong = ~np.isfinite(numbers.to_numpy())
+    if wrong.any():
+        shown = column.iloc[int(np.argmax(wrong))]
+        raise _at(source, wrong, name, f"holds {shown!r}; expected a finite number")
+    if SCHEMA[name].startswith("int"):
+        limit = np.iinfo(SCHEMA[name]).max if SCHEMA[name] == "int32" else 2**53
+        wrong = ((numbers != np.rint(numbers)) | (numbers.abs() > limit)).to_numpy()
+        if wrong.any():
+            shown = column.iloc[int(np.argmax(wrong))]
+            raise _at(source, wrong, name, f"holds {shown!r}; expected a whole number")
+    return numbers
+
+
+def _check_speed(speed: pd.Series, source: str) -> None:
+    name = str(speed.name)
+    _check_positive(speed >= 0, name, source)
+    fast = (speed > PLAUSIBLE_SPEED).to_numpy()
+    if fast.any():
+        value = speed.iloc[int(np.argmax(fast))]
+        message = f"holds {value:g} m/s; expected at most {PLAUSIBLE_SPEED:g} (is it km/h or ft/s?)"
+        raise _at(source, fast, name, message)
+
+
+def _check_positive(holds: pd.Series, name: str, source: str) -> None:
+    if not holds.all():
+        raise _at(source, ~holds, name, "is negative; expected at least 0")
+
+
+def _check_episodes(frame: pd.DataFrame, source: str) -> None:
+    """Episodes are unbroken, of one pair, longer than a row and regular in time."""
+    episode = frame["episode"].to_numpy()
+    starts = _starts(episode)
+    seen = pd.Series(episode[starts]).duplicated().to_numpy()
+    if seen.any():
+        row = int(starts[int(np.argmax(seen))])
+        raise DataError(
+            f"{source}: row {row}, column 'episode': episode {episode[row]:.0f} appears again "
+            "after another; expected its rows together, once"
+        )
+    lengths = np.diff(np.append(starts, len(frame)))
+    if (lengths < 2).any():
+        row = int(starts[int(np.argmax(lengths < 2))])
+        raise DataError(f"{source}: row {row}: an episode of one row; expected at least two")
+    for name in ("recording", "follower_id", "leader_id"):
+        first = frame[name].to_numpy()[np.repeat(starts, lengths)]
+        wrong = np.asarray(frame[name].to_numpy() != first)
+        if wrong.any():
+            raise _at(source, wrong, name, "changes within an episode; expected one pair")
+    _check_time(frame["time_s"].to_numpy(), starts, source)
+
+
+def _starts(episode: NDArray) -> NDArray[np.intp]:
+    """First row of every episode."""
+    return np.flatnonzero(np.concatenate([[True], episode[1:] != episode[:-1]]))
+
+
+def _check_time(time: NDArray[np.float64], starts: NDArray[np.intp], source: str) -> None:
+    """One positive step of time throughout the table."""
+    steps = np.diff(time)
+    inner = np.ones(len(steps), dtype=bool)
+    inner[starts[1:] - 1] = False
+    step = float(np.median(steps[inner]))
+    # Times that were kept in float32 are off by some tens of microseconds.
+    wrong = np.append(False, inner & ((steps <= 0) | (np.abs(steps - step) > 0.01 * abs(step))))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise _at(
+            source,
+            wrong,
+            "time_s",
+            f"is {steps[row - 1]:+g} s after the row before; expected a constant step "
+            f"({step:g} s here)",
+        )

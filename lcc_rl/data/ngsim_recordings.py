@@ -1,0 +1,135 @@
+"""Recording room: tells apart the recordings in which vehicle ids are used again.
+
+Within a recording the clock runs 100 ms a frame, so Global_Time − 100·Frame_ID, the time of frame
+0, is the same in every row of it and differs between recordings by minutes. Published clocks are
+not perfect. Those of one file and location are taken in three steps:
+
+1. A clock that is blank, zero or no plausible epoch is unusable. The site Peachtree publishes its
+   epoch in seconds (and still 100 a frame): that is usable.
+2. Times of frame 0 that lie within ``JITTER`` of the next one belong together, so that jitter,
+   truncation and rounding do not split a recording.
+3. Times that belong together and yet spread over more than ``SPREAD`` are no steady clock (one
+   that stands still, say) and are unusable too.
+
+Rows with a usable clock are told apart by location and time, over all files. Rows without one join
+the only recording of their file and location, where there is exactly one, and otherwise form a
+recording of their own per file and location.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+JITTER = 5_000  # ms; recordings of one site start at least 11,700 clock units apart
+SPREAD = 300_000  # ms; periods last 15 min, and a float32 clock is off by up to 66 s
+SECONDS_BELOW = 10**11  # an epoch below this is in seconds: in ms it would be in 1973
+
+
+class Group(NamedTuple):
+    """Rows of one file and location whose clocks tell the same time of frame 0.
+
+    Args:
+        file: path of the file.
+        location: Location in lower case, '' where there is none.
+        start: Global_Time − 100·Frame_ID as published; 0 where the clock is unusable.
+    """
+
+    file: str
+    location: str
+    start: int
+
+
+def name_recordings(rows: dict[Group, int]) -> tuple[dict[Group, str], list[str]]:
+    """Name the recording of every group.
+
+    Args:
+        rows: number of rows of each group.
+
+    Returns:
+        A name such as ``i-80@2005-04-13T22:58:55Z`` (UTC, the commonest time of frame 0), or
+        ``<file stem>#1`` where the clock does not tell, for each group; and notes for the report.
+    """
+    steady = _steady(rows)
+    named: dict[Group, str] = {}
+    for location in sorted({group.location for group in steady}):
+        here = [group for group in steady if group.location == location]
+        for cluster in _clusters(here):
+            name = _time_name(location, _commonest(cluster, rows))
+            named.update(dict.fromkeys(cluster, name))
+    notes = _name_by_file(named, rows)
+    return named, notes
+
+
+def _steady(rows: dict[Group, int]) -> list[Group]:
+    """Groups whose clock is usable; each file is judged alone, not to spoil the others."""
+    places: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    for group in rows:
+        if group.start > 0:
+            places[group.file, group.location].append(group)
+    return [
+        group
+        for groups in places.values()
+        for cluster in _clusters(groups)
+        if cluster[-1].start - cluster[0].start <= SPREAD
+        for group in cluster
+    ]
+
+
+def _clusters(groups: Iterable[Group]) -> list[list[Group]]:
+    """Groups in order of their start, cut where the next one is more than JITTER away."""
+    clusters: list[list[Group]] = []
+    for group in sorted(groups, key=lambda group: group.start):
+        if clusters and group.start - clusters[-1][-1].start <= JITTER:
+            clusters[-1].append(group)
+        else:
+            clusters.append([group])
+    return clusters
+
+
+def _commonest(cluster: list[Group], rows: dict[Group, int]) -> int:
+    """Start that most rows tell, the earliest of equals."""
+    counts: Counter[int] = Counter()
+    for group in cluster:
+        counts[group.start] += rows[group]
+    return min(counts, key=lambda start: (-counts[start], start))
+
+
+def _time_name(location: str, start: int) -> str:
+    seconds = start if start < SECONDS_BELOW else start // 1000
+    time = datetime.fromtimestamp(seconds, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return f"{location}@{time}" if location else time
+
+
+def _name_by_file(named: dict[Group, str], rows: dict[Group, int]) -> list[str]:
+    """Name the groups whose clock is unusable, in place; returns notes."""
+    recordings: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for group, name in named.items():
+        recordings[group.file, group.location].add(name)
+    untold: Counter[tuple[str, str]] = Counter()
+    own: dict[tuple[str, str], str] = {}
+    for group in sorted(rows.keys() - named.keys()):
+        place = (group.file, group.location)
+        untold[place] += rows[group]
+        if place not in own:
+            alone = len(recordings[place]) == 1
+            own[place] = next(iter(recordings[place])) if alone else _file_name(place[0], own)
+        named[group] = own[place]
+    return [
+        f"Global_Time does not tell the recording of {count:,} rows of {file}"
+        f"{f' at {location}' if location else ''}: taken as {own[file, location]}"
+        for (file, location), count in untold.items()
+    ]
+
+
+def _file_name(file: str, own: dict[tuple[str, str], str]) -> str:
+    """``<stem>#k`` with the smallest k that is free."""
+    stem = Path(file).name.removesuffix(".gz")
+    stem = stem.rpartition(".")[0] or stem
+    number = 1
+    while f"{stem}#{number}" in own.values():
+        number += 1
+    return f"{stem}#{number}"
