@@ -103,10 +103,14 @@ class DDPG:
         self.targets = SoftUpdate(self.loss, tau=tau)
         self.optimizer = torch.optim.Adam(
             [
-                {"params": list(self.loss.actor_network_params.flatten_keys().values()),
-                 "lr": actor_lr},
-                {"params": list(self.loss.value_network_params.flatten_keys().values()),
-                 "lr": critic_lr},
+                {
+                    "params": list(self.loss.actor_network_params.flatten_keys().values()),
+                    "lr": actor_lr,
+                },
+                {
+                    "params": list(self.loss.value_network_params.flatten_keys().values()),
+                    "lr": critic_lr,
+                },
             ],
             fused=True,
         )

@@ -1,0 +1,139 @@
+"""Entry point: evaluate a policy beside the human baselines, ``python -m lcc_rl.evaluate``."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pandas as pd
+from omegaconf import DictConfig, OmegaConf
+
+from lcc_rl.cli import entry_point, prepare_torch, run_folder
+from lcc_rl.config import load
+from lcc_rl.envs.factory import Inputs, build_agent, load_inputs
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.evaluation.monte_carlo import Strategy
+from lcc_rl.results.runs import load_policy, save_config
+from lcc_rl.results.study_figures import write_study_figures
+from lcc_rl.train import evaluate_and_write
+
+log = logging.getLogger("lcc_rl")
+
+BASELINES = ("direct", "idm")
+# What makes a baseline what it is; everything else it shares with the scenario under study.
+OWN_SETTINGS = {("cav", "max_acceleration"), ("hdv", "predecessor")}
+
+
+def run(cfg: DictConfig, folder: str | Path) -> pd.DataFrame:
+    """Evaluate a policy, those it is compared with, and the human baselines.
+
+    All meet the same profiles, drivers and noise. Writes config.yaml, episodes.parquet,
+    steps.parquet and figures.
+
+    Args:
+        cfg: configuration of the entry point ``evaluate``.
+        folder: where the files go.
+
+    Returns:
+        The rows of episodes.parquet.
+
+    Raises:
+        LccError: one clear error for whatever is wrong with settings, data or files.
+    """
+    folder = Path(folder)
+    prepare_torch(cfg)
+    inputs = load_inputs(cfg)
+    for line in inputs.report:
+        log.info(line)
+    strategies = [baseline(cfg, name, inputs) for name in BASELINES]
+    strategies += [trained(cfg, path, inputs) for path in cfg.compare]
+    if cfg.variant not in BASELINES:
+        strategies.append(studied(cfg, inputs))
+    save_config(cfg, folder)
+    episodes = evaluate_and_write(strategies, cfg, inputs, folder)
+    write_study_figures(folder)
+    return episodes
+
+
+def baseline(cfg: DictConfig, variant: str, inputs: Inputs) -> Strategy:
+    """Build a human baseline in the scenario under study."""
+    if cfg.variant == variant:
+        own = cfg
+    else:
+        own = load("evaluate", [f"variant={variant}"])
+        share_scenario(cfg, own)
+    return Strategy(variant, own, build_agent(own, inputs.population, cfg.device).policy)
+
+
+def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
+    """Give another variant the clock and the piece settings of the scenario under study."""
+    OmegaConf.set_struct(other, False)
+    for key in ("horizon", "time_step", "followers"):
+        other.scenario[key] = cfg.scenario[key]
+    for name, node in other.scenario.pieces.items():
+        for key, value in cfg.scenario.pieces.get(name, {}).items():
+            if not key.startswith("_") and (name, key) not in OWN_SETTINGS:
+                node[key] = value
+
+
+def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
+    """Build the strategy that the configuration asks for.
+
+    Raises:
+        ConfigError: if it needs a policy and none is given, or the policy is of another variant.
+    """
+    agent = build_agent(cfg, inputs.population, cfg.device)
+    if not agent.learns:
+        if cfg.policy is not None:
+            raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+        return Strategy(cfg.variant, cfg, agent.policy)
+    if cfg.policy is None:
+        raise ConfigError(
+            f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
+            f"(python -m lcc_rl.train variant={cfg.variant} makes one)"
+        )
+    weights, own = load_policy(cfg.policy)
+    if own.variant != cfg.variant:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
+            f"say variant={own.variant}"
+        )
+    if own.observation != OmegaConf.create(OmegaConf.to_container(cfg.observation, resolve=True)):
+        raise ConfigError(f"policy={cfg.policy} was trained with another observation than this")
+    cfg = OmegaConf.merge(OmegaConf.create(OmegaConf.to_container(cfg)), {"agent": own.agent})
+    return with_weights(cfg, weights, own.seed, str(cfg.policy), inputs)
+
+
+def trained(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
+    """Build a trained strategy from its policy file, in the scenario under study."""
+    weights, own = load_policy(path)
+    share_scenario(cfg, own)
+    return with_weights(own, weights, own.seed, path, inputs)
+
+
+def with_weights(
+    cfg: DictConfig, weights: dict[str, object], seed: int, path: str, inputs: Inputs
+) -> Strategy:
+    """Build a strategy and load its policy's weights.
+
+    Raises:
+        ResultsError: if the weights do not fit the network.
+    """
+    agent = build_agent(cfg, inputs.population, cfg.device)
+    try:
+        agent.policy.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ResultsError(f"{path}: the weights do not fit the policy network: {error}") from error
+    return Strategy(cfg.variant, cfg, agent.policy, seed)
+
+
+@entry_point("evaluate")
+def main(cfg: DictConfig) -> None:
+    """Evaluate into the run's folder."""
+    folder = run_folder()
+    run(cfg, folder)
+    log.info("results in %s", folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Measures of one episode, from its time series."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from lcc_rl.functional.power import kinetic_energy
+
+KILO = 1e-3
+UNSAFE_TTC = 4.0  # [s] (A10)
+LONG_TIME_GAP = 2.5  # [s] (A13)
+
+
+def energy_measures(
+    power: Tensor, speed: Tensor, alive: Tensor, time_step: float
+) -> dict[str, Tensor]:
+    """Energy of one vehicle, raw, net of its change in kinetic energy, and its distance.
+
+    Args:
+        power: motor power of each step, ``[time, *batch]`` [W].
+        speed: speed at every moment, ``[time + 1, *batch]`` [m/s].
+        alive: whether the episode was still running, ``[time, *batch]``.
+        time_step: duration of a step [s].
+
+    Returns:
+        ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
+        that it did not draw) and ``distance_m``, each ``[*batch]``.
+    """
+    energy = (power * alive).sum(0) * time_step * KILO
+    last = speed.gather(0, alive.sum(0, keepdim=True).long()).squeeze(0)
+    stored = (kinetic_energy(last) - kinetic_energy(speed[0])) * KILO
+    distance = (0.5 * (speed[:-1] + speed[1:]) * alive).sum(0) * time_step
+    return {"energy_kj": energy, "net_energy_kj": energy - stored, "distance_m": distance}
+
+
+def safety_measures(
+    series: Mapping[str, Tensor], alive: Tensor, time_step: float
+) -> dict[str, Tensor]:
+    """Safety, efficiency and comfort of the controlled car.
+
+    Args:
+        series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
+            each ``[time, *batch]``.
+        alive: whether the episode was still running, ``[time, *batch]``.
+        time_step: duration of a step [s].
+
+    Returns:
+        Minima, maxima, shares of time and root mean squares, each ``[*batch]``.
+    """
+    steps = alive.sum(0).clamp(min=1)
+
+    def share(condition: Tensor) -> Tensor:
+        return (condition & alive).sum(0) / steps
+
+    def lowest(entry: Tensor) -> Tensor:
+        return torch.where(alive, entry, torch.inf).amin(0)
+
+    def highest(entry: Tensor) -> Tensor:
+        return torch.where(alive, entry, -torch.inf).amax(0)
+
+    return {
+        "min_gap_m": lowest(series["gap"]),
+        "min_ttc_s": lowest(series["ttc"]),
+        "max_time_gap_s": highest(series["time_gap"]),
+        "share_ttc_unsafe": share(series["ttc"] < UNSAFE_TTC),
+        "share_time_gap_long": share(series["time_gap"] > LONG_TIME_GAP),
+        "rms_jerk_mps3": ((series["jerk"] ** 2 * alive).sum(0) / steps).sqrt(),
+        "duration_s": alive.sum(0) * time_step,
+    }

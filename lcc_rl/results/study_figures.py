@@ -1,0 +1,207 @@
+"""Figures of a study, each from parquet alone (ALCC Figs. 6, 7, 9 and 10)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lcc_rl.results.files import atomic_path, read_parquet
+from lcc_rl.results.runs import load
+from lcc_rl.results.tables import paired
+
+# Distinct without colour vision and in grey.
+COLOURS = {"alcc": "#0072b2", "reference": "#d55e00", "idm": "#6b6b6b", "direct": "#222222"}
+OTHERS = ("#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+VEHICLES = {
+    "leader": ("leader", "#222222"),
+    "cav": ("controlled car", "#0072b2"),
+    "hdv": ("human follower", "#d55e00"),
+}
+WINDOW = 10  # iterations of the rolling mean
+
+
+def colour(strategy: str) -> str:
+    """Return the colour that a strategy has in every figure."""
+    return COLOURS.get(strategy) or OTHERS[sum(strategy.encode()) % len(OTHERS)]
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that needs no display."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def style(axis: Axes, xlabel: str, ylabel: str) -> None:
+    """Label an axis and take away what carries no information."""
+    axis.set_xlabel(xlabel)
+    axis.set_ylabel(ylabel)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, whole or not at all."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=150)
+    return path
+
+
+def learning_curve(training: pd.DataFrame) -> Figure:
+    """Episode reward over episodes, with a band (Fig. 6).
+
+    Args:
+        training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
+
+    Returns:
+        With several seeds of a variant the line is their mean and the band its 95 % confidence
+        interval; with a single one the rolling mean and the 5th to 95th percentile of the same
+        window.
+    """
+    figure = new_figure(7.0, 4.0)
+    axis = figure.subplots()
+    floor = 0.0
+    for variant, rows in training.groupby("variant", sort=False):
+        curves = rows.pivot_table(index="episodes", columns="seed", values="episode_reward")
+        smooth = curves.rolling(WINDOW, min_periods=1)
+        mean = smooth.mean().mean(axis=1)
+        if curves.shape[1] > 1:
+            error = smooth.mean().std(axis=1) / np.sqrt(curves.shape[1])
+            low, high = mean - 1.96 * error, mean + 1.96 * error
+            label = f"{variant} (n = {curves.shape[1]} seeds, 95 % band)"
+        else:
+            low, high = (smooth.quantile(q).iloc[:, 0] for q in (0.05, 0.95))
+            label = f"{variant} (1 seed; band: 5–95 % of {WINDOW} batches)"
+        axis.plot(mean.index, mean, color=colour(str(variant)), label=label)
+        axis.fill_between(mean.index, low, high, color=colour(str(variant)), alpha=0.2, lw=0)
+        floor = min(floor, float(mean.iloc[len(mean) // 5 :].min()))
+    # The first, random episodes are far below everything else and would set the scale.
+    axis.set_ylim(bottom=1.6 * floor - 1.0)
+    style(axis, "training episodes", "mean reward per episode")
+    axis.legend(frameon=False)
+    axis.set_title("Learning curve, exploration noise included")
+    return figure
+
+
+def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
+    """Speeds, accelerations and gaps of one held-out episode (Fig. 7)."""
+    rows = steps[steps["strategy"] == strategy]
+    first = rows.iloc[0]
+    rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
+    figure = new_figure(7.0, 6.5)
+    axes = figure.subplots(3, 1, sharex=True)
+    for vehicle, (name, hue) in VEHICLES.items():
+        for axis, entry in zip(axes, ("speed", "acceleration", "gap"), strict=True):
+            column = f"{vehicle}_{entry}"
+            if column in rows and rows[column].notna().any():
+                axis.plot(rows["time_s"], rows[column], color=hue, label=name, lw=1.3)
+    style(axes[0], "", "speed [m/s]")
+    style(axes[1], "", "acceleration [m/s²]")
+    style(axes[2], "time [s]", "gap ahead [m]")
+    axes[0].legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.3))
+    figure.suptitle(
+        f"{strategy}: profile {first['profile']}, driver v0 {first['desired_speed_mps']:.1f} m/s, "
+        f"T {first['time_gap_s']:.2f} s",
+        fontsize=10,
+    )
+    return figure
+
+
+def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
+    """Energy of the human driver behind the controlled car and directly behind the leader (Fig. 9)."""
+    by_driver = (
+        episodes[episodes["strategy"].isin([strategy, "direct"])]
+        .pivot_table(index="driver_id", columns="strategy", values="hdv_energy_kj")
+        .dropna()
+    )
+    a, b = by_driver[strategy], by_driver["direct"]
+    figure = new_figure(9.0, 3.8)
+    left, right = figure.subplots(1, 2)
+    bins = np.histogram_bin_edges(np.concatenate([a, b]), 30)
+    left.hist(b, bins, color=colour("direct"), alpha=0.45, label=f"B: direct, mean {b.mean():.1f}")
+    label = f"A: behind {strategy}, mean {a.mean():.1f}"
+    left.hist(a, bins, color=colour(strategy), alpha=0.6, label=label)
+    style(left, "energy of the human driver [kJ per episode]", "drivers")
+    left.legend(frameon=False)
+    _paired_bars(right, 1.0 - a / b, "saving of A against B [%]", colour(strategy))
+    figure.suptitle(
+        f"Human driver's energy with and without the controlled car ahead (n = {len(a)} drivers)",
+        fontsize=10,
+    )
+    return figure
+
+
+def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
+    """Saving of the total energy per driver, strategy against baseline (Fig. 10)."""
+    by_driver = paired(episodes, "total_energy_kj").groupby("driver_id").mean()
+    saving = 1.0 - by_driver[strategy] / by_driver[baseline]
+    figure = new_figure(7.0, 3.8)
+    axis = figure.subplots()
+    label = f"total energy saved by {strategy} against {baseline} [%]"
+    _paired_bars(axis, saving, label, colour(strategy))
+    figure.suptitle(
+        f"{strategy} against {baseline}: mean {100 * saving.mean():+.2f} %, "
+        f"best {100 * saving.max():+.2f} %, worst {100 * saving.min():+.2f} %, "
+        f"{int((saving < 0).sum())} of {len(saving)} drivers worse off",
+        fontsize=10,
+    )
+    return figure
+
+
+def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
+    """Draw one bar per driver, sorted; below zero means worse off."""
+    ordered = 100 * np.sort(saving.to_numpy())
+    axis.bar(np.arange(len(ordered)), ordered, width=1.0, color=hue, alpha=0.8)
+    axis.axhline(0.0, color="#222222", lw=0.8)
+    axis.axhline(ordered.mean(), color="#222222", lw=0.8, ls="--")
+    axis.annotate(
+        f"mean {ordered.mean():+.1f} %",
+        (0.02, ordered.mean()),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 3),
+        textcoords="offset points",
+    )
+    style(axis, "drivers, sorted", label)
+
+
+def write_study_figures(folder: str | Path, training: str | Path | None = None) -> list[Path]:
+    """Draw every figure that the parquet files of a folder allow.
+
+    Args:
+        folder: holds episodes.parquet and steps.parquet; figures go to ``figures`` in it.
+        training: folder above the trainings, for the learning curve; None for none.
+
+    Returns:
+        The figures' paths.
+
+    Raises:
+        ResultsError: if a table is missing or a figure cannot be written.
+    """
+    folder = Path(folder)
+    episodes, steps = (
+        read_parquet(folder / "episodes.parquet"),
+        read_parquet(folder / "steps.parquet"),
+    )
+    target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
+    cars = [name for name in names if name != "direct"]
+    paths = []
+    if training is not None:
+        paths.append(
+            save_figure(learning_curve(load(training, "training")), target / "learning_curve.png")
+        )
+    for name in cars:
+        if len(steps) and (steps["strategy"] == name).any():
+            paths.append(save_figure(sample_episode(steps, name), target / f"episode_{name}.png"))
+        if "direct" in names:
+            figure = human_energy(episodes, name)
+            paths.append(save_figure(figure, target / f"human_energy_{name}.png"))
+        for baseline in ("idm", "reference"):
+            if baseline in names and baseline != name and name != "idm":
+                figure = paired_improvement(episodes, name, baseline)
+                path = target / f"improvement_{name}_vs_{baseline}.png"
+                paths.append(save_figure(figure, path))
+    return paths

@@ -1,0 +1,96 @@
+"""Result tables: what the strategies cost and gain, from the rows of episodes.parquet."""
+
+from __future__ import annotations
+
+import pandas as pd
+from rich.table import Table
+
+KEYS = ["profile_id", "driver_id"]
+
+
+def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Put strategies side by side: one row per (profile, driver), the mean over training seeds."""
+    return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
+
+
+def summary(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Summarise every strategy.
+
+    Args:
+        episodes: rows of one or more evaluations on the same profiles and drivers.
+
+    Returns:
+        One row per strategy: mean energies (raw, net of kinetic energy, per kilometre), saving
+        against the human baseline ``idm`` and against ``reference``, share of drivers worse off
+        than with each, and the safety measures. Savings are positive where energy is saved;
+        entries that do not exist for a strategy are missing.
+    """
+    total, net = paired(episodes, "total_energy_kj"), paired(episodes, "total_net_energy_kj")
+    rows = []
+    for strategy, group in episodes.groupby("strategy", sort=False):
+        row: dict[str, object] = {"strategy": strategy, "episodes": len(group)}
+        for vehicle in ("cav", "hdv", "total"):
+            for kind in ("energy_kj", "net_energy_kj"):
+                row[f"{vehicle}_{kind}"] = group[f"{vehicle}_{kind}"].mean()
+        kilometres = (group["cav_distance_m"].fillna(0) + group["hdv_distance_m"]).sum() / 1e3
+        energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
+        row["kj_per_km"] = energy.sum() / kilometres
+        for baseline in ("idm", "reference"):
+            row |= _against(total, net, str(strategy), baseline)
+        row["collisions"] = int(group["collided"].sum())
+        row["min_ttc_s"] = group["min_ttc_s"].min()
+        for column in ("share_ttc_unsafe", "share_time_gap_long", "rms_jerk_mps3"):
+            row[column] = group[column].mean()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _against(
+    total: pd.DataFrame, net: pd.DataFrame, strategy: str, baseline: str
+) -> dict[str, float]:
+    """Savings of a strategy over a baseline, paired by profile and driver."""
+    names = [f"saving_vs_{baseline}", f"net_saving_vs_{baseline}", f"worse_than_{baseline}"]
+    if not {strategy, baseline} <= set(total.columns) or strategy == baseline:
+        return dict.fromkeys(names, float("nan"))
+    by_driver = total.groupby("driver_id")[[strategy, baseline]].mean()
+    return dict(
+        zip(
+            names,
+            (
+                1.0 - total[strategy].mean() / total[baseline].mean(),
+                1.0 - net[strategy].mean() / net[baseline].mean(),
+                float((by_driver[strategy] > by_driver[baseline]).mean()),
+            ),
+            strict=True,
+        )
+    )
+
+
+COLUMNS = (
+    ("strategy", "strategy", "{}"),
+    ("CAV kJ", "cav_energy_kj", "{:.1f}"),
+    ("HDV kJ", "hdv_energy_kj", "{:.1f}"),
+    ("total kJ", "total_energy_kj", "{:.1f}"),
+    ("net kJ", "total_net_energy_kj", "{:.1f}"),
+    ("kJ/km", "kj_per_km", "{:.0f}"),
+    ("vs idm", "saving_vs_idm", "{:+.1%}"),
+    ("vs ref.", "saving_vs_reference", "{:+.1%}"),
+    ("worse off", "worse_than_reference", "{:.0%}"),
+    ("min TTC s", "min_ttc_s", "{:.1f}"),
+    ("TTC<4 s", "share_ttc_unsafe", "{:.2%}"),
+    ("TG>2.5 s", "share_time_gap_long", "{:.2%}"),
+    ("crashes", "collisions", "{:d}"),
+    ("jerk", "rms_jerk_mps3", "{:.2f}"),
+)
+
+
+def as_rich(table: pd.DataFrame, title: str) -> Table:
+    """Draw a summary for the terminal; savings are positive where energy is saved."""
+    drawn = Table(title=title, caption="energies: mean per episode; jerk: RMS [m/s³]")
+    for heading, _, _ in COLUMNS:
+        drawn.add_column(heading, justify="left" if heading == "strategy" else "right")
+    for row in table.to_dict("records"):
+        drawn.add_row(
+            *("–" if pd.isna(row[key]) else form.format(row[key]) for _, key, form in COLUMNS)
+        )
+    return drawn
