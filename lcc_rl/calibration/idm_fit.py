@@ -287,15 +287,19 @@ def _choose_constants(
     lower, upper = _box(MODES["local"], limits, observed.gap)
 
     def mean_error(candidates: Tensor) -> Tensor:
-        # One candidate at a time: drivers × population already fill the caches.
-        rows = []
-        for values in candidates[0].tolist():
-            trial = replace(constants, **dict(zip(SHARED, values, strict=True)))
-            error = SpeedError(observed, trial, MODES["local"], compiled)
-            generator = torch.Generator().manual_seed(seed)
-            found = minimise(error, lower, upper, observed.count, generator, inner)
-            rows.append(found.fitness.mean())
-        return torch.stack(rows).unsqueeze(0)
+        # Every pair of driver and candidate is a problem of its own.
+        count = candidates.shape[1]
+
+        def error(genes: Tensor) -> Tensor:
+            own = candidates[0].repeat_interleave(genes.shape[1], dim=0).unbind(-1)
+            trial = constants.with_(**dict(zip(SHARED, own, strict=True)))
+            side_by_side = genes.reshape(observed.count, -1, genes.shape[-1])
+            found = SpeedError(observed, trial, MODES["local"], compiled)(side_by_side)
+            return found.reshape(genes.shape[:-1])
+
+        generator = torch.Generator().manual_seed(seed)
+        found = minimise(error, lower, upper, observed.count * count, generator, inner)
+        return found.fitness.reshape(observed.count, count).mean(0, keepdim=True)
 
     generator = torch.Generator().manual_seed(seed)
     box = _box(SHARED, limits, observed.gap)

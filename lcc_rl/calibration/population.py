@@ -13,7 +13,14 @@ import torch
 from scipy.stats import gaussian_kde
 from torch import Tensor
 
-from lcc_rl.calibration.idm_fit import BOUND_TOLERANCE, COLUMNS, DEFAULT_BOUNDS, MODES, SHARED
+from lcc_rl.calibration.idm_fit import (
+    BOUND_TOLERANCE,
+    COLUMNS,
+    DEFAULT_BOUNDS,
+    MODES,
+    SHARED,
+    checked_bounds,
+)
 from lcc_rl.errors import ConfigError, DataError, ResultsError, unknown_name
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.results.files import read_parquet
@@ -230,12 +237,12 @@ def kde(
             drawn jointly.
 
     Raises:
-        ConfigError: if a setting is out of range.
+        ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
     if drivers < 1 or (bandwidth is not None and not bandwidth > 0.0):
         raise ConfigError("kde: 'drivers' and 'bandwidth' must be positive")
-    limits = {**DEFAULT_BOUNDS, **(bounds or {})}
+    limits = checked_bounds(bounds)
     table = load_drivers(path, mode)
     names = [name for name, column in COLUMNS.items() if np.ptp(table[column].to_numpy()) > 0.0]
     values = table[[COLUMNS[name] for name in names]].to_numpy(np.float64).T
