@@ -155,8 +155,8 @@ def build(node: Any, where: str, **resources: Any) -> Any:
         ConfigError: if the target is unknown, a key is none of its arguments, one is missing, or
             a value has the wrong type.
     """
-    settings = (
-        dict(OmegaConf.to_container(node, resolve=True)) if OmegaConf.is_config(node) else node
+    settings: Any = (
+        OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     )
     if not isinstance(settings, Mapping) or TARGET not in settings:
         raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}")

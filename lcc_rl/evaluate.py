@@ -100,7 +100,9 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
         )
     if own.observation != OmegaConf.create(OmegaConf.to_container(cfg.observation, resolve=True)):
         raise ConfigError(f"policy={cfg.policy} was trained with another observation than this")
-    cfg = OmegaConf.merge(OmegaConf.create(OmegaConf.to_container(cfg)), {"agent": own.agent})
+    cfg = cfg.copy()
+    OmegaConf.set_struct(cfg, False)
+    cfg.agent = own.agent
     return with_weights(cfg, weights, own.seed, str(cfg.policy), inputs)
 
 

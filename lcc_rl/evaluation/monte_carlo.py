@@ -137,7 +137,7 @@ def roll(env: TransformedEnv, policy: Any, given: TensorDictBase) -> tuple[Serie
             (vehicle, entry)
             for vehicle in VEHICLES
             for entry in RECORDED
-            if (vehicle, entry) in td.keys(True)  # noqa: SIM118
+            if (vehicle, entry) in td.keys(True)
         ]
         record: dict[tuple[str, str], list[Tensor]] = {
             key: [td.get(key)] if key[1] == "speed" else [] for key in keys

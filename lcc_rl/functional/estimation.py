@@ -1,9 +1,12 @@
 """Online estimation of a human driver's desired speed and time gap (A15).
 
 With a, b and s0 known, A3 is linear in q = (v_ref/v0)^δ and quadratic in T. Each step therefore
-allows one Gauss–Newton update of (q, T) from a single scalar measurement, the follower's
-acceleration by differencing; the running 2×2 covariance is all that is remembered. The calibrated
-population is the prior, which keeps what a drive does not reveal (v0 in congestion) plausible.
+allows one recursive update of (q, T) from a single scalar measurement, the follower's
+acceleration by differencing; the running 2×2 covariance is all that is remembered. Because the
+model is exactly quadratic in T, the update can account for the curvature too (a second-order
+filter), without which a wide belief about T is led astray by its first measurements. The
+calibrated population is the prior, which keeps what a drive does not reveal (v0 in congestion)
+plausible.
 """
 
 from __future__ import annotations
@@ -95,9 +98,11 @@ def predict_and_update(
     informative = (speed_reached > 0.0) & (measured.abs() < constants.acceleration_limit)
     spread_q = variance_q * slope_q + covariance * slope_t
     spread_t = covariance * slope_q + variance_t * slope_t
-    total = slope_q * spread_q + slope_t * spread_t + measurement_error**2
-    weight = informative / total
-    surprise = (measured - predicted) * weight
+    # What the square of T adds to mean and variance of the model; exact for a Gaussian belief.
+    curvature = constants.acceleration * (speed * inverse_gap).square() * variance_t
+    total = slope_q * spread_q + slope_t * spread_t + 2.0 * curvature.square()
+    weight = informative / (total + measurement_error**2)
+    surprise = (measured - predicted + curvature) * weight
     estimate = torch.cat(
         [
             (q + spread_q * surprise).clamp(min=1e-3),

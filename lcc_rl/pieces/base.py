@@ -10,7 +10,7 @@ keyword call, on a stored rollout and in a replay buffer. Two kinds exist:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -51,6 +51,9 @@ class Piece(TensorDictModuleBase, Transform):
         event_shape: shape of one written entry after the batch dimensions.
     """
 
+    # Maps the entries read to the entries written; a pure function of tensors.
+    compute: Callable[..., Any]
+
     def __init__(
         self,
         reads: Sequence[NestedKey],
@@ -61,10 +64,6 @@ class Piece(TensorDictModuleBase, Transform):
             in_keys=[as_tuple(key) for key in reads], out_keys=[as_tuple(key) for key in writes]
         )
         self.event_shape = tuple(event_shape)
-
-    def compute(self, *entries: Tensor) -> Tensor | tuple[Tensor, ...]:
-        """Map the entries read to the entries written; a pure function of tensors."""
-        raise NotImplementedError
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
         """Return the spec of each written key, without ``"next"``."""

@@ -12,7 +12,7 @@ and ``+reward.terms.comfort={_target_: mymodule.Comfort, weight: 0.1}`` on the c
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -38,6 +38,8 @@ class RewardTerm(RewardPiece):
     """
 
     reads: ClassVar[tuple[NestedKey, ...]] = ()
+    # Maps the entries read to the unweighted term, [*batch, 1].
+    reward: Callable[..., Tensor]
 
     def __init__(
         self, name: str, weight: float = 1.0, reads: Sequence[NestedKey] | None = None
@@ -46,10 +48,6 @@ class RewardTerm(RewardPiece):
             raise ConfigError(f"reward.terms.{name}.weight must be finite, got {weight}")
         super().__init__(self.reads if reads is None else reads, [(TERMS, name)])
         self.name, self.weight = name, weight
-
-    def reward(self, *entries: Tensor) -> Tensor:
-        """Return the unweighted term, shape ``[*batch, 1]``."""
-        raise NotImplementedError
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the weighted term."""

@@ -126,7 +126,8 @@ class IDMFollower(Transition):
         predecessor: namespace of the vehicle ahead of the first of them.
 
     Raises:
-        ConfigError: if ``followers`` or ``noise`` is out of range.
+        ConfigError: if ``followers`` or ``noise`` is out of range, or the drivers differ in more
+            than (v0, T).
     """
 
     desired_speeds: Tensor
@@ -145,6 +146,11 @@ class IDMFollower(Transition):
     ) -> None:
         if followers < 1:
             raise ConfigError(f"{name}.followers must be at least 1, got {followers}")
+        if any(isinstance(value, Tensor) for value in vars(population.constants).values()):
+            raise ConfigError(
+                f"{name}: drivers must share a, b and s0 (a locally calibrated population, "
+                "drivers.mode=local), got a population in which they differ by driver"
+            )
         if not 0.0 <= noise < 1.0:
             raise ConfigError(f"{name}.noise must lie in [0, 1), got {noise}")
         constants = [(name, "driver"), (name, "desired_speed"), (name, "desired_time_gap")]

@@ -112,7 +112,7 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 
 def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
-    """Energy of the human driver behind the controlled car and directly behind the leader (Fig. 9)."""
+    """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
     by_driver = (
         episodes[episodes["strategy"].isin([strategy, "direct"])]
         .pivot_table(index="driver_id", columns="strategy", values="hdv_energy_kj")

@@ -1,0 +1,78 @@
+"""Equations against values worked out by hand."""
+
+import pytest
+import torch
+
+from lcc_rl.functional.kinematics import advance_gap, advance_speed
+from lcc_rl.functional.power import kinetic_energy, motor_power, traction_force
+from lcc_rl.functional.safety import time_gap, time_to_collision
+
+
+def t(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_advance_speed_stops_at_zero() -> None:
+    # 10 + 2·0.1 = 10.2; 0.1 − 3·0.1 < 0, so it stops and has executed (0 − 0.1)/0.1 = −1.
+    speed, executed = advance_speed(t(10.0, 0.1), t(2.0, -3.0), 0.1)
+    torch.testing.assert_close(speed, t(10.2, 0.0))
+    torch.testing.assert_close(executed, t(2.0, -1.0))
+
+
+def test_advance_gap_is_trapezoidal() -> None:
+    # 5 + 0.1/2·((12 − 10) + (11 − 10.2)) = 5 + 0.05·2.8 = 5.14
+    gap = advance_gap(t(5.0), t(12.0), t(10.0), t(11.0), t(10.2), 0.1)
+    torch.testing.assert_close(gap, t(5.14))
+
+
+def test_motor_power_a2() -> None:
+    # v = 10, a = 1: 110.3 + 4229 + 1213 − 2.79 + 24840 + 2911 + 355.7 + 137.4 + 251.9
+    # = 34045.51 W
+    # v = 10, a = −1: 110.3 + 4229 − 1213 − 2.79 − 24840 + 2911 + 355.7 − 137.4 + 251.9
+    # = −18335.29 W
+    torch.testing.assert_close(motor_power(t(10.0, 10.0), t(1.0, -1.0)), t(34045.51, -18335.29))
+    torch.testing.assert_close(motor_power(t(10.0), t(-1.0), recuperation=False), t(0.0))
+    # Standing still: the constant alone.
+    torch.testing.assert_close(motor_power(t(0.0), t(0.0)), t(110.3))
+
+
+def test_traction_force_a1() -> None:
+    # v = 20, a = 0.5: 1.02·1005·0.5 = 512.55; 1005·9.81·0.015 = 147.88575;
+    # 0.5·0.3·2.02·1.206·400 = 146.1672; sum 806.60295 N
+    torch.testing.assert_close(traction_force(t(20.0), t(0.5)), t(806.60295))
+
+
+def test_motor_power_agrees_with_wheel_power() -> None:
+    # A2 is a fit of the electric power; at steady speed it must exceed the mechanical power of A1
+    # but by no more than a plausible loss.
+    speed = t(5.0, 10.0, 15.0, 20.0)
+    still = torch.zeros_like(speed)
+    ratio = motor_power(speed, still) / (traction_force(speed, still) * speed)
+    assert ((ratio > 1.0) & (ratio < 3.5)).all(), ratio
+
+
+def test_kinetic_energy() -> None:
+    # 0.5·1.02·1005·10² = 51255 J
+    torch.testing.assert_close(kinetic_energy(t(10.0)), t(51255.0))
+
+
+@pytest.mark.parametrize(
+    ("gap", "rate", "expected"),
+    [(8.0, 2.0, 4.0), (8.0, 0.0, 1e3), (8.0, -1.0, 1e3), (0.001, 5.0, 0.01), (-0.5, -1.0, 0.01)],
+)
+def test_time_to_collision(gap: float, rate: float, expected: float) -> None:
+    # closing: 8/2 = 4; opening or steady: the ceiling; contact: the floor, whatever the rate.
+    torch.testing.assert_close(time_to_collision(t(gap), t(rate)), t(expected))
+
+
+def test_time_gap_floor() -> None:
+    # 20/10 = 2; standing, floored at 1 m/s: 2.2/1 = 2.2; the literal rule: the ceiling.
+    torch.testing.assert_close(time_gap(t(20.0, 2.2), t(10.0, 0.0)), t(2.0, 2.2))
+    torch.testing.assert_close(time_gap(t(2.2), t(0.0), speed_floor=0.0), t(1e3))
+
+
+def test_time_to_collision_has_finite_gradient_where_it_does_not_close() -> None:
+    rate = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    time_to_collision(t(1.0, 5.0, -1.0), rate).sum().backward()
+    assert rate.grad is not None
+    assert torch.isfinite(rate.grad).all()
