@@ -54,6 +54,8 @@ def test_error_is_that_of_the_plain_simulation(mode, pieces, monkeypatch, uneven
     torch.testing.assert_close(error, expected, rtol=1e-9, atol=1e-12)
 
 
+# The compiler itself uses what its own package has deprecated.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.slow
 def test_compiled_simulation_gives_the_same_errors(uneven_lengths):
     observed = observe(uneven_lengths)
