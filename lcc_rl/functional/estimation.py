@@ -103,21 +103,16 @@ def predict_and_update(
     total = slope_q * spread_q + slope_t * spread_t + 2.0 * curvature.square()
     weight = informative / (total + measurement_error**2)
     surprise = (measured - predicted + curvature) * weight
-    estimate = torch.cat(
-        [
-            (q + spread_q * surprise).clamp(min=1e-3),
-            (time_gap + spread_t * surprise).clamp(0.05, 10.0),
-        ],
-        dim=-1,
-    )
-    learned = torch.cat(
-        [
-            variance_q - spread_q * spread_q * weight,
-            covariance - spread_q * spread_t * weight,
-            variance_t - spread_t * spread_t * weight,
-        ],
-        dim=-1,
-    )
+    variance_q = variance_q - spread_q * spread_q * weight
+    covariance = covariance - spread_q * spread_t * weight
+    variance_t = variance_t - spread_t * spread_t * weight
+    q, time_gap = q + spread_q * surprise, time_gap + spread_t * surprise
+    # A negative q means nothing (v0 beyond all bounds is q = 0); T follows along the covariance,
+    # else the pair would leave the ridge that the measurements allow.
+    bounded = q.clamp(min=0.0)
+    time_gap = time_gap + covariance / variance_q * (bounded - q)
+    estimate = torch.cat([bounded, time_gap.clamp(0.05, 10.0)], dim=-1)
+    learned = torch.cat([variance_q, covariance, variance_t], dim=-1)
     return predicted, Belief(estimate, learned)
 
 
