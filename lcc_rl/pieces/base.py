@@ -70,7 +70,7 @@ class Piece(TensorDictModuleBase, Transform):
         shape = (*batch, *self.event_shape)
         return {key: Unbounded(shape=shape, device=device) for key in map(arrived, self.out_keys)}
 
-    @dispatch
+    @dispatch(auto_batch_size=False)  # entries of followers have one dimension more
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         entries = [tensordict.get(key) for key in self.in_keys]
