@@ -8,9 +8,10 @@ are kept, in compact types, so that the whole portal export fits in a few gigaby
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from lcc_rl.data.ngsim_layouts import Block, read_blocks
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.ngsim_writer import write_ngsim
+from lcc_rl.data.places import Places, find
 from lcc_rl.data.units import FOOT, FRAME
 from lcc_rl.errors import DataError
 
@@ -129,7 +131,6 @@ class _Store:
 def read_ngsim(
     path: str | Path | Sequence[str | Path],
     location: str | None = None,
-    progress: Callable[[int], None] | None = None,
 ) -> Trajectories:
     """Read one or several NGSIM files, of any published layout, into SI.
 
@@ -147,7 +148,6 @@ def read_ngsim(
     Args:
         path: file or files, plain or gzipped.
         location: keep only rows of this Location (such as ``i-80``), whatever its letter case.
-        progress: called with the number of rows read so far after every block.
 
     Raises:
         DataError: if a file is missing, damaged, of no known layout, or a needed cell is blank or
@@ -162,8 +162,6 @@ def read_ngsim(
         for block in read_blocks(name):
             store.report.rows_read += block.rows_read
             _take(store, block, wanted)
-            if progress is not None:
-                progress(store.report.rows_read)
     if not store.chunks:
         raise DataError(_none_left_message(store, location))
     return Trajectories(_table(store), store.report)
@@ -294,13 +292,14 @@ def _table(store: _Store) -> pd.DataFrame:
     """The samples, sorted, without duplicates, with segments and headways."""
     columns = _joined(store.chunks)
     recording, names = _recordings(store, columns.pop("group"))
-    keys = _Keys(recording, columns["vehicle"], columns["frame"])
-    order, key = _kept_order(store, columns, keys)
+    places = Places(recording, columns["vehicle"], columns["frame"])
+    key = places.keys(recording, columns["vehicle"], columns["frame"])
+    order, key = _kept_order(store, columns, key)
     recording = recording[order]
     for name in list(columns):  # one column at a time, to hold only one extra copy
         columns[name] = columns[name][order]
     segment = _segments(key, recording, columns)
-    _fill_headways(store.report, columns, recording, keys, key)
+    _fill_headways(store.report, columns, recording, places, key)
     _count(store, recording, names, segment, columns["vehicle"])
     return _frame(columns, recording, names, segment)
 
@@ -325,39 +324,12 @@ def _recordings(store: _Store, group: NDArray[np.int32]) -> tuple[NDArray[np.int
     return codes[group], names
 
 
-class _Keys:
-    """One number per (recording, vehicle, frame), in the order of the table."""
-
-    def __init__(
-        self, recording: NDArray[np.int16], vehicle: NDArray[np.int64], frame: NDArray[np.int32]
-    ) -> None:
-        self.span = int(frame.max()) + 1
-        self.ids: NDArray[np.int64] | None = None
-        self.vehicles = int(vehicle.max()) + 1
-        if (int(recording.max()) + 1) * self.vehicles * self.span >= 2**62:
-            self.ids = np.unique(vehicle)  # ids too far apart to pack: use their ranks
-            self.vehicles = len(self.ids)
-        self.of_rows = self.pack(recording, vehicle, frame)
-
-    def pack(
-        self, recording: NDArray[np.int16], vehicle: NDArray[np.int64], frame: NDArray[np.int32]
-    ) -> NDArray[np.int64]:
-        """Keys of the given places; −1 for a vehicle that has no row at all."""
-        rank, known = vehicle, (vehicle > 0) & (vehicle < self.vehicles)
-        if self.ids is not None:
-            rank = np.minimum(np.searchsorted(self.ids, vehicle), len(self.ids) - 1)
-            known = self.ids[rank] == vehicle
-        key = (recording.astype(np.int64) * self.vehicles + rank) * self.span + frame
-        return np.where(known, key, -1)
-
-
 def _kept_order(
-    store: _Store, columns: Columns, keys: _Keys
+    store: _Store, columns: Columns, key: NDArray[np.int64]
 ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Rows to keep in sorted order, and their keys; duplicates are counted by kind."""
-    order = np.argsort(keys.of_rows, kind="stable")  # stable: the first in the files stays
-    key = keys.of_rows[order]
-    keys.of_rows = key[:0]
+    order = np.argsort(key, kind="stable")  # stable: the first in the files stays
+    key = key[order]
     repeated = np.zeros(len(key), dtype=bool)
     repeated[1:] = key[1:] == key[:-1]
     if not repeated.any():
@@ -395,7 +367,7 @@ def _fill_headways(
     report: ReadReport,
     columns: Columns,
     recording: NDArray[np.int16],
-    keys: _Keys,
+    places: Places,
     key: NDArray[np.int64],
 ) -> None:
     """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
@@ -404,19 +376,13 @@ def _fill_headways(
     given = follows & (headway != 0)
     headway[~given] = np.nan
     rows = np.flatnonzero(follows & ~given)
-    leader = find_leaders(keys.pack(recording[rows], preceding[rows], columns["frame"][rows]), key)
+    leader = find(places.keys(recording[rows], preceding[rows], columns["frame"][rows]), key)
     rows, leader = rows[leader >= 0], leader[leader >= 0]
     position = columns["position_m"]
     headway[rows] = position[leader] - position[rows]
     report.headways_given = int(given.sum())
     report.headways_derived = len(rows)
     report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
-
-
-def find_leaders(wanted: NDArray[np.int64], key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row of each wanted key in the sorted keys; −1 where it is not there."""
-    row = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-    return np.where(key[row] == wanted, row, -1)
 
 
 def _count(
@@ -454,7 +420,7 @@ def _frame(
     columns: Columns, recording: NDArray[np.int16], names: list[str], segment: NDArray[np.int32]
 ) -> pd.DataFrame:
     """The table, in its documented column order and without copying the columns."""
-    series: dict[str, NDArray | pd.Categorical] = {
+    series: dict[str, Any] = {
         "recording": pd.Categorical.from_codes(recording, categories=pd.Index(names)),
         "vehicle": columns["vehicle"],
         "frame": columns["frame"],

@@ -146,10 +146,10 @@ class Block:
         if not bad.any():
             return values
         # Blank cells and the word NaN both arrive here as NaN.
-        if blank is None or np.isinf(values).any():
-            wrong = bad if blank is None else np.isinf(values)
+        wrong = bad if blank is None else np.isinf(values)
+        if wrong.any():
             self.fail(int(np.argmax(wrong)), name, f"{unit}, a finite number")
-        return np.where(bad, blank, values)
+        return np.nan_to_num(values, nan=blank or 0.0)
 
     def integers(
         self, name: str, low: int, high: int, blank: int | None = None

@@ -1,0 +1,292 @@
+"""Car-following room: stretches of one vehicle behind another, filtered by stated criteria.
+
+A candidate is a maximal stretch of consecutive frames in which a vehicle names the same preceding
+vehicle and both have a row. Each criterion then removes whole candidates, in a fixed order, and
+the report counts how many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from lcc_rl.data.episodes import PLAUSIBLE_SPEED, SCHEMA
+from lcc_rl.data.ngsim import Trajectories
+from lcc_rl.data.places import find_leaders
+from lcc_rl.data.units import FRAME
+from lcc_rl.errors import ConfigError, DataError
+
+PASSENGER_CAR = 2
+LANE_CHANGES = ("split", "reject")
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """What counts as an episode of car following.
+
+    Args:
+        min_duration_s: shortest episode [s].
+        max_duration_s: longest episode [s]; None for no limit. Longer ones are removed, not cut.
+        min_gap_m: smallest gap at any time [m], bumper to bumper; None for no limit.
+        max_gap_m: largest gap at any time [m], beyond which a driver does not follow; None for no
+            limit.
+        passenger_cars_only: both vehicles are of class 2 throughout. Where the class of every
+            vehicle is unknown there is nothing to filter on: all stay and the report says so.
+        lane_changes: both vehicles share one lane throughout. ``split`` cuts a candidate where
+            they do not and judges the parts; ``reject`` removes a candidate with any lane change.
+
+    Raises:
+        ConfigError: if a limit is negative, not a number, or a lower one above an upper one.
+    """
+
+    min_duration_s: float = 15.0
+    max_duration_s: float | None = None
+    min_gap_m: float | None = 0.0
+    max_gap_m: float | None = 120.0
+    passenger_cars_only: bool = True
+    lane_changes: str = "split"
+
+    def __post_init__(self) -> None:
+        for name in ("min_duration_s", "max_duration_s", "max_gap_m"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ConfigError(f"criteria: {name!r} must be at least 0, got {value}")
+        if self.min_duration_s < FRAME:
+            raise ConfigError(
+                f"criteria: 'min_duration_s' must be at least {FRAME:g} s, two samples, got "
+                f"{self.min_duration_s}"
+            )
+        _ordered("min_duration_s", self.min_duration_s, "max_duration_s", self.max_duration_s)
+        _ordered("min_gap_m", self.min_gap_m, "max_gap_m", self.max_gap_m)
+        if self.lane_changes not in LANE_CHANGES:
+            raise ConfigError(
+                f"criteria: 'lane_changes' must be one of {', '.join(LANE_CHANGES)}, got "
+                f"{self.lane_changes!r}"
+            )
+
+
+def _ordered(low_name: str, low: float | None, high_name: str, high: float | None) -> None:
+    if low is not None and high is not None and not low <= high:
+        raise ConfigError(
+            f"criteria: {low_name!r} ({low}) must not be above {high_name!r} ({high})"
+        )
+
+
+@dataclass
+class ExtractionReport:
+    """What the extraction kept and why it removed the rest.
+
+    Args:
+        candidates: stretches of one vehicle behind another.
+        removed: candidates removed by each criterion, in the order of application.
+        kept: episodes left.
+        rows: samples in the episodes.
+        unseen: samples that name a preceding vehicle which has no row in that frame.
+        other_lane: samples that name a preceding vehicle on another lane, left out by ``split``.
+        notes: anything else worth a line.
+    """
+
+    candidates: int = 0
+    removed: dict[str, int] = field(default_factory=dict)
+    kept: int = 0
+    rows: int = 0
+    unseen: int = 0
+    other_lane: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def lines(self) -> list[str]:
+        """The report as plain lines."""
+        minutes = self.rows * FRAME / 60
+        left_out = {
+            "name a preceding vehicle that is not seen in that frame": self.unseen,
+            "name a preceding vehicle on another lane": self.other_lane,
+        }
+        return [
+            f"{self.candidates:,} candidates: stretches of one vehicle behind another",
+            *(f"left out {count:,} samples that {why}" for why, count in left_out.items() if count),
+            *(f"removed {count:,}: {name}" for name, count in self.removed.items()),
+            *self.notes,
+            f"kept {self.kept:,} episodes: {self.rows:,} samples, {minutes:,.1f} min",
+        ]
+
+
+@dataclass
+class _Pairs:
+    """Samples of followers that see their leader, and the candidates they form.
+
+    Args:
+        follower, leader: rows of the samples table, one entry per sample of a candidate.
+        starts, lengths: first entry and number of entries of each candidate.
+        gap: bumper-to-bumper gap of each entry [m].
+    """
+
+    follower: NDArray[np.int64]
+    leader: NDArray[np.int64]
+    starts: NDArray[np.intp]
+    lengths: NDArray[np.intp]
+    gap: NDArray[np.float32]
+
+    def least(self, values: NDArray) -> NDArray:
+        """Smallest value of each candidate."""
+        return np.minimum.reduceat(values, self.starts)
+
+    def largest(self, values: NDArray) -> NDArray:
+        """Largest value of each candidate."""
+        return np.maximum.reduceat(values, self.starts)
+
+    def always(self, holds: Mask) -> Mask:
+        """Candidates in which a condition holds throughout."""
+        return np.logical_and.reduceat(holds, self.starts)
+
+
+def extract(
+    trajectories: Trajectories, criteria: Criteria
+) -> tuple[pd.DataFrame, ExtractionReport]:
+    """Extract episodes of car following.
+
+    Args:
+        trajectories: samples in the shape of :class:`lcc_rl.data.ngsim.Trajectories`.
+        criteria: what counts as an episode.
+
+    Returns:
+        The episode table (:data:`lcc_rl.data.episodes.SCHEMA`), numbered from 0 in the order of
+        recording, follower and time; gap_m is the space headway less the leader's length. And a
+        report on what each criterion removed.
+
+    Raises:
+        DataError: if no vehicle follows another, or a criterion removes the last candidate; it
+            names the criterion.
+    """
+    samples = trajectories.samples
+    report = ExtractionReport()
+    pairs = _pairs(samples, criteria, report)
+    keep = np.ones(len(pairs.starts), dtype=bool)
+    for name, passes in _criteria(samples, pairs, criteria, report):
+        left = keep & passes
+        report.removed[name] = int(keep.sum() - left.sum())
+        keep = left
+        if not keep.any():
+            report.rows = 0
+            raise DataError(f"no episode is left after the criterion {name!r}:\n{report}")
+    episodes = _episodes(samples, pairs, keep)
+    report.kept, report.rows = int(keep.sum()), len(episodes)
+    return episodes, report
+
+
+def _pairs(samples: pd.DataFrame, criteria: Criteria, report: ExtractionReport) -> _Pairs:
+    """All candidates."""
+    preceding = samples["preceding"].to_numpy()
+    ahead = find_leaders(
+        samples["recording"].cat.codes.to_numpy(),
+        samples["vehicle"].to_numpy(),
+        samples["frame"].to_numpy(),
+        preceding,
+    )
+    report.unseen = int(((preceding > 0) & (ahead < 0)).sum())
+    lane = samples["lane"].to_numpy()
+    seen = ahead >= 0
+    if criteria.lane_changes == "split":
+        same = lane[ahead] == lane
+        report.other_lane = int((seen & ~same).sum())
+        seen &= same
+    follower = np.flatnonzero(seen)
+    if len(follower) == 0:
+        raise DataError(
+            f"no vehicle follows another in the same lane and frame: of {len(samples):,} samples "
+            f"{int((preceding > 0).sum()):,} name a preceding vehicle, and none of those is seen; "
+            "expected a Preceding column that names vehicles in the file"
+        )
+    leader = ahead[follower]
+    starts = _cuts(samples, follower, criteria)
+    report.candidates = len(starts)
+    length = samples["length_m"].to_numpy()[leader]
+    gap = samples["space_headway_m"].to_numpy()[follower] - length
+    return _Pairs(follower, leader, starts, np.diff(np.append(starts, len(follower))), gap)
+
+
+def _cuts(
+    samples: pd.DataFrame, follower: NDArray[np.int64], criteria: Criteria
+) -> NDArray[np.intp]:
+    """First entry of each candidate: a row left out, or a change of segment, leader or lane."""
+    cut = np.ones(len(follower), dtype=bool)
+    cut[1:] = np.diff(follower) != 1
+    names = ["segment", "preceding"] + (["lane"] if criteria.lane_changes == "split" else [])
+    for name in names:
+        values = samples[name].to_numpy()[follower]
+        cut[1:] |= values[1:] != values[:-1]
+    return np.flatnonzero(cut)
+
+
+def _criteria(
+    samples: pd.DataFrame, pairs: _Pairs, criteria: Criteria, report: ExtractionReport
+) -> Iterator[tuple[str, Mask]]:
+    """Name of each criterion and which candidates pass it, in the order of application."""
+    if criteria.lane_changes == "reject":
+        lane = samples["lane"].to_numpy()
+        own = lane[pairs.follower]
+        one_lane = pairs.least(own) == pairs.largest(own)
+        yield "lane_changes: reject", one_lane & pairs.always(own == lane[pairs.leader])
+    # Half a frame of slack: durations are sums of inexact tenths.
+    duration = (pairs.lengths - 1) * FRAME
+    yield (
+        f"min_duration_s: {criteria.min_duration_s:g}",
+        duration > criteria.min_duration_s - FRAME / 2,
+    )
+    if criteria.max_duration_s is not None:
+        yield (
+            f"max_duration_s: {criteria.max_duration_s:g}",
+            duration < criteria.max_duration_s + FRAME / 2,
+        )
+    if criteria.passenger_cars_only:
+        yield from _class_criterion(samples["vehicle_class"].to_numpy(), pairs, report)
+    speed = samples["speed_mps"].to_numpy()
+    plausible = (speed >= 0) & (speed <= PLAUSIBLE_SPEED)
+    name = f"speeds of 0 to {PLAUSIBLE_SPEED:g} m/s"
+    yield name, pairs.always(plausible[pairs.follower] & plausible[pairs.leader])
+    if criteria.min_gap_m is not None:
+        yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.least(pairs.gap) >= criteria.min_gap_m
+    if criteria.max_gap_m is not None:
+        yield f"max_gap_m: {criteria.max_gap_m:g}", pairs.largest(pairs.gap) <= criteria.max_gap_m
+
+
+def _class_criterion(
+    kind: NDArray[np.int8], pairs: _Pairs, report: ExtractionReport
+) -> Iterator[tuple[str, Mask]]:
+    if not kind.any():
+        report.notes.append(
+            "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so there "
+            "is nothing to filter on and every vehicle stays"
+        )
+        return
+    car = kind == PASSENGER_CAR
+    yield "passenger_cars_only", pairs.always(car[pairs.follower] & car[pairs.leader])
+
+
+def _episodes(samples: pd.DataFrame, pairs: _Pairs, keep: Mask) -> pd.DataFrame:
+    """The episode table of the candidates that are left."""
+    entry = np.flatnonzero(np.repeat(keep, pairs.lengths))
+    follower, leader = pairs.follower[entry], pairs.leader[entry]
+    position, speed = samples["position_m"].to_numpy(), samples["speed_mps"].to_numpy()
+    recording = samples["recording"].cat
+    columns = {
+        "episode": np.repeat(np.arange(int(keep.sum())), pairs.lengths[keep]),
+        "recording": np.asarray(recording.categories)[recording.codes.to_numpy()[follower]],
+        "follower_id": samples["vehicle"].to_numpy()[follower],
+        "leader_id": samples["vehicle"].to_numpy()[leader],
+        "time_s": samples["time_s"].to_numpy()[follower],
+        "follower_position_m": position[follower],
+        "follower_speed_mps": speed[follower],
+        "leader_position_m": position[leader],
+        "leader_speed_mps": speed[leader],
+        "leader_length_m": samples["length_m"].to_numpy()[leader],
+        "gap_m": pairs.gap[entry],
+    }
+    return pd.DataFrame(columns).astype({**SCHEMA, "recording": str})

@@ -1,0 +1,108 @@
+"""Source room: where car-following episodes come from; every source loads the same table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from glob import glob, has_magic
+from pathlib import Path
+
+import pandas as pd
+
+from lcc_rl.data.car_following import Criteria, extract
+from lcc_rl.data.episodes import read_episodes
+from lcc_rl.data.ngsim import Trajectories, read_ngsim
+from lcc_rl.errors import DataError
+
+
+@dataclass(frozen=True)
+class LoadedEpisodes:
+    """Episodes and how they came about.
+
+    Args:
+        episodes: the episode table, see :data:`lcc_rl.data.episodes.SCHEMA`.
+        report: plain lines: what was read, dropped, filtered and kept.
+    """
+
+    episodes: pd.DataFrame
+    report: list[str]
+
+
+@dataclass(frozen=True)
+class NgsimSource:
+    """Episodes extracted from NGSIM files of any published layout.
+
+    Args:
+        path: a file, several files, or a pattern such as ``data/*.csv.gz``.
+        location: keep only this Location (``i-80``, ``us-101`` …) of a file that has several.
+        smoothing: applied to the trajectories, see :mod:`lcc_rl.data.smoothing`; None for none.
+        criteria: what counts as an episode; None for the defaults.
+    """
+
+    path: str | Sequence[str]
+    location: str | None = None
+    smoothing: Callable[[Trajectories], Trajectories] | None = None
+    criteria: Criteria | None = None
+
+    def load(self) -> LoadedEpisodes:
+        """Read, smooth where asked, and extract.
+
+        Raises:
+            DataError: if a file is missing or not what was expected, or no episode is left.
+        """
+        files = find_files(self.path)
+        trajectories = read_ngsim(files, self.location)
+        if self.smoothing is not None:
+            trajectories = self.smoothing(trajectories)
+        try:
+            episodes, report = extract(trajectories, self.criteria or Criteria())
+        except DataError as error:
+            raise DataError(f"{', '.join(files)}: {error}") from error
+        return LoadedEpisodes(episodes, [*trajectories.report.lines(), *report.lines()])
+
+
+@dataclass(frozen=True)
+class EpisodesSource:
+    """Episodes that were extracted before, from a parquet file.
+
+    Args:
+        path: see :func:`lcc_rl.data.episodes.read_episodes`.
+    """
+
+    path: str
+
+    def load(self) -> LoadedEpisodes:
+        """Read and validate.
+
+        Raises:
+            DataError: if the file is missing or not a valid episode table.
+        """
+        path = Path(self.path).expanduser()
+        episodes = read_episodes(path)
+        count = episodes["episode"].nunique()
+        return LoadedEpisodes(
+            episodes, [f"read {count:,} episodes, {len(episodes):,} rows, {path}"]
+        )
+
+
+def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
+    """Files that a path, a pattern or a list of them stands for; a pattern's are sorted.
+
+    Raises:
+        DataError: if a pattern matches no file, or a file is named twice.
+    """
+    entries = [path] if isinstance(path, (str, Path)) else list(path)
+    files: list[str] = []
+    for entry in entries:
+        name = str(Path(entry).expanduser())
+        if has_magic(name) and not Path(name).exists():
+            found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())
+            if not found:
+                raise DataError(f"{name}: no file matches this pattern")
+            files += found
+        else:
+            files.append(name)
+    twice = sorted({name for name in files if files.count(name) > 1})
+    if twice:
+        raise DataError(f"{twice[0]}: is named twice; expected every file once")
+    return files
