@@ -26,9 +26,9 @@ class StopAndGo:
     strong accelerations of recorded traffic.
 
     The default values are fitted to NGSIM I-80 by ``tools/fit_stream.py``: they minimise the
-    distance between the leaders of the synthetic pairs and those of 264 real pairs in the
-    mean and quantiles of speed, acceleration and 30 s energy (see
-    :mod:`lcc_rl.data.statistics`), for platoons of four vehicles.
+    distance between the leaders of the synthetic pairs and those of 264 real pairs in the mean
+    and quantiles of speed, acceleration and 30 s energy (see :mod:`lcc_rl.data.statistics`) and
+    in the autocorrelation of acceleration, for platoons of four vehicles.
 
     Args:
         mean_speed_mps: mean of the levels [m/s].
@@ -45,22 +45,23 @@ class StopAndGo:
         ConfigError: if a parameter is not positive (the spreads may be zero), naming it.
     """
 
-    mean_speed_mps: float = 5.12
-    level_spread_mps: float = 2.22
-    wave_spread_mps: float = 3.49
-    wave_s: float = 4.12
-    ripple_spread_mps: float = 0.5
-    ripple_s: float = 1.5
-    response_s: float = 1.40
+    mean_speed_mps: float = 5.21
+    level_spread_mps: float = 2.78
+    wave_spread_mps: float = 2.59
+    wave_s: float = 4.92
+    ripple_spread_mps: float = 1.32
+    ripple_s: float = 2.13
+    response_s: float = 0.99
     acceleration_limit: float = 2.5
     braking_limit: float = 3.5
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             spread = name.endswith("spread_mps")
-            if not (value >= 0 if spread else value > 0) or not np.isfinite(value):
+            number = isinstance(value, (int, float)) and np.isfinite(value)
+            if not number or not (value >= 0 if spread else value > 0):
                 kind = "zero or more" if spread else "positive"
-                raise ConfigError(f"stop-and-go leader: {name!r} must be {kind}, got {value}")
+                raise ConfigError(f"stop-and-go leader: {name!r} must be {kind}, got {value!r}")
 
     def drive(
         self, count: int, steps: int, time_step: float, generator: np.random.Generator

@@ -8,8 +8,10 @@ reader, extraction and calibration; unlike there, the truth about every driver i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
@@ -17,11 +19,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lcc_rl.calibration.population import DriverPopulation
+from lcc_rl.calibration.population import DriverPopulation, bootstrap
+from lcc_rl.data.car_following import Criteria
+from lcc_rl.data.ngsim_writer import write_ngsim
+from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.stop_and_go import StopAndGo
 from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
+from lcc_rl.results.files import write_parquet
 
 Array = NDArray[np.float64]
 
@@ -65,9 +71,9 @@ class Lane:
         ConfigError: if an argument is out of range, naming it.
     """
 
-    platoons: int = 28
+    platoons: int = 30
     vehicles: int = 4
-    duration_s: tuple[float, float] = (35.0, 85.0)
+    duration_s: tuple[float, float] = (60.0, 90.0)
     leader: StopAndGo = field(default_factory=StopAndGo)
     noise: float = 0.05
 
@@ -79,8 +85,8 @@ class Lane:
             raise ConfigError(
                 f"stream: 'duration_s' must be a range from 1 s up, got {low}, {high}"
             )
-        if not 0.0 <= self.noise < 1.0:
-            raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise}")
+        if not isinstance(self.noise, (int, float)) or not 0.0 <= self.noise < 1.0:
+            raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise!r}")
 
     def drive(self, drivers: DriverPopulation, name: str, generator: np.random.Generator) -> Stream:
         """Drive one recording.
@@ -105,6 +111,102 @@ class Lane:
         length = _lengths((self.vehicles, self.platoons), generator)
         samples = _samples(speed, _positions(speed, gap, length), length, warm_up, seen)
         return Stream(samples.assign(recording=name), _truth(ranks).assign(recording=name))
+
+
+@dataclass(frozen=True)
+class StreamSource:
+    """The embedded default data: a stream, written in the NGSIM layout and read back.
+
+    The default size gives 270 pairs, about as many as the 264 real I-80 pairs that the leader is
+    fitted to, in three recordings like I-80's.
+
+    Args:
+        recordings: number of recordings; their leaders, drivers and vehicle ids are independent.
+        platoons: platoons per recording, one after another on its lane.
+        vehicles: vehicles per platoon, the stochastic leader included.
+        duration_s: range of the time that a platoon is seen [s].
+        seed: seed of all randomness; the same seed gives the same file, byte for byte.
+        noise: relative noise of the drivers' acceleration, see :class:`Lane`.
+        leader: the stochastic leader; by default the one fitted to I-80.
+        drivers: the population; by default the shipped I-80 drivers.
+        criteria: what counts as car following; by default that of the real files.
+        path: where the file is kept, ``.gz`` compresses it; by default it is read and forgotten.
+
+    Raises:
+        ConfigError: if an argument is out of range, naming it.
+    """
+
+    recordings: int = 3
+    platoons: int = 30
+    vehicles: int = 4
+    duration_s: tuple[float, float] = (60.0, 90.0)
+    seed: int = 0
+    noise: float = 0.05
+    leader: StopAndGo | None = None
+    drivers: DriverPopulation | None = None
+    criteria: Criteria | None = None
+    path: str | None = None
+
+    def __post_init__(self) -> None:
+        _at_least("recordings", self.recordings, 1)
+        _at_least("seed", self.seed, 0)
+        self._lane()
+
+    def generate(self) -> Stream:
+        """Drive all recordings.
+
+        Raises:
+            DataError: if the shipped drivers cannot be read.
+        """
+        lane, drivers = self._lane(), self.drivers or bootstrap()
+        made = [
+            lane.drive(drivers, recording_name(index), np.random.default_rng([self.seed, index]))
+            for index in range(self.recordings)
+        ]
+        samples = pd.concat([one.samples for one in made], ignore_index=True)
+        return Stream(samples, pd.concat([one.truth for one in made], ignore_index=True))
+
+    def write(self, path: str | Path) -> Stream:
+        """Drive all recordings and write them in the official NGSIM layout.
+
+        The truth is written beside the file, ``stream.csv`` getting ``stream_truth.parquet``.
+
+        Returns:
+            What was written.
+
+        Raises:
+            DataError: if the shipped drivers cannot be read.
+            ResultsError: if a file cannot be written.
+        """
+        stream = self.generate()
+        write_ngsim(stream.samples, path)
+        write_parquet(stream.truth, truth_path(path))
+        return stream
+
+    def load(self) -> LoadedEpisodes:
+        """Write the stream, read it back and extract its car-following episodes.
+
+        Raises:
+            DataError: if no pair meets the criteria.
+            ResultsError: if the file cannot be written.
+        """
+        with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
+            path = Path(self.path or Path(folder) / "stream.csv").expanduser()
+            self.write(path)
+            loaded = NgsimSource(str(path), criteria=self.criteria).load()
+        size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"
+        line = f"synthetic stream: {size} vehicles, seed {self.seed}"
+        return replace(loaded, report=[line, *loaded.report])
+
+    def _lane(self) -> Lane:
+        leader = self.leader or StopAndGo()
+        return Lane(self.platoons, self.vehicles, self.duration_s, leader, self.noise)
+
+
+def truth_path(path: str | Path) -> Path:
+    """Where the ground truth of a stream file lies."""
+    path = Path(path)
+    return path.with_name(f"{path.name.removesuffix('.gz').removesuffix('.csv')}_truth.parquet")
 
 
 def draw_drivers(
@@ -239,6 +341,5 @@ def _pair(name: str, value: object) -> tuple[float, float]:
 
 
 def recording_name(index: int) -> str:
-    """Name of a recording; it tells the start, an hour after the one before."""
-    start = FIRST_START + timedelta(hours=index)
-    return f"stream@{start.strftime('%Y-%m-%dT%H:%M:%SZ')}"
+    """Name of a recording as the reader gives it: its start, an hour after the one before."""
+    return (FIRST_START + timedelta(hours=index)).strftime("%Y-%m-%dT%H:%M:%SZ")
