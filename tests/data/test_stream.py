@@ -20,9 +20,10 @@ from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
 from lcc_rl.data.stop_and_go import StopAndGo, jumps, stratified_normal
-from lcc_rl.data.stream import Stream, StreamSource, draw_drivers
+from lcc_rl.data.stream import Stream, StreamSource, draw_drivers, truth_path
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
+from lcc_rl.results.files import read_parquet
 
 SMALL: dict[str, Any] = {"recordings": 2, "platoons": 4, "vehicles": 3, "duration_s": (35.0, 50.0)}
 MATCH = 0.15  # the accepted deviation of every compared number
@@ -116,6 +117,21 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
     StreamSource(**SMALL, seed=6).write(other)
     assert first.read_bytes() == second.read_bytes()
     assert first.read_bytes() != other.read_bytes()
+
+
+def test_file_and_truth_are_kept_where_asked(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "stream.csv.gz"
+    source = StreamSource(**SMALL, seed=5, path=str(path))
+    loaded = source.load()
+    assert sorted(file.name for file in path.parent.iterdir()) == [
+        "stream.csv.gz",
+        "stream_truth.parquet",
+    ]
+    truth = read_parquet(truth_path(path))
+    pd.testing.assert_frame_equal(truth, source.generate().truth)
+    pairs = loaded.episodes[["recording", "follower_id", "leader_id"]].drop_duplicates()
+    assert pairs.to_numpy().tolist() == truth[["recording", "vehicle", "preceding"]].values.tolist()
+    assert "seed 5" in loaded.report[0]
 
 
 def test_a_recording_does_not_depend_on_how_many_there_are() -> None:
