@@ -78,6 +78,8 @@ class StudyConfig:
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)
     agent: Any = MISSING
+    # Here, not in TrainConfig, so that one recipe serves every entry point.
+    training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
@@ -85,7 +87,6 @@ class StudyConfig:
 class TrainConfig(StudyConfig):
     """``python -m lcc_rl.train``."""
 
-    training: TrainingConfig = field(default_factory=TrainingConfig)
     resume: str | None = None
 
 
@@ -217,10 +218,9 @@ def _accepted(hint: Any) -> tuple[type, ...]:
 
 
 def plain(config: Any) -> dict[str, Any]:
-    """Return a configuration as plain, resolved containers."""
-    return typing.cast(
-        dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    )
+    """Return a configuration as plain, resolved containers; what is missing stays ``"???"``."""
+    node = config if OmegaConf.is_config(config) else OmegaConf.create(config)
+    return typing.cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
 
 
 def config_hash(config: Any) -> str:

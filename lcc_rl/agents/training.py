@@ -233,6 +233,7 @@ class Trainer:
         self.iteration, self.updates = state["iteration"], state["updates"]
         self.agent.load_state_dict(state["agent"])
         self.buffer.load_state_dict(state["buffer"])
+        self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
         self.rows, self.times = _rows(state["rows"]), _rows(state["times"])
 
 

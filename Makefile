@@ -1,0 +1,34 @@
+# Two commands: `make run` does the main job, `make test` checks everything. Each sets up .venv
+# first; Python 3.11 or newer and make are all that a fresh machine needs.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+ARGS ?=
+
+# One thread per process: two trainings run side by side, and results depend on the number.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: run test lint clean
+
+run: $(STAMP)
+	$(BIN)/python -m lcc_rl.pipeline experiment=quickstart $(ARGS)
+
+test: lint
+	$(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "lcc_rl needs Python 3.11 or newer, %s is %d.%d; say make PYTHON=python3.12" % (sys.executable, v[0], v[1]))'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"
+	@touch $(STAMP)
+
+clean:
+	rm -rf $(VENV) build *.egg-info

@@ -1,0 +1,169 @@
+"""Training: deterministic, resumable bit for bit, and honest about what goes wrong."""
+
+from __future__ import annotations
+
+import signal
+
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION, compose, wavy_profiles
+
+from lcc_rl.agents.ddpg import Exploration
+from lcc_rl.agents.training import Diverged, Interrupted, Trainer, episode_statistics
+from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.results.files import read_parquet, write_torch
+from lcc_rl.results.runs import identity
+
+SMALL = (
+    "training.episodes=20",
+    "training.environments=4",
+    "training.checkpoint_every=2",
+    "agent.batch_size=32",
+    "agent.buffer_size=200",
+    "agent.hidden=[16,16]",
+)
+
+
+def make(folder, *overrides: str) -> Trainer:
+    cfg = compose("alcc", *SMALL, *overrides)
+    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
+    agent = build_agent(cfg, POPULATION)
+    return Trainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+
+
+def weights(trainer: Trainer) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
+
+
+def test_same_seed_same_rows_and_weights(tmp_path) -> None:
+    one, two = make(tmp_path / "a"), make(tmp_path / "b")
+    pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
+    assert torch.equal(weights(one), weights(two))
+    other = make(tmp_path / "c", "seed=1")
+    other.run()
+    assert not torch.equal(weights(one), weights(other))
+
+
+def test_resuming_equals_never_having_stopped(tmp_path) -> None:
+    whole = make(tmp_path / "whole")
+    expected = whole.run()
+    first = make(tmp_path / "parts")
+    iterate = first._iterate
+
+    def dies(batches):
+        if first.iteration == 3:
+            raise MemoryError  # as sudden as SIGKILL: nothing is saved on the way out
+        return iterate(batches)
+
+    first._iterate = dies
+    with pytest.raises(MemoryError):
+        first.run()
+    second = make(tmp_path / "parts")
+    second.load()
+    assert second.iteration == 2  # the last checkpoint
+    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
+    assert torch.equal(weights(second), weights(whole))
+    stored = read_parquet(tmp_path / "parts" / "training.parquet")
+    pd.testing.assert_frame_equal(stored, expected, check_exact=True)
+
+
+def test_sigint_saves_and_says_how_to_go_on(tmp_path) -> None:
+    expected = make(tmp_path / "whole").run()
+    before = signal.getsignal(signal.SIGINT)
+    stopped = make(tmp_path / "stopped")
+    iterate = stopped._iterate
+
+    def interrupted(batches):
+        if stopped.iteration == 2:
+            signal.raise_signal(signal.SIGINT)  # in the middle of the third iteration
+        return iterate(batches)
+
+    stopped._iterate = interrupted
+    with pytest.raises(Interrupted, match="after iteration 3 of 5; .*resume="):
+        stopped.run()
+    assert signal.getsignal(signal.SIGINT) is before
+    again = make(tmp_path / "stopped")
+    again.load()
+    assert again.iteration == 3
+    pd.testing.assert_frame_equal(again.run(), expected, check_exact=True)
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(tmp_path) -> None:
+    make(tmp_path).run()
+    with pytest.raises(ResultsError, match="another configuration"):
+        make(tmp_path, "agent.gamma=0.8").load()
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated", "pickle"])
+def test_damaged_checkpoints(tmp_path, damage) -> None:
+    trainer = make(tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    if damage == "truncated":
+        trainer.run()
+        path.write_bytes(path.read_bytes()[:1000])
+    if damage == "pickle":
+        # Anything but tensors and containers would have to run code to load.
+        write_torch({"identity": Exploration()}, path)
+    with pytest.raises(ResultsError, match=r"checkpoint\.pt"):
+        trainer.load()
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("training.episodes=2", "at least"),
+        ("training.episodes=21", "multiple"),
+        ("training.checkpoint_every=0", "checkpoint_every"),
+    ],
+)
+def test_contradictory_lengths(tmp_path, override, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make(tmp_path, override)
+
+
+def test_divergence_stops_with_the_quantity_named(tmp_path) -> None:
+    trainer = make(tmp_path, "agent.critic_lr=1e12", "training.episodes=400")
+    with pytest.raises(Diverged, match=r"loss_\w+ became"):
+        trainer.run()
+
+
+def test_exploration_decays_linearly() -> None:
+    schedule = Exploration(initial=0.4, final=0.1, decay_share=0.5)
+    assert [round(schedule.sigma(x), 6) for x in (0.0, 0.25, 0.5, 1.0)] == [0.4, 0.25, 0.1, 0.1]
+
+
+def test_update_ratio_is_as_stated(tmp_path) -> None:
+    rows = make(tmp_path, "agent.updates_per_transition=0.25").run()
+    # 4 environments × 20 steps = 80 transitions per iteration, a quarter of it updates; the first
+    # iteration already fills the batch of 32.
+    assert rows["updates"].diff().dropna().eq(20).all()
+    assert rows["transitions"].iloc[-1] == 400
+
+
+def test_statistics_leave_out_what_follows_a_collision(tmp_path) -> None:
+    trainer = make(tmp_path, "scenario.horizon=100")
+    with torch.no_grad():
+        trainer.agent.policy.module[0][-1].bias.fill_(9.0)  # full throttle into the leader
+    batch = next(trainer._batches())
+    row = episode_statistics(batch)
+    assert row["collisions"] == 4
+    assert row["reward_collision"] == -100.0
+    terms = [value for key, value in row.items() if key.startswith("reward_")]
+    assert row["episode_reward"] == pytest.approx(sum(terms), rel=1e-5)
+
+
+def test_learns_to_keep_going(tmp_path) -> None:
+    # Behaviour, not numbers: after a few hundred updates the car earns more than at the start.
+    trainer = make(
+        tmp_path,
+        "scenario.horizon=100",
+        "training.episodes=160",
+        "training.environments=16",
+        "agent.batch_size=128",
+        "agent.buffer_size=20000",
+        "agent.hidden=[64,64]",
+    )
+    rows = trainer.run()
+    assert rows["episode_reward"].tail(3).mean() > rows["episode_reward"].head(2).mean() + 10

@@ -1,0 +1,256 @@
+"""Environments: specs, physics, determinism, gradients, compilation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import POPULATION, VARIANTS, compose, small_env, wavy_profiles
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+from torchrl.envs.utils import step_mdp
+
+from lcc_rl.envs.clock import Clock
+from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.functional.idm import equilibrium_gap
+from lcc_rl.functional.power import motor_power
+
+T = 0.1
+
+
+def play(env, actions):
+    """Step through actions ``[time, *batch, 1]`` without resets; returns the list of moments."""
+    td = env.reset()
+    moments = [td]
+    for action in actions:
+        td = step_mdp(env.step(td.set("action", action)))
+        moments.append(td)
+    return moments
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("batch_size", [(), 3])
+def test_specs(variant, batch_size) -> None:
+    check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
+
+
+@pytest.mark.parametrize("followers", [1, 4])
+def test_number_of_followers_is_a_dimension(followers) -> None:
+    env = small_env("alcc", 3, [f"scenario.followers={followers}"])
+    check_env_specs(env)
+    data = env.rollout(5)
+    assert data["hdv", "speed"].shape == (3, 5, followers, 1)
+    assert data["observation"].shape[-1] == 7
+
+
+def test_rollout_follows_the_equations() -> None:
+    env = small_env("alcc", 5, ["scenario.pieces.hdv.noise=0"])
+    data = env.rollout(20, break_when_any_done=False)
+    leader, cav, hdv = data["leader"], data["cav"], data["hdv"]
+    after = data["next"]
+    # The CAV moves by its action: v' = v + 3·action·T unless it stops.
+    moved = (cav["speed"] + 3.0 * data["action"] * T).clamp(min=0.0)
+    torch.testing.assert_close(after["cav", "speed"], moved)
+    # Gaps are the integral of relative speed by the trapezoidal rule.
+    closing = leader["speed"] - cav["speed"] + after["leader", "speed"] - after["cav", "speed"]
+    torch.testing.assert_close(after["cav", "gap"], cav["gap"] + 0.05 * closing)
+    # Power: A2 of the speed at the start and the acceleration executed.
+    power = motor_power(cav["speed"], (after["cav", "speed"] - cav["speed"]) / T)
+    torch.testing.assert_close(after["cav", "power"], power, rtol=1e-3, atol=2.0)
+    # The reward is the sum of its terms; energy is −P/20000·T.
+    terms = after["reward_terms"]
+    torch.testing.assert_close(after["reward"], sum(terms.values()))
+    torch.testing.assert_close(terms["cav_energy"], -after["cav", "power"] / 20000 * T)
+    predicted = after["hdv", "predicted_power"].sum(-2)
+    torch.testing.assert_close(terms["hdv_energy"], -predicted / 20000 * T)
+    assert hdv["driver"].unique().numel() > 1
+
+
+def test_initial_state() -> None:
+    td = small_env("alcc", 6).reset()
+    speed = td["leader", "speed"]
+    assert torch.equal(td["cav", "speed"], speed)
+    assert torch.equal(td["hdv", "speed"].squeeze(-2), speed)
+    torch.testing.assert_close(td["cav", "gap"], 2.0 + 1.5 * speed)
+    hdv = td["hdv"]
+    gap = equilibrium_gap(
+        hdv["speed"], hdv["desired_speed"], hdv["desired_time_gap"], POPULATION.constants
+    )
+    torch.testing.assert_close(hdv["gap"], gap)
+
+
+def test_leader_plays_the_profile_that_is_asked_for() -> None:
+    env, profiles = small_env("alcc", 2), wavy_profiles()
+    given = TensorDict(
+        {
+            ("leader", "profile"): torch.tensor([[2], [0]]),
+            ("leader", "start"): torch.tensor([[7], [300]]),
+            ("hdv", "driver"): torch.tensor([[[5]], [[9]]]),
+        },
+        [2],
+    )
+    td = env.reset(given)
+    data = env.rollout(20, tensordict=td, auto_reset=False, break_when_any_done=False)
+    expected = torch.stack([profiles.record(2)[8:28], profiles.record(0)[301:321]])
+    assert torch.equal(data["next", "leader", "speed"].squeeze(-1), expected)
+    drawn = POPULATION.time_gap[torch.tensor([5, 9])]
+    assert torch.equal(data["hdv", "desired_time_gap"][:, 0].flatten(), drawn)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        (("leader", "profile"), torch.tensor([[99]]), "profile ids"),
+        (("hdv", "driver"), torch.tensor([[[100000]]]), "driver ids"),
+    ],
+)
+def test_unknown_ids_are_refused(key, value, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        small_env("alcc", 1).reset(TensorDict({key: value}, [1]))
+
+
+def test_same_seed_same_episodes_and_other_seed_others() -> None:
+    a, b, c = (small_env("alcc", 4, seed=s).reset() for s in (1, 1, 2))
+    assert (a == b).all()
+    assert not torch.equal(a["leader", "speed"], c["leader", "speed"])
+
+
+def test_episode_seed_replays_an_episode_wherever_it_stands() -> None:
+    env = small_env("alcc", 4)
+    actions = torch.zeros(20, 4, 1)
+    td = env.reset()
+    seeds = td["episode", "seed"]
+    first = torch.stack([m["hdv", "speed"] for m in play_from(env, td, actions)])
+    turned = env.reset(TensorDict({("episode", "seed"): seeds.flip(0)}, [4]))
+    second = torch.stack([m["hdv", "speed"] for m in play_from(env, turned, actions)])
+    assert torch.equal(first, second.flip(1))
+
+
+def play_from(env, td, actions):
+    moments = []
+    for action in actions:
+        td = step_mdp(env.step(td.set("action", action)))
+        moments.append(td)
+    return moments
+
+
+def test_noise_is_within_bounds_and_the_same_for_every_controller() -> None:
+    quiet = small_env("alcc", 64, ["scenario.pieces.hdv.noise=0"], seed=3)
+    noisy = small_env("alcc", 64, seed=3)
+    zero = torch.zeros(1, 64, 1)
+    a, b = play(quiet, zero)[-1], play(noisy, zero)[-1]
+    # Dividing tiny accelerations is noise of another kind.
+    firm = a["hdv", "acceleration"].abs() > 0.05
+    ratio = (b["hdv", "acceleration"] / a["hdv", "acceleration"])[firm]
+    assert ((ratio > 1.0 - 1e-4) & (ratio < 1.05 + 1e-4)).all()
+    assert ratio.std() > 0.005
+
+
+def test_collision_terminates_and_is_penalised() -> None:
+    env = small_env("alcc", 2, ["scenario.horizon=100"])
+    data = env.rollout(100, lambda td: td.set("action", torch.ones(2, 1)), break_when_any_done=True)
+    last = data[:, -1]["next"]
+    crashed = last["terminated"].squeeze(-1)
+    assert crashed.any()
+    assert torch.equal(last["done"], last["terminated"])
+    assert not last["truncated"].any()
+    assert (last["cav", "gap"][crashed] <= 0).all()
+    assert (last["reward_terms", "collision"][crashed] == -100.0).all()
+    assert (data["next", "reward_terms", "collision"][:, :-1] == 0.0).all()
+
+
+def test_horizon_truncates() -> None:
+    data = small_env("idm", 2).rollout(20, lambda td: td.set("action", torch.zeros(2, 1)))
+    assert data.shape == (2, 20)
+    last = data[:, -1]["next"]
+    assert last["truncated"].all()
+    assert last["done"].all()
+    assert not last["terminated"].any()
+
+
+def test_gradient_from_energies_to_actions_matches_finite_differences() -> None:
+    # Over 300 steps, in double precision; actions small enough not to collide.
+    cfg = compose("alcc", "scenario.horizon=300", "scenario.pieces.hdv.noise=0")
+    env = build_env(cfg, wavy_profiles(), POPULATION, 2, seed=5)
+    for piece in env.transform:
+        piece.double()
+    start = env.reset().apply(lambda x: x.double() if x.is_floating_point() else x)
+    actions = 0.05 * torch.sin(torch.arange(300, dtype=torch.float64) / 7.0)
+    actions = actions.view(-1, 1, 1).repeat(1, 2, 1)
+
+    def energy(chosen):
+        td, total = start.clone(), 0.0
+        for action in chosen:
+            td = env.step(td.set("action", action))["next"].exclude("reward", "reward_terms")
+            total = total + (td["cav", "power"] + td["hdv", "power"].sum(-2)).sum() * T / 1e3
+        return total
+
+    chosen = actions.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(energy(chosen), chosen)
+    assert torch.isfinite(gradient).all()
+    assert (gradient.abs() > 0).all()
+    for step in (0, 100, 250):
+        shifted = [actions.clone() for _ in range(2)]
+        shifted[0][step, 1] += 1e-4
+        shifted[1][step, 1] -= 1e-4
+        difference = (energy(shifted[0]) - energy(shifted[1])) / 2e-4
+        torch.testing.assert_close(gradient[step, 1, 0], difference, rtol=1e-2, atol=1e-3)
+
+
+def test_compiled_step_agrees_with_eager() -> None:
+    env = small_env("alcc", 4)
+    pieces = [piece for piece in env.transform if type(piece).__name__ == "IDMFollower"]
+    compiled = torch.compile(pieces[0].compute, fullgraph=True, backend="aot_eager")
+    data = env.rollout(5)
+    entries = [
+        (data["next"].get(key) if late else data.get(key)) for late, key in pieces[0]._sources
+    ]
+    for eager, fast in zip(pieces[0].compute(*entries), compiled(*entries), strict=True):
+        torch.testing.assert_close(eager, fast, rtol=1e-5, atol=1e-5)
+
+
+def test_idm_in_the_cars_place_follows_well() -> None:
+    cfg = compose("idm", "scenario.horizon=300")
+    env = build_env(cfg, wavy_profiles(), POPULATION, 16)
+    policy = build_agent(cfg, POPULATION).policy
+    with torch.no_grad():
+        data = env.rollout(300, policy, break_when_any_done=False)
+    assert (data["next", "cav", "gap"] > 0.5).all()
+    assert not data["next", "terminated"].any()
+    # It really follows: after the start, its time gap stays near 1.2 s, not at the limits.
+    assert data["next", "cav", "time_gap"][:, 100:].median() < 2.5
+
+
+def test_sampled_idm_draws_drivers_per_episode() -> None:
+    cfg = compose("idm", "agent.sampled=true")
+    env = build_env(cfg, wavy_profiles(), POPULATION, 64)
+    td = env.reset(
+        TensorDict(
+            {
+                ("leader", "profile"): torch.zeros(64, 1, dtype=torch.int64),
+                ("leader", "start"): torch.zeros(64, 1, dtype=torch.int64),
+            },
+            [64],
+        )
+    )
+    assert build_agent(cfg, POPULATION).policy(td)["action"].unique().numel() > 10
+
+
+def test_profile_shorter_than_the_horizon() -> None:
+    cfg = compose("alcc", "scenario.horizon=1000")
+    with pytest.raises(DataError, match="shorter than the horizon"):
+        build_env(cfg, wavy_profiles(), POPULATION, 2)
+
+
+def test_clock_refuses_an_empty_horizon() -> None:
+    with pytest.raises(ConfigError, match="horizon"):
+        Clock(0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_agrees_with_cpu() -> None:
+    cfg = compose("alcc")
+    zero = torch.zeros(20, 8, 1)
+    cpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8), zero)[-1]
+    gpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8, device="cuda"), zero.cuda())[-1]
+    torch.testing.assert_close(cpu["hdv", "speed"], gpu["hdv", "speed"].cpu())
