@@ -172,7 +172,7 @@ class Block:
         """Raise the DataError for the cell at ``row`` of column ``name``."""
         cell = self.table[name][row].as_py()
         place = row if self._kept is None else int(self._kept[row])
-        shown = "is blank" if cell is None else f"holds {cell[:40]!r}"
+        shown = "is blank or NaN" if cell is None else f"holds {cell[:40]!r}"
         raise DataError(
             f"{self.path}: line {self._line_of_row(place)}, column {name!r} {shown}; "
             f"expected {expected}"
@@ -192,6 +192,9 @@ class Block:
             raise
 
     def _parse(self, layout: Layout) -> pa.Table:
+        if not _is_text(self.lines):
+            line = self._line_where(lambda found: not _is_text(found))
+            raise DataError(f"{self.path}: line {line} is not text; expected UTF-8")
         names = [str(place) for place in range(layout.width)]
         wanted = {str(place): name for name, place in layout.places.items()}
         odd: list[pa_csv.InvalidRow] = []
@@ -225,15 +228,12 @@ class Block:
         self, odd: list[pa_csv.InvalidRow], layout: Layout, error: pa.ArrowException
     ) -> str:
         if odd:
-            text = odd[0].text.encode("utf-8", "surrogateescape")
+            text = odd[0].text.encode()
             line = self._line_where(lambda found: found.rstrip(b"\r") == text)
             return (
                 f"{self.path}: line {line} has {odd[0].actual_columns} columns; "
                 f"expected {layout.width} as in the first line"
             )
-        line = self._line_where(lambda found: not _is_text(found))
-        if line is not None:
-            return f"{self.path}: line {line} is not text; expected UTF-8"
         reason = str(error).splitlines()[0]
         return f"{self.path}: from line {self.first_line}: expected rows of text: {reason}"
 
@@ -344,7 +344,7 @@ def _detect(name: str, lines: bytes) -> tuple[Layout, bytes]:
         raise DataError(f"{name}: is a binary file; expected an NGSIM text table, plain or .gz")
     spaced = "," not in text
     cells = text.split() if spaced else [cell.strip() for cell in _split_commas(name, text)]
-    if not _is_number(cells[0]):
+    if not cells or not _is_number(cells[0]):
         return Layout(len(cells), _places(name, cells), header=True, spaced=spaced), rest
     if len(cells) != len(OFFICIAL):
         raise DataError(
@@ -399,12 +399,11 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _is_text(line: bytes) -> bool:
+def _is_text(lines: bytes) -> bool:
     try:
-        line.decode("utf-8")
+        return lines.isascii() or bool(lines.decode("utf-8"))
     except UnicodeDecodeError:
         return False
-    return True
 
 
 def _single_spaces(lines: bytes) -> bytes:
