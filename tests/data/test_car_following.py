@@ -1,0 +1,220 @@
+"""Extraction of car-following episodes: each criterion, its count, and the real pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from ngsim_text import cells, csv_text, pair
+
+from lcc_rl.data.car_following import Criteria, ExtractionReport, extract
+from lcc_rl.data.episodes import SCHEMA, read_episodes, split_episodes, validate_episodes
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.errors import ConfigError, DataError
+
+FOOT = 0.3048
+SHORT = Criteria(min_duration_s=1.0)
+
+
+def extracted(
+    folder: Path, rows: list[list[str]], criteria: Criteria = SHORT
+) -> tuple[pd.DataFrame, ExtractionReport]:
+    (folder / "file.csv").write_text(csv_text(rows))
+    episodes, report = extract(read_ngsim(folder / "file.csv"), criteria)
+    pd.testing.assert_frame_equal(validate_episodes(episodes, "extracted"), episodes)
+    assert report.candidates - sum(report.removed.values()) == report.kept
+    assert report.rows == len(episodes)
+    return episodes, report
+
+
+def test_an_episode_holds_both_vehicles_and_the_gap(tmp_path: Path) -> None:
+    episodes, report = extracted(tmp_path, pair())
+    assert {str(name): str(kind) for name, kind in episodes.dtypes.items()} == SCHEMA
+    assert (report.candidates, report.kept, len(episodes)) == (1, 1, 20)
+    row = episodes.drop(columns="recording").iloc[4].to_dict()
+    assert episodes["recording"].unique().tolist() == ["2005-04-13T22:58:55Z"]
+    assert row == pytest.approx(
+        {
+            "episode": 0,
+            "follower_id": 7,
+            "leader_id": 9,
+            "time_s": 0.4,
+            "follower_position_m": 40 * FOOT,
+            "follower_speed_mps": 100 * FOOT,
+            "leader_position_m": 100 * FOOT,
+            "leader_speed_mps": 100 * FOOT,
+            "leader_length_m": 15 * FOOT,
+            "gap_m": 45 * FOOT,
+        },
+        rel=1e-6,
+    )
+
+
+def test_a_new_leader_begins_a_new_episode(tmp_path: Path) -> None:
+    rows = pair(range(40)) + [cells(8, k, Local_Y=10.0 * k + 30) for k in range(40)]
+    for row in rows[15:40]:
+        row[14], row[16] = "8", "30"
+    episodes, _ = extracted(tmp_path, rows)
+    pairs = episodes.groupby("episode")[["leader_id", "time_s"]].agg(["first", "last"])
+    assert pairs["leader_id", "first"].tolist() == pairs["leader_id", "last"].tolist() == [9, 8]
+    assert pairs["time_s", "last"].tolist() == [1.4, 3.9]
+    assert episodes["gap_m"].iloc[-1] == pytest.approx(15 * FOOT)
+
+
+def test_a_missing_frame_of_either_vehicle_splits(tmp_path: Path) -> None:
+    frames = [*range(15), *range(16, 30)]
+    for rows in (
+        pair(frames)[: len(frames)] + pair(range(30))[30:],
+        pair(range(30))[:30] + pair(frames)[len(frames) :],
+    ):
+        episodes, _ = extracted(tmp_path, rows)
+        assert episodes.groupby("episode").size().tolist() == [15, 14]
+
+
+def test_a_leader_that_is_never_seen_is_reported(tmp_path: Path) -> None:
+    _, report = extracted(tmp_path, pair() + [cells(5, k, Preceding=99) for k in range(20)])
+    assert report.unseen == 20
+    assert "20 samples that name a preceding vehicle that is not seen" in str(report)
+
+
+def lane_change() -> list[list[str]]:
+    """The follower is on lane 3 in frames 12 to 14 of 0 to 29, behind the same leader."""
+    rows = pair(range(30))
+    for row in rows[12:15]:
+        row[13] = "3"
+    return rows
+
+
+def test_a_lane_change_splits_or_rejects(tmp_path: Path) -> None:
+    episodes, report = extracted(tmp_path, lane_change())
+    assert episodes.groupby("episode").size().tolist() == [12, 15]
+    assert (report.candidates, report.other_lane) == (2, 3)
+    reject = Criteria(min_duration_s=1.0, lane_changes="reject")
+    with pytest.raises(DataError, match=r"no episode is left after .*'lane_changes: reject'"):
+        extracted(tmp_path, lane_change(), reject)
+    _, report = extracted(tmp_path, pair(), reject)
+    assert report.removed["lane_changes: reject"] == 0
+
+
+def test_both_on_another_lane_is_a_lane_change_too(tmp_path: Path) -> None:
+    rows = pair(range(30))
+    for row in rows[15:30] + rows[45:60]:
+        row[13] = "3"
+    episodes, _ = extracted(tmp_path, rows)
+    assert episodes.groupby("episode").size().tolist() == [15, 15]
+
+
+def population() -> list[list[str]]:
+    """Pairs (11, 12), (21, 22) …; each but the first breaks one criterion."""
+    flaws: list[dict[str, object]] = [
+        {},
+        {"frames": 9},
+        {"frames": 60},
+        {"v_Class": 3},
+        {"v_Vel": 300.0},
+        {"v_Vel": -0.5},
+        {"Space_Headway": 16},
+        {"Space_Headway": 400},
+    ]
+    rows = []
+    for number, flaw in enumerate(flaws, 1):
+        frames = range(int(str(flaw.pop("frames", 30))))
+        follower, leader = 10 * number + 1, 10 * number + 2
+        for k in frames:
+            change = {"Preceding": leader, "Space_Headway": 60, **flaw}
+            rows += [cells(follower, k, **change), cells(leader, k, Local_Y=10.0 * k + 60)]
+    return rows
+
+
+def test_each_criterion_removes_its_candidates_in_order(tmp_path: Path) -> None:
+    criteria = Criteria(min_duration_s=1.0, max_duration_s=5.0, min_gap_m=1.0, max_gap_m=100.0)
+    episodes, report = extracted(tmp_path, population(), criteria)
+    assert report.candidates == 8
+    assert report.removed == {
+        "min_duration_s: 1": 1,
+        "max_duration_s: 5": 1,
+        "passenger_cars_only": 1,
+        "speeds of 0 to 70 m/s": 2,
+        "min_gap_m: 1": 1,
+        "max_gap_m: 100": 1,
+    }
+    assert episodes["follower_id"].unique().tolist() == [11]
+    assert "removed 2: speeds of 0 to 70 m/s" in str(report)
+
+
+def test_limits_can_be_lifted(tmp_path: Path) -> None:
+    free = Criteria(0.5, None, min_gap_m=None, max_gap_m=None, passenger_cars_only=False)
+    episodes, report = extracted(tmp_path, population(), free)
+    assert episodes["follower_id"].unique().tolist() == [11, 21, 31, 41, 71, 81]
+    assert list(report.removed) == ["min_duration_s: 0.5", "speeds of 0 to 70 m/s"]
+
+
+def test_durations_are_inclusive(tmp_path: Path) -> None:
+    rows = pair(range(151))  # 15.0 s
+    assert extracted(tmp_path, rows, Criteria(15.0, 15.0))[1].kept == 1
+    with pytest.raises(DataError, match=r"'min_duration_s: 15.1'"):
+        extracted(tmp_path, rows, Criteria(15.1))
+    with pytest.raises(DataError, match=r"'max_duration_s: 14.9'"):
+        extracted(tmp_path, rows, Criteria(14.0, 14.9))
+
+
+def test_without_classes_all_vehicles_stay_and_it_is_said(tmp_path: Path) -> None:
+    rows = [[*row[:10], "0", *row[11:]] for row in pair()]
+    _, report = extracted(tmp_path, rows)
+    assert report.kept == 1
+    assert "passenger_cars_only" not in report.removed
+    assert "nothing to filter on" in str(report)
+
+
+def test_nobody_follows(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no vehicle follows another .* of 2 samples 1 name"):
+        extracted(tmp_path, [cells(7, 1, Preceding=5), cells(7, 2)])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"min_duration_s": 0.0}, "'min_duration_s' must be at least 0.1"),
+        ({"min_duration_s": -1.0}, "'min_duration_s' must be at least 0"),
+        ({"min_duration_s": float("nan")}, "'min_duration_s' must be at least 0"),
+        ({"max_duration_s": 14.0}, r"'min_duration_s' \(15.0\) must not be above 'max_duration_s'"),
+        ({"min_gap_m": 200.0}, r"'min_gap_m' \(200.0\) must not be above 'max_gap_m' \(120.0\)"),
+        ({"max_gap_m": -1.0, "min_gap_m": None}, "'max_gap_m' must be at least 0"),
+        ({"lane_changes": "keep"}, "'lane_changes' must be one of split, reject, got 'keep'"),
+    ],
+)
+def test_impossible_criteria(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Criteria(**arguments)  # type: ignore[arg-type]
+
+
+def test_all_real_pairs_are_recovered(shared_data: Path) -> None:
+    found, _ = extract(read_ngsim(shared_data / "i80_pairs_ngsim_layout.csv.gz"), Criteria())
+    truth = read_episodes(shared_data / "i80_pairs.parquet")
+    assert found["episode"].nunique() == truth["episode"].nunique() == 264
+    # Ids differ; a pair is known by its first time and place, which no two pairs share.
+    expected = {
+        (round(pair["time_s"][0], 1), round(float(pair["follower_position_m"][0]), 1)): pair
+        for pair in split_episodes(truth)
+    }
+    assert len(expected) == 264
+    for episode in split_episodes(found):
+        first = float(episode["follower_position_m"][0])
+        other = expected.pop((round(episode["time_s"][0], 1), round(first, 1)))
+        np.testing.assert_allclose(episode["time_s"], other["time_s"], atol=1e-3)
+        np.testing.assert_allclose(episode["gap_m"], other["gap_m"], atol=0.02, rtol=0)
+        for name in ("follower_speed_mps", "leader_speed_mps"):
+            np.testing.assert_allclose(episode[name], other[name], atol=0.01, rtol=0)
+        for name in ("follower_position_m", "leader_position_m", "leader_length_m"):
+            np.testing.assert_allclose(episode[name], other[name], atol=0.02, rtol=0)
+    assert not expected
+
+
+def test_real_file_without_classes_and_lengths(shared_data: Path) -> None:
+    trajectories = read_ngsim(shared_data / "i80_coifman_li_2017_native.txt.gz")
+    episodes, report = extract(trajectories, Criteria(min_duration_s=5.0))
+    assert report.kept == episodes["episode"].nunique() > 1000
+    assert "nothing to filter on" in str(report)
+    validate_episodes(episodes, "Coifman and Li")
