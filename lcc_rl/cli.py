@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.errors import ConfigError, LccError
+from lcc_rl.errors import ConfigError, Interrupted, LccError
 
 # OSError: Hydra cannot make the run's folder, a disk is full, a file is not ours to read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
@@ -86,6 +87,9 @@ def _stop(error: Exception) -> NoReturn:
     while cause is not None and not isinstance(cause, LccError):
         cause = cause.__cause__
     text = " ".join(str(cause or error).split())
+    if isinstance(cause, Interrupted):
+        print(f"lcc_rl: {text}", file=sys.stderr)
+        sys.exit(INTERRUPTED)
     print(f"lcc_rl: error: {text}", file=sys.stderr)
     sys.exit(BAD_INPUT)
 
@@ -112,4 +116,6 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
     except (RuntimeError, AssertionError, TypeError) as error:
         raise ConfigError(f"device {cfg.device!r} is not available: {error}") from error
     torch.set_num_threads(cfg.threads)
+    # TorchRL tells of every buffer it allocates.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     return device

@@ -49,6 +49,7 @@ class TrainingConfig:
 
     episodes: int = MISSING
     environments: int = MISSING
+    segment: int = MISSING
     checkpoint_every: int = MISSING
 
 

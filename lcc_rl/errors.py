@@ -22,6 +22,14 @@ class ResultsError(LccError, RuntimeError):
     """A result, policy or checkpoint file is missing, damaged or of another version."""
 
 
+class Interrupted(LccError):
+    """A job was stopped by the user after saving its state."""
+
+
+class Diverged(LccError):
+    """A loss or reward is no longer a number; the last checkpoint is from before that."""
+
+
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     """Build the error for an unknown name, listing the valid ones and the nearest."""
     options = sorted(valid)

@@ -21,10 +21,10 @@ log = logging.getLogger("lcc_rl")
 
 BASELINES = ("direct", "idm")
 # What makes a baseline what it is; everything else it shares with the scenario under study.
-OWN_SETTINGS = {("cav", "max_acceleration"), ("hdv", "predecessor")}
+OWN_SETTINGS = {("cav", "max_acceleration")}
 
 
-def run(cfg: DictConfig, folder: str | Path) -> pd.DataFrame:
+def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
     """Evaluate a policy, those it is compared with, and the human baselines.
 
     All meet the same profiles, drivers and noise. Writes config.yaml, episodes.parquet,
@@ -33,6 +33,7 @@ def run(cfg: DictConfig, folder: str | Path) -> pd.DataFrame:
     Args:
         cfg: configuration of the entry point ``evaluate``.
         folder: where the files go.
+        own: evaluate the configuration's own variant, not only what it is compared with.
 
     Returns:
         The rows of episodes.parquet.
@@ -47,7 +48,7 @@ def run(cfg: DictConfig, folder: str | Path) -> pd.DataFrame:
         log.info(line)
     strategies = [baseline(cfg, name, inputs) for name in BASELINES]
     strategies += [trained(cfg, path, inputs) for path in cfg.compare]
-    if cfg.variant not in BASELINES:
+    if own and cfg.variant not in BASELINES:
         strategies.append(studied(cfg, inputs))
     save_config(cfg, folder)
     episodes = evaluate_and_write(strategies, cfg, inputs, folder)
@@ -57,22 +58,20 @@ def run(cfg: DictConfig, folder: str | Path) -> pd.DataFrame:
 
 def baseline(cfg: DictConfig, variant: str, inputs: Inputs) -> Strategy:
     """Build a human baseline in the scenario under study."""
-    if cfg.variant == variant:
-        own = cfg
-    else:
-        own = load("evaluate", [f"variant={variant}"])
-        share_scenario(cfg, own)
-    return Strategy(variant, own, build_agent(own, inputs.population, cfg.device).policy)
+    if cfg.variant != variant:
+        studied, cfg = cfg, load("evaluate", [f"variant={variant}"])
+        share_scenario(studied, cfg)
+    return Strategy(variant, cfg, build_agent(cfg, inputs.population, cfg.device).policy)
 
 
 def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
-    """Give another variant the clock and the piece settings of the scenario under study."""
+    """Give another variant the clock and the pieces' numbers of the scenario under study."""
     OmegaConf.set_struct(other, False)
     for key in ("horizon", "time_step", "followers"):
         other.scenario[key] = cfg.scenario[key]
     for name, node in other.scenario.pieces.items():
         for key, value in cfg.scenario.pieces.get(name, {}).items():
-            if not key.startswith("_") and (name, key) not in OWN_SETTINGS:
+            if isinstance(value, (int, float)) and (name, key) not in OWN_SETTINGS:
                 node[key] = value
 
 

@@ -71,9 +71,10 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
         OmegaConf.set_struct(part, False)
         part.update(inputs)
     _train_all(parts, folder, cfg.jobs)
-    final.compare = [str(folder / name) for name in cfg.variants if _learned(folder / name)]
-    final.variant = "idm"
-    episodes = evaluate.run(final, folder / "evaluation")
+    final.compare = [
+        str(folder / name) for name in cfg.variants if (folder / name / "policy.pt").exists()
+    ]
+    episodes = evaluate.run(final, folder / "evaluation", own=False)
     write_study_figures(folder / "evaluation", folder if final.compare else None)
     return episodes
 
@@ -126,10 +127,6 @@ def _train_one(settings: dict[str, Any], folder: str) -> None:
 
 def _finished(folder: Path) -> bool:
     return (folder / "episodes.parquet").exists()
-
-
-def _learned(folder: Path) -> bool:
-    return (folder / "policy.pt").exists()
 
 
 def _root(override: str) -> str:

@@ -1,4 +1,4 @@
-"""The training loop: collect whole episodes, learn from the replay buffer, checkpoint, repeat.
+"""The training loop: play a batch of episodes, learning as it goes; checkpoint; repeat.
 
 Iteration i is a function of the state before it and of (seed, i) alone: every generator is seeded
 anew from these at its start. A checkpoint therefore holds tensors and a counter, and a resumed
@@ -27,7 +27,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.config import TrainingConfig, require
-from lcc_rl.errors import LccError, ResultsError
+from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.progress import ProgressReporter
 from lcc_rl.results.files import read_torch, write_parquet, write_torch
@@ -42,18 +42,13 @@ LEARNED_FROM = (
 )
 
 
-class Interrupted(LccError):
-    """A training was stopped by the user after saving its state."""
-
-
-class Diverged(LccError):
-    """A loss or reward is no longer a number; the last checkpoint is from before that."""
-
-
 def derived_seed(*parts: object) -> int:
     """Return a seed that depends on all parts; distinct purposes get independent streams."""
     digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1
+
+
+REPORTED = (("next", "reward"), ("next", "reward_terms"), ("next", "done"), ("next", "terminated"))
 
 
 class Trainer:
@@ -91,6 +86,10 @@ class Trainer:
             f"training.episodes ({settings.episodes}) must be a multiple of "
             f"training.environments ({batch})",
         )
+        require(
+            settings.segment >= 1 and self.horizon % settings.segment == 0,
+            f"training.segment ({settings.segment}) must divide scenario.horizon ({self.horizon})",
+        )
         require(settings.checkpoint_every >= 1, "training.checkpoint_every must be at least 1")
         self.agent, self.env, self.settings = agent, env, settings
         self.seed, self.folder, self.identity = seed, folder, identity
@@ -119,10 +118,10 @@ class Trainer:
         progress = ProgressReporter(
             title, self.iterations, start=self.iteration, folder=self.folder
         )
-        batches = self._batches()
+        collector = self._collector()
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
-                row = self._iterate(batches)
+                row = self._iterate(collector)
                 progress.update(
                     self.iteration, {"reward": row["episode_reward"], "loss": row["loss_value"]}
                 )
@@ -137,44 +136,49 @@ class Trainer:
         self.save()
         return pd.DataFrame(self.rows)
 
-    def _batches(self) -> Iterator[TensorDictBase]:
+    def _collector(self) -> Collector:
         policy = TensorDictSequential(self.agent.policy, self.exploration)
-        collector = Collector(
+        return Collector(
             self.env,
             policy,
-            frames_per_batch=self.env.batch_size[0] * self.horizon,
+            frames_per_batch=self.env.batch_size[0] * self.settings.segment,
             total_frames=-1,
-            reset_at_each_iter=True,
+            auto_register_policy_transforms=False,
         )
-        return iter(collector)
 
-    def _iterate(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
-        begun = time.perf_counter()
-        share = self.iteration / self.iterations
-        sigma = self.agent.exploration.sigma(share)
+    def _iterate(self, collector: Collector) -> dict[str, float]:
+        """Play one batch of episodes, learning after every segment of them."""
+        sigma = self.agent.exploration.sigma(self.iteration / self.iterations)
         self.exploration.sigma.fill_(sigma)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         self.sampler.manual_seed(derived_seed(self.seed, self.iteration, "replay"))
-        batch = next(batches)
-        row = {"iteration": float(self.iteration), "exploration_sigma": sigma}
-        row |= episode_statistics(batch)
-        collected = time.perf_counter()
-        self.buffer.extend(batch.select(*LEARNED_FROM).reshape(-1))
-        row |= self._learn(batch.numel())
+        collector.reset()
+        segments = iter(collector)
+        played, losses, spent = [], [], [0.0, 0.0]
+        for _ in range(self.horizon // self.settings.segment):
+            begun = time.perf_counter()
+            batch = next(segments)
+            self.buffer.extend(batch.select(*LEARNED_FROM).reshape(-1))
+            played.append(batch.select(*REPORTED))
+            collected = time.perf_counter()
+            losses.append(self._learn(batch.numel()))
+            spent[0] += collected - begun
+            spent[1] += time.perf_counter() - collected
+        episodes = torch.cat(played, dim=1)
         self.iteration += 1
-        row["episodes"] = float(self.iteration * self.env.batch_size[0])
-        row["transitions"] = row["episodes"] * self.horizon
-        row["updates"] = float(self.updates)
+        row = {
+            "iteration": float(self.iteration),
+            "episodes": float(self.iteration * self.env.batch_size[0]),
+            "transitions": float(self.iteration * episodes.numel()),
+            "updates": float(self.updates),
+            "exploration_sigma": sigma,
+            **episode_statistics(episodes),
+            **{name: sum(loss[name] for loss in losses) / len(losses) for name in losses[0]},
+        }
         self._check_finite(row)
         self.rows.append(row)
-        done = time.perf_counter()
-        self.times.append(
-            {
-                "iteration": row["iteration"],
-                "collect_s": collected - begun,
-                "learn_s": done - collected,
-            }
-        )
+        times = zip(("iteration", "collect_s", "learn_s"), (row["iteration"], *spent), strict=True)
+        self.times.append(dict(times))
         return row
 
     def _learn(self, transitions: int) -> dict[str, float]:

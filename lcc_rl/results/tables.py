@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pandas as pd
+from rich.markup import escape
 from rich.table import Table
 
 KEYS = ["profile_id", "driver_id"]
@@ -66,31 +67,37 @@ def _against(
     )
 
 
-COLUMNS = (
-    ("strategy", "strategy", "{}"),
-    ("CAV kJ", "cav_energy_kj", "{:.1f}"),
-    ("HDV kJ", "hdv_energy_kj", "{:.1f}"),
-    ("total kJ", "total_energy_kj", "{:.1f}"),
-    ("net kJ", "total_net_energy_kj", "{:.1f}"),
-    ("kJ/km", "kj_per_km", "{:.0f}"),
-    ("vs idm", "saving_vs_idm", "{:+.1%}"),
-    ("vs ref.", "saving_vs_reference", "{:+.1%}"),
-    ("worse off", "worse_than_reference", "{:.0%}"),
-    ("min TTC s", "min_ttc_s", "{:.1f}"),
-    ("TTC<4 s", "share_ttc_unsafe", "{:.2%}"),
-    ("TG>2.5 s", "share_time_gap_long", "{:.2%}"),
-    ("crashes", "collisions", "{:d}"),
-    ("jerk", "rms_jerk_mps3", "{:.2f}"),
+ROWS = (
+    ("CAV energy [kJ]", "cav_energy_kj", "{:.1f}"),
+    ("HDV energy [kJ]", "hdv_energy_kj", "{:.1f}"),
+    ("total energy [kJ]", "total_energy_kj", "{:.1f}"),
+    ("  net of kinetic energy [kJ]", "total_net_energy_kj", "{:.1f}"),
+    ("  per vehicle-kilometre [kJ/km]", "kj_per_km", "{:.0f}"),
+    ("saving against idm", "saving_vs_idm", "{:+.1%}"),
+    ("  net of kinetic energy", "net_saving_vs_idm", "{:+.1%}"),
+    ("  drivers worse off", "worse_than_idm", "{:.0%}"),
+    ("saving against reference", "saving_vs_reference", "{:+.1%}"),
+    ("  net of kinetic energy", "net_saving_vs_reference", "{:+.1%}"),
+    ("  drivers worse off", "worse_than_reference", "{:.0%}"),
+    ("collisions", "collisions", "{:d}"),
+    ("minimum time-to-collision [s]", "min_ttc_s", "{:.2f}"),
+    ("time with TTC < 4 s", "share_ttc_unsafe", "{:.2%}"),
+    ("time with time gap > 2.5 s", "share_time_gap_long", "{:.2%}"),
+    ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
+    ("episodes", "episodes", "{:d}"),
 )
 
 
 def as_rich(table: pd.DataFrame, title: str) -> Table:
-    """Draw a summary for the terminal; savings are positive where energy is saved."""
-    drawn = Table(title=title, caption="energies: mean per episode; jerk: RMS [m/s³]")
-    for heading, _, _ in COLUMNS:
-        drawn.add_column(heading, justify="left" if heading == "strategy" else "right")
-    for row in table.to_dict("records"):
-        drawn.add_row(
-            *("–" if pd.isna(row[key]) else form.format(row[key]) for _, key, form in COLUMNS)
-        )
+    """Draw a summary for the terminal, a column per strategy; positive savings are savings."""
+    drawn = Table(
+        title=escape(title), caption="energies: mean per episode; direct: no controlled car"
+    )
+    drawn.add_column("")
+    for strategy in table["strategy"]:
+        drawn.add_column(str(strategy), justify="right")
+    for label, key, form in ROWS:
+        if table[key].notna().any():
+            cells = ("–" if pd.isna(value) else form.format(value) for value in table[key])
+            drawn.add_row(escape(label), *cells)
     return drawn
