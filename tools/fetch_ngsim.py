@@ -1,0 +1,266 @@
+"""Download the official NGSIM export of the US Department of Transportation, page by page.
+
+    python tools/fetch_ngsim.py --location i-80 --output data/ngsim_i80.csv
+
+The portal holds 11.8 million rows of four locations. The download is paged; an interrupted one is
+taken up again by the same command. The file appears under its name only when it is whole and its
+number of rows is the one the portal counts. The result is read by ``data=ngsim``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import http.client
+import io
+import json
+import os
+import sys
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+BASE_URL = "https://data.transportation.gov"
+DATASET = "8ect-6jqj"
+LOCATIONS = ("i-80", "us-101", "lankershim", "peachtree")
+PAGE_ROWS = 50_000
+GIVE_UP = (400, 401, 403, 404)  # asking again would not help
+
+
+class FetchError(Exception):
+    """The download cannot go on; the message says why."""
+
+
+@dataclass
+class State:
+    """How far a download is; kept beside the partial file.
+
+    Args:
+        query: what is being downloaded; a partial file of another query is not continued.
+        total: rows that the portal counts.
+        rows: rows in the partial file.
+        size: bytes of the partial file up to the last whole page.
+    """
+
+    query: str
+    total: int
+    rows: int = 0
+    size: int = 0
+
+
+@dataclass(frozen=True)
+class Portal:
+    """The portal's interface.
+
+    Args:
+        base_url: scheme and host.
+        dataset: identifier of the dataset.
+        location: location to download; None for all four.
+        retries: how often a failed request is repeated.
+        pause_s: pause before the first repetition [s]; it doubles with each.
+        timeout_s: time limit of one request [s].
+    """
+
+    base_url: str = BASE_URL
+    dataset: str = DATASET
+    location: str | None = None
+    retries: int = 6
+    pause_s: float = 2.0
+    timeout_s: float = 120.0
+
+    @property
+    def query(self) -> str:
+        """What is downloaded, as one line."""
+        return f"{self.base_url} {self.dataset} {self.location or 'all locations'}"
+
+    def count(self) -> int:
+        """Number of rows that the portal has."""
+        text = self.get("json", {"$select": "count(*) as rows"})
+        try:
+            return int(json.loads(text)[0]["rows"])
+        except (ValueError, LookupError, TypeError) as error:
+            raise FetchError(
+                f"{self.base_url}: unexpected answer to a count: {text[:200]!r}"
+            ) from (error)
+
+    def page(self, offset: int, rows: int) -> bytes:
+        """One page of the table as CSV with a header."""
+        # Without an order, Socrata may repeat and leave out rows between pages.
+        return self.get("csv", {"$limit": str(rows), "$offset": str(offset), "$order": ":id"})
+
+    def get(self, kind: str, query: dict[str, str]) -> bytes:
+        """Answer to one request, repeated while the failure may pass."""
+        if self.location is not None:
+            query = {**query, "$where": f"location='{self.location}'"}
+        text = urllib.parse.urlencode(query)
+        url = f"{self.base_url}/resource/{self.dataset}.{kind}?{text}"
+        for attempt in range(self.retries + 1):
+            try:
+                with urllib.request.urlopen(url, timeout=self.timeout_s) as answer:
+                    return self._whole(answer)
+            except urllib.error.HTTPError as error:
+                failure = f"{error.code} {error.reason}"
+                error.close()
+                if error.code in GIVE_UP:
+                    raise FetchError(f"{url}: {failure}") from error
+            except (OSError, http.client.HTTPException, ValueError) as error:
+                failure = str(error) or type(error).__name__
+            if attempt < self.retries:
+                time.sleep(self.pause_s * 2**attempt)
+        raise FetchError(
+            f"{url}: failed {self.retries + 1} times, last: {failure}. Run the same command again "
+            "to go on from here"
+        )
+
+    @staticmethod
+    def _whole(answer: http.client.HTTPResponse) -> bytes:
+        content = answer.read()
+        promised = answer.headers.get("Content-Length")
+        if promised is not None and int(promised) != len(content):
+            raise OSError(f"{len(content)} of {promised} bytes arrived")
+        return content
+
+
+def fetch(
+    portal: Portal,
+    output: Path,
+    page_rows: int = PAGE_ROWS,
+    say: Callable[[str], None] = print,
+) -> int:
+    """Download a table, going on from a partial file of the same query.
+
+    Args:
+        portal: where from, and which location.
+        output: the file, written whole or not at all.
+        page_rows: rows per request.
+        say: takes lines of progress.
+
+    Returns:
+        The number of rows downloaded.
+
+    Raises:
+        FetchError: if the portal does not answer, answers something else than the table, or the
+            number of rows is not the one it counts.
+    """
+    partial, state_file = _beside(output, "part"), _beside(output, "state")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    total = portal.count()
+    if total == 0:
+        raise FetchError(f"{portal.query}: the portal has no such rows")
+    state = _resumed(state_file, partial, State(portal.query, total), say)
+    already, start = state.rows, time.monotonic()
+    with open(partial, "r+b" if state.rows else "wb") as file:
+        file.truncate(state.size)
+        file.seek(state.size)
+        while state.rows < total:
+            page = portal.page(state.rows, min(page_rows, total - state.rows))
+            rows, text = _rows_of(page, header=state.rows == 0, source=portal.query)
+            if rows == 0:
+                break
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+            state.rows, state.size = state.rows + rows, state.size + len(text)
+            _save(state, state_file)
+            say(_progress(state, state.rows - already, time.monotonic() - start))
+    _check_whole(state, portal, state_file)
+    os.replace(partial, output)
+    state_file.unlink(missing_ok=True)
+    return state.rows
+
+
+def _beside(output: Path, suffix: str) -> Path:
+    return output.with_name(f".{output.name}.{suffix}")
+
+
+def _resumed(state_file: Path, partial: Path, fresh: State, say: Callable[[str], None]) -> State:
+    """State of a partial download of the same query, or a fresh one."""
+    try:
+        state = State(**json.loads(state_file.read_text()))
+        whole = partial.stat().st_size >= state.size > 0
+    except (OSError, ValueError, TypeError):
+        return fresh
+    if state.query != fresh.query or state.total != fresh.total or not whole:
+        say("the partial file is of another download or damaged: starting again")
+        return fresh
+    say(f"going on from {state.rows:,} of {state.total:,} rows")
+    return state
+
+
+def _save(state: State, path: Path) -> None:
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(asdict(state)))
+    os.replace(temporary, path)
+
+
+def _rows_of(page: bytes, header: bool, source: str) -> tuple[int, bytes]:
+    """Number of rows of a page and its text, with or without the header line."""
+    text = page.removeprefix(b"\xef\xbb\xbf")
+    first, _, body = text.partition(b"\n")
+    names = first.decode("utf-8", "replace").lower().replace('"', "")
+    if "vehicle_id" not in names or "frame_id" not in names:
+        raise FetchError(f"{source}: the answer is not the NGSIM table; it begins {text[:200]!r}")
+    if body and not body.endswith(b"\n"):
+        body += b"\n"
+    rows = sum(1 for row in csv.reader(io.StringIO(body.decode("utf-8"))) if row)
+    return rows, (first + b"\n" + body) if header else body
+
+
+def _progress(state: State, fetched: int, seconds: float) -> str:
+    rate = fetched / max(seconds, 1e-9)
+    left = (state.total - state.rows) / rate
+    return (
+        f"{state.rows:,} of {state.total:,} rows ({state.rows / state.total:.1%}), "
+        f"{rate:,.0f} rows/s, {left / 60:.1f} min left"
+    )
+
+
+def _check_whole(state: State, portal: Portal, state_file: Path) -> None:
+    counted = portal.count()
+    if state.rows > counted:
+        state_file.unlink(missing_ok=True)  # too many rows cannot become right by going on
+    if state.rows != counted:
+        raise FetchError(
+            f"{portal.query}: {state.rows:,} rows arrived but the portal counts {counted:,}. "
+            "Run the same command again"
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--location", choices=LOCATIONS, help="one location (default: all four)")
+    parser.add_argument("--output", type=Path, default=Path("data/ngsim.csv"), help="the CSV file")
+    parser.add_argument("--page-rows", type=int, default=PAGE_ROWS, help="rows per request")
+    parser.add_argument("--retries", type=int, default=Portal.retries, help="per request")
+    parser.add_argument("--pause", type=float, default=Portal.pause_s, help="first pause [s]")
+    parser.add_argument("--base-url", default=BASE_URL, help="another portal, for tests")
+    options = parser.parse_args(arguments)
+    if options.page_rows < 1:
+        parser.error("--page-rows must be at least 1")
+    portal = Portal(
+        options.base_url.rstrip("/"),
+        location=options.location,
+        retries=options.retries,
+        pause_s=options.pause,
+    )
+    try:
+        if options.output.exists():
+            raise FetchError(f"{options.output}: exists already; remove it to download it again")
+        rows = fetch(portal, options.output, options.page_rows)
+    except (FetchError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again to go on", file=sys.stderr)
+        return 130
+    print(f"{options.output}: {rows:,} rows")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
