@@ -120,6 +120,10 @@ def register_schemas() -> None:
 
 
 register_schemas()
+# A resumed run goes on in its own folder instead of leaving an empty one behind.
+OmegaConf.register_new_resolver(
+    "lcc.folder", lambda resumed, fresh: resumed or fresh, replace=True
+)
 
 
 def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
@@ -168,6 +172,8 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     for key in given:
         if key not in signature:
             raise unknown_name(f"setting of {where}", key, signature)
+        if given[key] == "???":
+            raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
     _check_types(target, given, where)
     offered = {k: v for k, v in resources.items() if k in signature and k not in given}
     arguments = {

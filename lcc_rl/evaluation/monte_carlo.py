@@ -71,7 +71,7 @@ def evaluate(
     """Run every episode of one strategy.
 
     An episode's noise depends on ``seed`` and its profile and driver only: it is the same for
-    every strategy, and the batch size does not change any row.
+    every strategy, and the batch size changes a row by no more than rounding.
 
     Args:
         strategy: the controller and its environment's configuration.

@@ -1,0 +1,40 @@
+"""Measures of an episode against values worked out by hand."""
+
+import torch
+
+from lcc_rl.evaluation.metrics import energy_measures, safety_measures
+
+ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
+
+
+def test_energy_counts_only_the_running_steps() -> None:
+    power = torch.tensor([[1000.0, 2000.0], [3000.0, 9000.0]])
+    speed = torch.tensor([[10.0, 10.0], [11.0, 12.0], [12.0, 99.0]])
+    measures = energy_measures(power, speed, ALIVE, 0.1)
+    # (1000 + 3000)·0.1 J = 0.4 kJ; 2000·0.1 = 0.2 kJ.
+    torch.testing.assert_close(measures["energy_kj"], torch.tensor([0.4, 0.2]))
+    # ½·1.02·1005·(12² − 10²) = 22552.2 J; the second ends at 12 m/s after its only step, too.
+    torch.testing.assert_close(measures["net_energy_kj"], torch.tensor([0.4, 0.2]) - 22.5522)
+    # (10.5 + 11.5)·0.1 = 2.2 m; 11·0.1 = 1.1 m.
+    torch.testing.assert_close(measures["distance_m"], torch.tensor([2.2, 1.1]))
+
+
+def test_safety() -> None:
+    series = {
+        "ttc": torch.tensor([[3.0, 5.0], [1e3, 0.01]]),
+        "time_gap": torch.tensor([[2.6, 1.0], [1.0, 9.0]]),
+        "gap": torch.tensor([[8.0, 3.0], [7.0, -1.0]]),
+        "jerk": torch.tensor([[3.0, 2.0], [4.0, 50.0]]),
+    }
+    measures = safety_measures(series, ALIVE, 0.1)
+    expected = {
+        "min_gap_m": [7.0, 3.0],
+        "min_ttc_s": [3.0, 5.0],
+        "max_time_gap_s": [2.6, 1.0],
+        "share_ttc_unsafe": [0.5, 0.0],
+        "share_time_gap_long": [0.5, 0.0],
+        "rms_jerk_mps3": [12.5**0.5, 2.0],  # √((9 + 16)/2)
+        "duration_s": [0.2, 0.1],
+    }
+    for name, values in expected.items():
+        torch.testing.assert_close(measures[name], torch.tensor(values))
