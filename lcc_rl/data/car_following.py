@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.data.episodes import PLAUSIBLE_SPEED, SCHEMA
+from lcc_rl.data.episodes import PLAUSIBLE_SPEED
 from lcc_rl.data.ngsim import Trajectories
 from lcc_rl.data.places import find_leaders
 from lcc_rl.data.units import FRAME
@@ -275,12 +276,14 @@ def _episodes(samples: pd.DataFrame, pairs: _Pairs, keep: Mask) -> pd.DataFrame:
     entry = np.flatnonzero(np.repeat(keep, pairs.lengths))
     follower, leader = pairs.follower[entry], pairs.leader[entry]
     position, speed = samples["position_m"].to_numpy(), samples["speed_mps"].to_numpy()
-    recording = samples["recording"].cat
-    columns = {
-        "episode": np.repeat(np.arange(int(keep.sum())), pairs.lengths[keep]),
-        "recording": np.asarray(recording.categories)[recording.codes.to_numpy()[follower]],
-        "follower_id": samples["vehicle"].to_numpy()[follower],
-        "leader_id": samples["vehicle"].to_numpy()[leader],
+    vehicle, recording = samples["vehicle"].to_numpy(), samples["recording"].cat
+    number = np.arange(int(keep.sum()), dtype=np.int32)
+    names = pd.Categorical.from_codes(recording.codes.to_numpy()[follower], recording.categories)
+    columns: dict[str, Any] = {
+        "episode": np.repeat(number, pairs.lengths[keep]),
+        "recording": pd.Series(names).astype(str),
+        "follower_id": vehicle[follower],
+        "leader_id": vehicle[leader],
         "time_s": samples["time_s"].to_numpy()[follower],
         "follower_position_m": position[follower],
         "follower_speed_mps": speed[follower],
@@ -289,4 +292,5 @@ def _episodes(samples: pd.DataFrame, pairs: _Pairs, keep: Mask) -> pd.DataFrame:
         "leader_length_m": samples["length_m"].to_numpy()[leader],
         "gap_m": pairs.gap[entry],
     }
-    return pd.DataFrame(columns).astype({**SCHEMA, "recording": str})
+    # The samples have the schema's types; a conversion would copy what may be millions of rows.
+    return pd.DataFrame(columns, copy=False)
