@@ -92,9 +92,14 @@ def test_parquet_round_trip_with_metadata(tmp_path) -> None:
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(ValueError, match="half-way"), atomic_path(path) as temporary:
-        temporary.write_text("new, but")
-        raise ValueError("half-way")
+
+    def fails_half_way() -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_text("new, but")
+            raise ValueError("half-way")
+
+    with pytest.raises(ValueError, match="half-way"):
+        fails_half_way()
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
 
@@ -102,13 +107,14 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path) -> None:
 def test_a_full_disk_is_one_clear_error(tmp_path) -> None:
     if not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full on this system")
-    with (
-        pytest.raises(ResultsError, match=r"a\.txt: cannot be written: .*[Nn]o space"),
-        atomic_path(tmp_path / "a.txt"),
-        open("/dev/full", "w") as full,
-    ):
-        full.write("x")
-        full.flush()
+
+    def fills_the_disk() -> None:
+        with atomic_path(tmp_path / "a.txt"), open("/dev/full", "w") as full:
+            full.write("x")
+            full.flush()
+
+    with pytest.raises(ResultsError, match=r"a\.txt: cannot be written: .*[Nn]o space"):
+        fills_the_disk()
     assert not list(tmp_path.iterdir())
 
 

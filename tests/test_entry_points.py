@@ -1,0 +1,223 @@
+"""The commands as a user types them, shrunk to seconds."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from omegaconf import DictConfig
+
+from lcc_rl import evaluate, pipeline, results, train
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
+from lcc_rl.results.files import read_parquet
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = (
+    "experiment=smoke",
+    "data.platoons=4",
+    "data.recordings=2",
+    "scenario.horizon=40",
+    "agent.batch_size=64",
+    "agent.hidden=[16,16]",
+)
+NO_AGENT = tuple(item for item in TINY if not item.startswith("agent."))
+
+
+def tiny(entry: str, *overrides: str, agent: bool = True) -> DictConfig:
+    return load(entry, [*(TINY if agent else NO_AGENT), *overrides])
+
+
+def command(*words: str, cwd: Path, check: bool = True) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", *words],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=300,
+    )
+    assert not check or done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("trained") / "alcc"
+    train.run(tiny("train", "variant=alcc"), folder, quiet=True)
+    return folder
+
+
+def test_train_leaves_everything_that_is_promised(trained) -> None:
+    names = {path.name for path in trained.iterdir()}
+    assert names == {
+        "config.yaml",
+        "training.parquet",
+        "timing.parquet",
+        "checkpoint.pt",
+        "policy.pt",
+        "progress.json",
+        "episodes.parquet",
+        "steps.parquet",
+    }
+    rows = read_parquet(trained / "training.parquet")
+    assert {"episode_reward", "reward_safety", "loss_actor", "updates", "transitions"} <= set(rows)
+    assert json.loads((trained / "progress.json").read_text())["done"] == 3
+
+
+def test_same_command_same_rows(trained, tmp_path) -> None:
+    train.run(tiny("train", "variant=alcc"), tmp_path, quiet=True)
+    for table in ("training", "episodes", "steps"):
+        one, two = (read_parquet(folder / f"{table}.parquet") for folder in (trained, tmp_path))
+        pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+def test_a_folder_with_a_training_is_not_overwritten(trained) -> None:
+    with pytest.raises(ConfigError, match="already holds a training"):
+        train.run(tiny("train", "variant=alcc"), trained)
+
+
+def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
+    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}")
+    rows = evaluate.run(cfg, tmp_path)
+    assert set(rows["strategy"]) == {"direct", "idm", "alcc"}
+    # The training's own evaluation met the same episodes.
+    own = read_parquet(trained / "episodes.parquet")
+    again = rows[rows["strategy"] == "alcc"].reset_index(drop=True)[own.columns]
+    pd.testing.assert_frame_equal(again, own, check_exact=True)
+    figures = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert {"episode_alcc.png", "human_energy_alcc.png", "improvement_alcc_vs_idm.png"} <= figures
+
+
+def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
+    # A quieter scenario must reach the baselines as well, without changing what they are.
+    quiet = "scenario.pieces.hdv.noise=0"
+    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", quiet)
+    rows = evaluate.run(cfg, tmp_path / "a")
+    alone = evaluate.run(tiny("evaluate", "variant=idm", quiet, agent=False), tmp_path / "b")
+    for name in ("idm", "direct"):
+        one, two = (r[r["strategy"] == name].reset_index(drop=True) for r in (rows, alone))
+        pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["variant=alcc"], "give policy="),
+        (["variant=reference", "policy={trained}"], "trained as variant alcc"),
+        (["variant=alcc", "policy={trained}", "observation.scales.cav.gap=0.2"], "observation"),
+        (["variant=alcc", "policy=nowhere"], "no such file"),
+        (["variant=alcc", "policy={trained}/training.parquet"], "not a readable weights file"),
+        (["variant=alcc", "policy={trained}/checkpoint.pt"], "not a policy"),
+    ],
+)
+def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
+    cfg = tiny("evaluate", *(item.format(trained=trained) for item in overrides))
+    with pytest.raises(Exception, match=words) as caught:
+        evaluate.run(cfg, tmp_path)
+    assert type(caught.value).__module__ == "lcc_rl.errors"
+
+
+def test_pipeline_from_data_to_figures_and_completion(tmp_path) -> None:
+    overrides = [*TINY, "variants=[reference,alcc]"]
+    rows = pipeline.run(load("pipeline", overrides), tmp_path, overrides)
+    assert set(rows["strategy"]) == {"direct", "idm", "reference", "alcc"}
+    for name in ("reference", "alcc"):
+        assert (tmp_path / name / "policy.pt").exists()
+    figures = {path.name for path in (tmp_path / "evaluation" / "figures").iterdir()}
+    assert {"learning_curve.png", "improvement_alcc_vs_reference.png"} <= figures
+    # The trainings used the drivers calibrated from the data, not the shipped ones.
+    drivers = read_parquet(tmp_path / "calibration" / "drivers.parquet")
+    assert rows["desired_speed_mps"].isin(drivers["desired_speed_mps"].astype("float32")).all()
+    # Completing a complete job changes nothing.
+    again = pipeline.run(load("pipeline", overrides), tmp_path, overrides)
+    pd.testing.assert_frame_equal(rows, again, check_exact=True)
+
+
+def test_multirun_sweep_and_results_load(tmp_path) -> None:
+    words = [*TINY, "variant=alcc,reference", "seed=0,1", "hydra.sweep.dir=sweep"]
+    command("lcc_rl.train", "-m", *words, cwd=tmp_path)
+    frame = results.load(tmp_path / "sweep")
+    assert frame.groupby(["variant", "seed"]).ngroups == 4
+    assert frame["run"].nunique() == 4
+    assert {"agent.gamma", "reward.terms.safety.weight", "scenario.horizon"} <= set(frame)
+    training = results.load(tmp_path / "sweep", "training")
+    assert len(training) == 4 * 3
+    assert training.groupby("seed")["episode_reward"].first().nunique() == 2
+
+
+def test_sigkill_and_resume_equal_an_uninterrupted_run(trained, tmp_path) -> None:
+    longer = ("training.episodes=160", "variant=alcc", "hydra.run.dir=run")
+    whole = command("lcc_rl.train", *TINY, *longer[:2], "hydra.run.dir=whole", cwd=tmp_path)
+    assert whole.returncode == 0
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lcc_rl.train", *TINY, *longer],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    checkpoint = tmp_path / "run" / "checkpoint.pt"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists()
+    assert not (tmp_path / "run" / "episodes.parquet").exists()
+    command("lcc_rl.train", "resume=run", cwd=tmp_path)
+    for table in ("training", "episodes", "steps"):
+        one, two = (read_parquet(tmp_path / f / f"{table}.parquet") for f in ("whole", "run"))
+        pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "lcc_rl.train",
+            *TINY,
+            "training.episodes=80000",
+            "hydra.run.dir=run",
+        ],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "run/checkpoint.pt").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert re.search(r"stopped after iteration \d+ of 10000; go on with: .*resume=.*run", errors)
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["lcc_rl.train", "variant=alccc"], "alccc"),
+        (["lcc_rl.train", "sede=1"], "sede"),
+        (["lcc_rl.train", "data=ngsim"], "data.path"),
+        (["lcc_rl.train", "data=ngsim", "data.path=nowhere.csv"], "nowhere.csv"),
+        (["lcc_rl.train", "resume=nowhere"], "nowhere"),
+        (["lcc_rl.train", "resume=x", "seed=3"], "remove seed=3"),
+        (["lcc_rl.pipeline", "variants=[]"], "variants is empty"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> None:
+    done = command(*words, cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
