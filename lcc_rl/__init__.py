@@ -1,3 +1,18 @@
 """lcc_rl: learn and compare car-following controllers in mixed traffic."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
 __version__ = "0.1.0"
+__all__ = ["__version__", "make_env", "results"]
+
+
+def __getattr__(name: str) -> Any:
+    # Lazy: asking for the version must not load torch.
+    if name == "make_env":
+        return import_module("lcc_rl.envs.factory").make_env
+    if name == "results":
+        return import_module("lcc_rl.results")
+    raise AttributeError(f"module 'lcc_rl' has no attribute {name!r}")
