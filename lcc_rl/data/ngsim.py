@@ -214,9 +214,9 @@ def _columns(store: _Store, block: Block, names: list[str], places: NDArray[np.i
     preceding[(preceding < 0) | (preceding == vehicle)] = 0
     kinds = block.integers("v_Class", -1, INT8, blank=-1)
     store.blank_classes += int((kinds < 0).sum())
-    headway = np.zeros(len(block))
+    headway = np.zeros(len(block), dtype=np.float32)
     if block.has("Space_Headway"):
-        headway = block.numbers("Space_Headway", "feet", blank=0.0)
+        headway = _metres(block, "Space_Headway", "feet", blank=0.0)
     columns: Columns = {
         "group": _groups(store, block, frame, names, places),
         "vehicle": vehicle,
@@ -228,7 +228,7 @@ def _columns(store: _Store, block: Block, names: list[str], places: NDArray[np.i
         "speed_mps": _metres(block, "v_Vel", "ft/s"),
         "acceleration_mps2": _metres(block, "v_Acc", "ft/s²"),
         "preceding": preceding,
-        "space_headway_m": (headway * FOOT).astype(np.float32),
+        "space_headway_m": headway,
     }
     for official, own in COLUMN_OF.items():
         store.saw(official, bool(columns[own].any()))
@@ -246,9 +246,9 @@ COLUMN_OF = {
 }
 
 
-def _metres(block: Block, name: str, unit: str) -> NDArray[np.float32]:
+def _metres(block: Block, name: str, unit: str, blank: float | None = None) -> NDArray[np.float32]:
     """A column in SI; numbers too large to be real would overflow to infinity."""
-    values = block.numbers(name, unit)
+    values = block.numbers(name, unit, blank)
     large = np.abs(values) > 1e9
     if large.any():
         block.fail(int(np.argmax(large)), name, f"{unit}, at most 1e9 in size")

@@ -334,6 +334,10 @@ MALFORMED: dict[str, tuple[str | bytes, str]] = {
     "NaN": (changed(Local_Y="NaN"), r"line 4, column 'Local_Y' is blank or NaN; expected feet"),
     "infinite": (changed(v_Acc="inf"), r"line 4, column 'v_Acc' holds 'inf'"),
     "huge": (changed(Local_Y="1e30"), r"line 4, column 'Local_Y' holds '1e30'"),
+    "huge headway": (
+        changed(Space_Headway="9" * 40),
+        r"line 4, column 'Space_Headway' holds '9999",
+    ),
     "blank id": (
         changed(Vehicle_ID=""),
         r"line 4, column 'Vehicle_ID' is blank or NaN; expected a whole",
