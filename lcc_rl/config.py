@@ -121,9 +121,7 @@ def register_schemas() -> None:
 
 register_schemas()
 # A resumed run goes on in its own folder instead of leaving an empty one behind.
-OmegaConf.register_new_resolver(
-    "lcc.folder", lambda resumed, fresh: resumed or fresh, replace=True
-)
+OmegaConf.register_new_resolver("lcc.folder", lambda resumed, fresh: resumed or fresh, replace=True)
 
 
 def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:

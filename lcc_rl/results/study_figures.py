@@ -89,9 +89,8 @@ def learning_curve(training: pd.DataFrame) -> Figure:
 
 def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     """Speeds, accelerations and gaps of one held-out episode (Fig. 7)."""
-    rows = steps[steps["strategy"] == strategy]
+    rows = _one_episode(steps, strategy)
     first = rows.iloc[0]
-    rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
     figure = new_figure(7.0, 6.5)
     axes = figure.subplots(3, 1, sharex=True)
     for vehicle, (name, hue) in VEHICLES.items():
@@ -109,6 +108,46 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
         fontsize=10,
     )
     return figure
+
+
+def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
+    """One episode's speeds, and what each strategy's two cars draw: the study at a glance."""
+    figure = new_figure(10.0, 3.8)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    rows = _one_episode(steps, strategy)
+    for vehicle, (name, hue) in VEHICLES.items():
+        left.plot(rows["time_s"], rows[f"{vehicle}_speed"], color=hue, label=name, lw=1.3)
+    style(left, "time [s]", "speed [m/s]")
+    left.set_title(f"One held-out episode of {strategy}", fontsize=10)
+    left.legend(frameon=False, fontsize=9)
+    cars = episodes[episodes["strategy"] != "direct"]
+    means = cars.groupby("strategy", sort=False)[["cav_energy_kj", "hdv_energy_kj"]].mean()
+    base = 0.0 * means["cav_energy_kj"]
+    for vehicle in ("cav", "hdv"):
+        name, hue = VEHICLES[vehicle]
+        right.bar(means.index, means[f"{vehicle}_energy_kj"], bottom=base, color=hue, label=name)
+        base = base + means[f"{vehicle}_energy_kj"]
+    for place, (label, total) in enumerate(base.items()):
+        saving = f" ({100 * (total / base['idm'] - 1):+.1f} %)" if label != "idm" else ""
+        right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
+    right.set_ylim(top=1.2 * base.max())
+    style(right, "", "energy [kJ per episode]")
+    right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
+    right.set_title(
+        f"Mean over {cars['profile_id'].nunique()} held-out profiles × "
+        f"{cars['driver_id'].nunique()} drivers",
+        fontsize=10,
+    )
+    return figure
+
+
+def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
+    """Return the time series of a strategy's liveliest sample episode."""
+    rows = steps[steps["strategy"] == strategy]
+    episodes = rows.groupby(["profile", "driver_id"])["leader_speed"]
+    spread = episodes.transform("std")
+    first = rows.loc[spread.idxmax()]
+    return rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
 
 
 def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
@@ -145,7 +184,7 @@ def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> 
     _paired_bars(axis, saving, label, colour(strategy))
     figure.suptitle(
         f"{strategy} against {baseline}: mean {100 * saving.mean():+.2f} %, "
-        f"best {100 * saving.max():+.2f} %, worst {100 * saving.min():+.2f} %, "
+        f"best {100 * saving.max():+.2f} %, worst {100 * saving.min():+.2f} %\n"
         f"{int((saving < 0).sum())} of {len(saving)} drivers worse off",
         fontsize=10,
     )
@@ -189,6 +228,8 @@ def write_study_figures(folder: str | Path, training: str | Path | None = None) 
     target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
     paths = []
+    if len(steps) and "idm" in names and cars[-1] != "idm":
+        paths.append(save_figure(overview(episodes, steps, cars[-1]), target / "overview.png"))
     if training is not None:
         paths.append(
             save_figure(learning_curve(load(training, "training")), target / "learning_curve.png")
