@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from lcc_rl.errors import DataError, ResultsError
+from lcc_rl.errors import DataError
 from lcc_rl.results.files import read_parquet, write_parquet
 
 SCHEMA: dict[str, str] = {
@@ -48,7 +49,9 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     """
     try:
         frame = read_parquet(path)
-    except (ResultsError, ValueError, NotImplementedError) as error:
+        for name in frame.select_dtypes("str").columns:
+            pa.array(frame[name]).validate(full=True)  # damaged text would fail only when used
+    except Exception as error:  # a damaged parquet file raises errors of many kinds
         raise DataError(f"{path}: is not a readable episode table: {error}") from error
     names = {old: new for old, new in ALIASES.items() if new not in frame.columns}
     return validate_episodes(frame.rename(columns=names), str(path))

@@ -144,6 +144,16 @@ def test_unreadable_files(tmp_path: Path, content: bytes | None) -> None:
         read_episodes(path)
 
 
+def test_damaged_text_is_noticed_on_reading(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.parquet"
+    table().assign(recording="recording-a").to_parquet(path, compression=None)
+    content = path.read_bytes()
+    assert b"recording-a" in content
+    path.write_bytes(content.replace(b"recording-a", b"recording-\xff"))
+    with pytest.raises(DataError, match=r"pairs\.parquet: is not a readable episode table"):
+        read_episodes(path)
+
+
 def test_real_pairs(shared_data: Path) -> None:
     frame = read_episodes(shared_data / "i80_pairs.parquet")
     assert (len(frame), frame["episode"].nunique(), frame["recording"].nunique()) == (
