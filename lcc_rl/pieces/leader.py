@@ -31,10 +31,11 @@ class NGSIMLeader(Transition):
         time_step: duration of a step [s].
         start: ``"random"`` draws where in the record the window begins, ``"first"`` begins at
             its first sample.
+        profile: the record to play in every episode; None draws one for each.
         name: namespace of the written entries.
 
     Raises:
-        ConfigError: if ``start`` is unknown.
+        ConfigError: if ``start`` or ``profile`` is unknown.
         DataError: if no record is as long as the horizon.
     """
 
@@ -48,6 +49,7 @@ class NGSIMLeader(Transition):
         horizon: int,
         time_step: float,
         start: str = "random",
+        profile: int | None = None,
         name: str = "leader",
     ) -> None:
         if start not in ("random", "first"):
@@ -60,7 +62,10 @@ class NGSIMLeader(Transition):
             choices=chosen,
         )
         profiles = profiles.at_least(horizon)
+        if profile is not None and not 0 <= profile < len(profiles):
+            raise ConfigError(f"{name}.profile must lie in 0…{len(profiles) - 1}, got {profile}")
         self.name, self.start, self.time_step = name, start, time_step
+        self.profile = profile
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("starts", profiles.lengths - horizon)
@@ -79,7 +84,9 @@ class NGSIMLeader(Transition):
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         seed = start.get(SEED)
         profile, first = given.get(self.choices[0], None), given.get(self.choices[1], None)
-        if profile is None:
+        if profile is None and self.profile is not None:
+            profile = torch.full_like(seed, self.profile)
+        elif profile is None:
             profile = choose(seed, len(self.offsets), stream_id(f"{self.name}.profile"))
         elif bool(((profile < 0) | (profile >= len(self.offsets))).any()):
             raise ConfigError(f"profile ids must lie in 0…{len(self.offsets) - 1}, got {profile}")

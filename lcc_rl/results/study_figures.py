@@ -146,7 +146,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     rows = steps[steps["strategy"] == strategy]
     episodes = rows.groupby(["profile", "driver_id"])["leader_speed"]
     spread = episodes.transform("std")
-    first = rows.loc[spread.idxmax()]
+    first = rows.iloc[int(spread.to_numpy().argmax())]
     return rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
 
 

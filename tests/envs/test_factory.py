@@ -97,6 +97,15 @@ def test_leader_plays_the_profile_that_is_asked_for() -> None:
     assert torch.equal(data["hdv", "desired_time_gap"][:, 0].flatten(), drawn)
 
 
+def test_one_profile_for_every_episode() -> None:
+    env = small_env("alcc", 16, ["scenario.pieces.leader.profile=2"])
+    td = env.reset()
+    assert (td["leader", "profile"] == 2).all()
+    assert td["leader", "start"].unique().numel() > 1
+    with pytest.raises(ConfigError, match=r"profile must lie in 0…3"):
+        small_env("alcc", 1, ["scenario.pieces.leader.profile=4"])
+
+
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
@@ -207,6 +216,24 @@ def test_compiled_step_agrees_with_eager() -> None:
     ]
     for eager, fast in zip(pieces[0].compute(*entries), compiled(*entries), strict=True):
         torch.testing.assert_close(eager, fast, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
+    policy = build_agent(compose("alcc"), POPULATION).policy
+    runs = []
+    for compiled in (False, True):
+        env = small_env("alcc", 64, ["scenario.horizon=300"], seed=2)
+        if compiled:
+            env.compile(warmup=1)
+        with torch.no_grad():
+            runs.append(env.rollout(300, policy, break_when_any_done=False)["next"])
+    for key in (("cav", "gap"), ("hdv", "speed"), ("hdv", "predicted_acceleration"), "reward"):
+        difference = (runs[0][key] - runs[1][key]).abs()
+        # Until the first collision; what follows depends on rounding.
+        running = ~runs[0]["terminated"].cumsum(1).bool()
+        running = running.unsqueeze(-1) if difference.ndim > running.ndim else running
+        assert (difference * running).max() < 1e-3 * runs[0][key].abs().max(), key
 
 
 def test_idm_in_the_cars_place_follows_well() -> None:
