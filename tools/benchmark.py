@@ -282,7 +282,9 @@ def env_rates(options: Namespace, batch: int, ending: str) -> dict[str, np.ndarr
     plain, start = PlainLoop(env), env.reset()
     advance = plain.step
     if ending:
-        # One graph per size, as one would have it; a graph for any size is slower.
+        # One graph per size, which is faster than one for any size; and none of other sizes, whose
+        # guards would be tried first and count towards the compiler's limit.
+        torch.compiler.reset()
         env.compile(warmup=3, dynamic=False)
         advance = torch.compile(plain.step, dynamic=False)
 
