@@ -49,7 +49,7 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     """
     try:
         frame = read_parquet(path)
-        for name in frame.select_dtypes("str").columns:
+        for name in map(str, frame.select_dtypes("str").columns):
             pa.array(frame[name]).validate(full=True)  # damaged text would fail only when used
     except Exception as error:  # a damaged parquet file raises errors of many kinds
         raise DataError(f"{path}: is not a readable episode table: {error}") from error
