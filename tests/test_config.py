@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import subprocess
+import sys
 from pathlib import Path
 
 import lcc_rl.conf
@@ -200,3 +202,14 @@ def test_all_terms_removed() -> None:
 def test_hash_ignores_order_and_sees_values() -> None:
     assert config_hash({"a": 1, "b": 2}) == config_hash({"b": 2, "a": 1})
     assert config_hash({"a": 1}) != config_hash({"a": 2})
+
+
+@pytest.mark.parametrize(
+    "module", ["pieces", "envs", "policies", "agents", "evaluation", "results", "data.stream"]
+)
+def test_every_room_can_be_entered_first(module) -> None:
+    # A circular import shows only in a fresh interpreter that begins with the wrong room.
+    done = subprocess.run(
+        [sys.executable, "-c", f"import lcc_rl.{module}"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

@@ -43,7 +43,6 @@ from lcc_rl.config import load
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.data.stream import StreamSource
-from lcc_rl.envs.clock import SEED, STEP
 from lcc_rl.envs.factory import Inputs, build_agent, build_env, load_inputs
 from lcc_rl.errors import DataError, LccError, unknown_name
 from lcc_rl.evaluation.monte_carlo import Strategy
@@ -54,6 +53,7 @@ from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.random import uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
+from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.results.files import write_parquet
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed

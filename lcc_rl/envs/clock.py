@@ -10,9 +10,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from lcc_rl.errors import ConfigError
-
-SEED = ("episode", "seed")
-STEP = ("episode", "step")
+from lcc_rl.pieces.base import SEED, STEP
 
 
 class Clock(EnvBase):

@@ -17,10 +17,10 @@ from torchrl.envs.utils import step_mdp
 
 from lcc_rl.config import require
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.envs.clock import SEED
 from lcc_rl.envs.factory import build_env
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures
 from lcc_rl.functional.random import hash_bits
+from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.vehicles import Population
 
 # What a strategy's episodes are measured by; those that a scenario lacks are left out.

@@ -22,6 +22,9 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 NEXT = "next"
+# Written by the clock: the seed from which everything random in an episode follows, and its step.
+SEED = ("episode", "seed")
+STEP = ("episode", "step")
 
 
 def as_tuple(key: NestedKey) -> tuple[str, ...]:

@@ -9,10 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.envs.clock import STEP
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
-from lcc_rl.pieces.base import Transition, following
+from lcc_rl.pieces.base import STEP, Transition, following
 from lcc_rl.pieces.vehicles import Population
 
 

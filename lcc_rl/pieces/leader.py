@@ -10,10 +10,9 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.envs.clock import SEED, STEP
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import choose, stream_id
-from lcc_rl.pieces.base import Transition, following
+from lcc_rl.pieces.base import SEED, STEP, Transition, following
 
 
 class NGSIMLeader(Transition):

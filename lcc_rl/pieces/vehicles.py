@@ -9,12 +9,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.envs.clock import SEED, STEP
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.random import choose, stream_id, uniform
-from lcc_rl.pieces.base import Transition, following
+from lcc_rl.pieces.base import SEED, STEP, Transition, following
 
 MOTION = ("speed", "gap", "relative_speed", "acceleration", "jerk")
 

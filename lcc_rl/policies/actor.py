@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from lcc_rl.envs.clock import SEED, STEP
 from lcc_rl.functional.random import normal, stream_id
+from lcc_rl.pieces.base import SEED, STEP
 
 
 def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:

@@ -9,10 +9,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from lcc_rl.envs.clock import SEED
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import idm_acceleration
 from lcc_rl.functional.random import choose, stream_id
+from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.vehicles import Population
 
 

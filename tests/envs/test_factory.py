@@ -219,6 +219,7 @@ def test_compiled_step_agrees_with_eager() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own
 def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
     policy = build_agent(compose("alcc"), POPULATION).policy
     runs = []
