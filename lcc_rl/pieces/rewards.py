@@ -20,6 +20,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.safety import time_to_collision
 from lcc_rl.pieces.base import RewardPiece
 
 TERMS = "reward_terms"
@@ -57,10 +58,15 @@ class RewardTerm(RewardPiece):
 class SafetyReward(RewardTerm):
     """R_safe = log(TTC / threshold) where TTC is below the threshold, else 0 (A10–A11).
 
+    With a ``margin`` the time is that until the gap has shrunk to the margin. The literal rule
+    (0) says nothing against creeping up to a standing leader until the bumpers touch: slowly
+    enough, TTC stays large.
+
     Args:
         name, weight: see :class:`RewardTerm`.
         threshold: time-to-collision that is safe enough [s].
         floor: time-to-collision below which the term no longer falls [s].
+        margin: gap that counts as contact [m].
         vehicle: namespace of the vehicle.
     """
 
@@ -70,16 +76,20 @@ class SafetyReward(RewardTerm):
         weight: float = 1.0,
         threshold: float = 4.0,
         floor: float = 0.01,
+        margin: float = 0.0,
         vehicle: str = "cav",
     ) -> None:
         if not 0 < floor < threshold:
             raise ConfigError(f"reward.terms.{name}: floor {floor} must be below {threshold}")
-        super().__init__(name, weight, [(vehicle, "ttc")])
-        self.threshold, self.floor = threshold, floor
+        if not margin >= 0:
+            raise ConfigError(f"reward.terms.{name}.margin must not be negative, got {margin}")
+        super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "relative_speed")])
+        self.threshold, self.floor, self.margin = threshold, floor, margin
 
-    def reward(self, ttc: Tensor) -> Tensor:
+    def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the unweighted term."""
-        return (ttc.clamp(self.floor, self.threshold) / self.threshold).log()
+        ttc = time_to_collision(gap - self.margin, -relative_speed, self.floor)
+        return (ttc.clamp(max=self.threshold) / self.threshold).log()
 
 
 class EfficiencyReward(RewardTerm):
