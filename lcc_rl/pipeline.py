@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from lcc_rl import calibrate, evaluate, train
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import build, load, plain, require
 from lcc_rl.data.episodes import write_episodes
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.progress import watch
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.runs import save_config
@@ -27,6 +27,7 @@ log = logging.getLogger("lcc_rl")
 
 # Settings that only the pipeline has; all others are passed on to calibration and trainings.
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra")
+PATIENCE = 20.0  # a training ends after the iteration at hand [s]
 OVERRIDES, TRAJECTORIES = "overrides.json", "trajectories.parquet"
 
 
@@ -105,9 +106,22 @@ def _train_all(parts: dict[str, DictConfig], folder: Path, jobs: int) -> None:
             name: pool.submit(_train_one, plain(cfg), str(folder / name))
             for name, cfg in todo.items()
         }
-        watch({name: (folder / name, future) for name, future in futures.items()})
-        for future in futures.values():
-            future.result()
+        try:
+            watch({name: (folder / name, future) for name, future in futures.items()})
+            for future in futures.values():
+                future.result()
+        except (KeyboardInterrupt, Interrupted):
+            _stop_children(list(futures.values()))
+            raise Interrupted(
+                f"stopped; complete it with: python -m lcc_rl.pipeline resume={folder}"
+            ) from None
+
+
+def _stop_children(futures: list[Future[None]]) -> None:
+    """Let trainings that heard the interrupt save and end; then tell those that did not."""
+    _, running = wait(futures, PATIENCE)
+    for process in multiprocessing.active_children() if running else ():
+        process.terminate()
 
 
 def _train_one(settings: dict[str, Any], folder: str) -> None:

@@ -203,6 +203,29 @@ def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
     assert "Traceback" not in errors
 
 
+def test_an_interrupted_pipeline_is_completed(tmp_path) -> None:
+    words = [*TINY, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lcc_rl.pipeline", *words],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "job/alcc/checkpoint.pt").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process of the job
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "resume=" in errors
+    assert not (tmp_path / "job/alcc/episodes.parquet").exists()
+    command("lcc_rl.pipeline", "resume=job", cwd=tmp_path)
+    assert len(read_parquet(tmp_path / "job/alcc/training.parquet")) == 50
+    assert (tmp_path / "job/evaluation/figures/overview.png").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
