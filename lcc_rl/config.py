@@ -9,13 +9,13 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from hydra.utils import get_object
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -164,7 +164,7 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     )
     if not isinstance(settings, Mapping) or TARGET not in settings:
         raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}")
-    target = _find(str(settings[TARGET]), where)
+    target = find_target(str(settings[TARGET]), where)
     signature = inspect.signature(target).parameters
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
     for key in given:
@@ -187,9 +187,15 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     return target(**arguments, **offered)
 
 
-def _find(target: str, where: str) -> Any:
+def find_target(target: str, where: str) -> Any:
+    """Return the class or function that a ``_target_`` names.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    module, _, name = target.rpartition(".")
     try:
-        return get_object(target)
+        return getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}") from error
 

@@ -10,10 +10,9 @@ from pathlib import Path
 import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
-from hydra.utils import get_object
 from omegaconf import OmegaConf
 
-from lcc_rl.config import build, config_hash, load
+from lcc_rl.config import build, config_hash, find_target, load
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import RewardTerm
@@ -65,6 +64,13 @@ def test_every_option_of_a_group_builds(group) -> None:
         assert built is not None
 
 
+@pytest.mark.parametrize("variant", options("variant"))
+@pytest.mark.parametrize("experiment", options("experiment"))
+def test_every_recipe_serves_every_variant(experiment, variant) -> None:
+    cfg = load("train", [f"experiment={experiment}", f"variant={variant}"])
+    assert build_agent(cfg, POPULATION).policy is not None
+
+
 def test_paper_recipe_is_what_the_defaults_are() -> None:
     # The recipe exists to be read; it must not drift from the defaults it repeats.
     assert config_hash(load("train", ["experiment=paper_alcc"])) == config_hash(load("train"))
@@ -87,7 +93,7 @@ def test_constructor_arguments_and_yaml_are_in_parity() -> None:
         cfg = compose(variant)
         nodes = {**cfg.scenario.pieces, **cfg.reward.terms}
         for name, node in nodes.items():
-            signature = set(inspect.signature(get_object(node["_target_"])).parameters)
+            signature = set(inspect.signature(find_target(node["_target_"], name)).parameters)
             given = {key for key in node if not key.startswith("_")}
             assert given <= signature, name
             assert signature - given <= offered | naming, (name, signature - given)

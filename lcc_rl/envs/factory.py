@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 from torchrl.envs import Compose, TransformedEnv
 
-from lcc_rl.config import build, load
+from lcc_rl.config import TARGET, build, find_target, load, plain
 from lcc_rl.data.profiles import Profiles, leader_profiles
 from lcc_rl.envs.clock import Clock
 from lcc_rl.pieces import Piece, TotalReward
@@ -114,10 +115,16 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
     Raises:
         ConfigError: naming the option at fault.
     """
+    node = plain(cfg.agent)
+    target = find_target(node[TARGET], "agent")
+    if not getattr(target, "learns", True):
+        # A recipe's learning settings mean nothing to those that do not learn.
+        known = inspect.signature(target).parameters
+        node = {key: value for key, value in node.items() if key in known or key == TARGET}
     cav = cfg.scenario.pieces.get("cav")
     observation: Piece = build(cfg.observation, "observation")
     return build(
-        cfg.agent,
+        node,
         "agent",
         population=population,
         observation_size=observation.event_shape[0],

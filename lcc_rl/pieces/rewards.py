@@ -58,9 +58,9 @@ class RewardTerm(RewardPiece):
 class SafetyReward(RewardTerm):
     """R_safe = log(TTC / threshold) where TTC is below the threshold, else 0 (A10–A11).
 
-    With a ``margin`` the time is that until the gap has shrunk to the margin. The literal rule
-    (0) says nothing against creeping up to a standing leader until the bumpers touch: slowly
-    enough, TTC stays large.
+    The time is that until the gap has shrunk to the ``margin``. The literal rule, margin 0, says
+    nothing against creeping up to a standing leader until the bumpers touch: slowly enough, TTC
+    stays large.
 
     Args:
         name, weight: see :class:`RewardTerm`.
@@ -76,7 +76,7 @@ class SafetyReward(RewardTerm):
         weight: float = 1.0,
         threshold: float = 4.0,
         floor: float = 0.01,
-        margin: float = 0.0,
+        margin: float = 1.0,
         vehicle: str = "cav",
     ) -> None:
         if not 0 < floor < threshold:

@@ -21,7 +21,7 @@ def t(*values: float) -> torch.Tensor:
 
 def test_safety() -> None:
     # Gap 6 m closing at 3 m/s: log(2/4); at 1 m/s: 6 s, safe; opening: safe; contact: log(0.01/4).
-    term = SafetyReward()
+    term = SafetyReward(margin=0.0)
     got = term.reward(t(6.0, 6.0, 6.0, -0.1), t(-3.0, -1.0, 1.0, -1.0))
     torch.testing.assert_close(got, t(math.log(0.5), 0.0, 0.0, math.log(0.0025)))
     assert got.min() > -6.0
@@ -29,7 +29,7 @@ def test_safety() -> None:
 
 def test_safety_with_margin() -> None:
     # To the margin of 1 m: (6 − 1)/2.5 = 2 s; literally it would be 2.4 s.
-    got = SafetyReward(margin=1.0).reward(t(6.0, 0.9), t(-2.5, 0.0))
+    got = SafetyReward().reward(t(6.0, 0.9), t(-2.5, 0.0))
     torch.testing.assert_close(got, t(math.log(0.5), math.log(0.0025)))
 
 
