@@ -175,6 +175,7 @@ def alcc(options: Namespace, batch: int, initial_time_gap: float = 1.5) -> Trans
     cfg, inputs = study(options.quick)
     cfg = cfg.copy()
     cfg.scenario.pieces.cav.initial_time_gap = initial_time_gap
+    cfg.scenario.pieces.cav.initial_gap_range = [1.0, 1.0]
     return build_env(cfg, inputs.training, inputs.population, batch)
 
 
@@ -224,7 +225,8 @@ class PlainLoop:
         predicted, belief = predict_and_update(*motion, speed, belief, drivers, dt, error)
         early = now["step"] < self.estimator.learning_steps
         predicted = torch.where(early, self.estimator.mean(*motion), predicted)
-        ttc, threshold = time_to_collision(cav_gap, cav - leader), self.safety.threshold
+        threshold = self.safety.threshold
+        ttc = time_to_collision(cav_gap - self.safety.margin, cav - leader)
         late = time_gap(cav_gap, cav) >= self.efficiency.threshold
         reward = (
             self.safety.weight * (ttc.clamp(self.safety.floor, threshold) / threshold).log()

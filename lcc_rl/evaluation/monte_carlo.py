@@ -119,7 +119,10 @@ def choices(
     given.set(SEED, (hash_bits(number + seed * 0x9E3779B1) >> 1).unsqueeze(-1))
     given.set(("leader", "profile"), profile.unsqueeze(-1))
     given.set(("leader", "start"), torch.zeros_like(profile).unsqueeze(-1))
-    shape = env.full_state_spec["hdv", "driver"].shape
+    spec = env.full_state_spec
+    if ("cav", "gap_factor") in spec.keys(True):
+        given.set(("cav", "gap_factor"), torch.ones(*batch, 1))
+    shape = spec["hdv", "driver"].shape
     given.set(("hdv", "driver"), driver.view(-1, 1, 1).expand(shape).clone())
     return given
 

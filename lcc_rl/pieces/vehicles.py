@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import torch
@@ -42,11 +43,14 @@ class CAVMotion(Transition):
         max_acceleration: acceleration of action 1; braking of action −1 [m/s²].
         standstill_gap: gap at the start when standing [m].
         initial_time_gap: further time gap at the start [s]; the paper is silent on it.
+        initial_gap_range: the gap at the start is that times a factor drawn evenly from this
+            range by the episode's seed, so that training meets what good driving never does;
+            ``(name, "gap_factor")`` given to ``env.reset`` replaces the draw (evaluation gives 1).
         name: namespace of the car.
         predecessor: namespace of the vehicle ahead.
 
     Raises:
-        ConfigError: if ``max_acceleration`` or ``standstill_gap`` is not positive.
+        ConfigError: if ``max_acceleration``, ``standstill_gap`` or the range is not positive.
     """
 
     def __init__(
@@ -55,6 +59,7 @@ class CAVMotion(Transition):
         max_acceleration: float = 3.0,
         standstill_gap: float = 2.0,
         initial_time_gap: float = 1.5,
+        initial_gap_range: Sequence[float] = (1.0, 1.0),
         name: str = "cav",
         predecessor: str = "leader",
     ) -> None:
@@ -64,6 +69,13 @@ class CAVMotion(Transition):
         ):
             if not value > 0:
                 raise ConfigError(f"{name}.{label} must be positive, got {value}")
+        lowest, highest = initial_gap_range
+        if not 0 < lowest <= highest:
+            raise ConfigError(
+                f"{name}.initial_gap_range must be two increasing positive factors, got "
+                f"{list(initial_gap_range)}"
+            )
+        factor = [(name, "gap_factor")]
         super().__init__(
             reads=[
                 (name, "speed"),
@@ -74,7 +86,10 @@ class CAVMotion(Transition):
                 following((predecessor, "speed")),
             ],
             writes=motion_keys(name),
+            constants=factor,
+            choices=factor,
         )
+        self.lowest, self.highest = float(lowest), float(highest)
         self.time_step, self.max_acceleration = time_step, max_acceleration
         self.standstill_gap, self.initial_time_gap = standstill_gap, initial_time_gap
         self.name, self.predecessor = name, predecessor
@@ -98,10 +113,13 @@ class CAVMotion(Transition):
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         speed = start.get((self.predecessor, "speed"))
         still = torch.zeros_like(speed)
-        gap = self.standstill_gap + self.initial_time_gap * speed
-        for key, value in zip(
-            motion_keys(self.name), (speed, gap, still, still, still), strict=True
-        ):
+        factor = given.get(self.choices[0], None)
+        if factor is None:
+            draw = uniform(start.get(SEED), 0, stream_id(f"{self.name}.gap_factor"))
+            factor = self.lowest + (self.highest - self.lowest) * draw
+        gap = factor * (self.standstill_gap + self.initial_time_gap * speed)
+        values = (factor, speed, gap, still, still, still)
+        for key, value in zip([*self.constants, *motion_keys(self.name)], values, strict=True):
             start.set(key, value)
 
 

@@ -67,7 +67,8 @@ def test_rollout_follows_the_equations() -> None:
 
 
 def test_initial_state() -> None:
-    td = small_env("alcc", 6).reset()
+    nominal = TensorDict({("cav", "gap_factor"): torch.ones(6, 1)}, [6])
+    td = small_env("alcc", 6).reset(nominal)
     speed = td["leader", "speed"]
     assert torch.equal(td["cav", "speed"], speed)
     assert torch.equal(td["hdv", "speed"].squeeze(-2), speed)
@@ -77,6 +78,14 @@ def test_initial_state() -> None:
         hdv["speed"], hdv["desired_speed"], hdv["desired_time_gap"], POPULATION.constants
     )
     torch.testing.assert_close(hdv["gap"], gap)
+
+
+def test_training_starts_at_many_gaps() -> None:
+    td = small_env("alcc", 200).reset()
+    factor = td["cav", "gap"] / (2.0 + 1.5 * td["cav", "speed"])
+    torch.testing.assert_close(factor, td["cav", "gap_factor"])
+    assert 0.1 <= factor.min() < 0.2
+    assert 1.4 < factor.max() <= 1.5
 
 
 def test_leader_plays_the_profile_that_is_asked_for() -> None:
