@@ -155,13 +155,14 @@ class Trainer:
         collector.reset()
         segments = iter(collector)
         played, losses, spent = [], [], [0.0, 0.0]
-        for _ in range(self.horizon // self.settings.segment):
+        for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             batch = next(segments)
             self.buffer.extend(batch.select(*LEARNED_FROM).reshape(-1))
             played.append(batch.select(*REPORTED))
             collected = time.perf_counter()
-            losses.append(self._learn(batch.numel()))
+            before = (self.iteration * self.horizon + part * batch.shape[1]) * batch.shape[0]
+            losses.append(self._learn(before, batch.numel()))
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         episodes = torch.cat(played, dim=1)
@@ -181,9 +182,10 @@ class Trainer:
         self.times.append(dict(times))
         return row
 
-    def _learn(self, transitions: int) -> dict[str, float]:
-        ready = len(self.buffer) >= self.agent.batch_size
-        count = round(transitions * self.agent.updates_per_transition) if ready else 0
+    def _learn(self, before: int, new: int) -> dict[str, float]:
+        """Take the updates that are due after ``new`` transitions on top of those ``before``."""
+        ratio, ready = self.agent.updates_per_transition, len(self.buffer) >= self.agent.batch_size
+        count = int((before + new) * ratio) - int(before * ratio) if ready else 0
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
         for _ in range(count):
             losses = self.agent.update(self.buffer.sample())
