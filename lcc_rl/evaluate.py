@@ -15,7 +15,7 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.results.runs import load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
-from lcc_rl.train import evaluate_and_write
+from lcc_rl.train import check_sizes, evaluate_and_write
 
 log = logging.getLogger("lcc_rl")
 
@@ -43,6 +43,9 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
     """
     folder = Path(folder)
     prepare_torch(cfg)
+    check_sizes(cfg)
+    if cfg.policy is not None and cfg.variant in BASELINES:
+        raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)

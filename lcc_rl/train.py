@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pandas as pd
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
+from lcc_rl.config import require
 from lcc_rl.envs.factory import Inputs, build_agent, build_env, load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
@@ -20,6 +21,8 @@ from lcc_rl.results.runs import identity, load_config, save_config, save_policy
 from lcc_rl.results.tables import as_rich, summary
 
 log = logging.getLogger("lcc_rl")
+
+MEASURED = ("cav_ttc", "cav_time_gap", "cav_power", "hdv_power")
 
 
 def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFrame:
@@ -50,6 +53,7 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
             "hydra.run.dir"
         )
     prepare_torch(cfg)
+    check_sizes(cfg)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
@@ -69,6 +73,25 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
     seed = cfg.seed if agent.learns else None
     strategy = Strategy(cfg.variant, cfg, agent.policy, seed)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+
+
+def check_sizes(cfg: DictConfig) -> None:
+    """Check, before anything runs, what would fail only at its end.
+
+    Raises:
+        ConfigError: naming the option.
+    """
+    sizes = {f"evaluation.{key}": cfg.evaluation[key] for key in ("profiles", "drivers")}
+    sizes["evaluation.batch_size"] = cfg.evaluation.batch_size
+    if not OmegaConf.is_missing(cfg.training, "environments"):
+        sizes["training.environments"] = cfg.training.environments
+    for name, value in sizes.items():
+        require(value is None or value >= 1, f"{name} must be at least 1, got {value}")
+    pieces = cfg.scenario.pieces
+    measured = [name for name in MEASURED if "cav" in pieces and name not in pieces]
+    require(not measured, f"scenario.pieces lacks {measured}, which the evaluation measures")
+    step = cfg.scenario.time_step
+    require(step > 0, f"scenario.time_step must be positive, got {step}")
 
 
 def evaluate_and_write(

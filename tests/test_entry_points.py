@@ -126,6 +126,37 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
     assert type(caught.value).__module__ == "lcc_rl.errors"
 
 
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("training.environments=0", r"training\.environments must be at least 1"),
+        ("evaluation.drivers=0", r"evaluation\.drivers must be at least 1"),
+        ("evaluation.profiles=0", r"evaluation\.profiles must be at least 1"),
+        ("scenario.time_step=-0.1", r"time_step must be positive"),
+        ("~scenario.pieces.cav_ttc", r"lacks \['cav_ttc'\], which the evaluation measures"),
+        ("~scenario.pieces.hdv_predicted_power", r"reads hdv\.predicted_power, which no piece"),
+        ("~scenario.pieces.hdv", r"reads hdv\."),
+    ],
+)
+def test_what_would_fail_late_fails_before_anything_is_written(tmp_path, override, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        train.run(tiny("train", override), tmp_path)
+    assert not (tmp_path / "training.parquet").exists()
+
+
+def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
+    train.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct")
+    cfg = tiny("evaluate", "variant=idm", "scenario.followers=3", agent=False)
+    rows = evaluate.run(cfg, tmp_path / "three")
+    assert set(rows["strategy"]) == {"direct", "idm"}
+    assert (tmp_path / "three" / "figures" / "episode_idm.png").exists()
+
+
+def test_a_policy_for_those_that_learn_nothing_is_refused(trained, tmp_path) -> None:
+    with pytest.raises(ConfigError, match="learns nothing"):
+        evaluate.run(tiny("evaluate", "variant=idm", f"policy={trained}", agent=False), tmp_path)
+
+
 def test_pipeline_from_data_to_figures_and_completion(tmp_path) -> None:
     overrides = [*TINY, "variants=[reference,alcc]"]
     rows = pipeline.run(load("pipeline", overrides), tmp_path, overrides)

@@ -12,7 +12,7 @@ import pandas as pd
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.ngsim import Trajectories, read_ngsim
-from lcc_rl.errors import DataError
+from lcc_rl.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,10 @@ class NgsimSource:
         Raises:
             DataError: if a file is missing or not what was expected, or no episode is left.
         """
+        if self.smoothing is not None and not callable(self.smoothing):
+            raise ConfigError(
+                f"data.smoothing must be null or a node with _target_, got {self.smoothing!r}"
+            )
         files = find_files(self.path)
         trajectories = read_ngsim(files, self.location)
         if self.smoothing is not None:

@@ -14,7 +14,9 @@ from torchrl.envs import Compose, TransformedEnv
 from lcc_rl.config import TARGET, build, find_target, load, plain
 from lcc_rl.data.profiles import Profiles, leader_profiles
 from lcc_rl.envs.clock import Clock
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Piece, TotalReward
+from lcc_rl.pieces.base import SEED, STEP, Transition, arrived
 from lcc_rl.pieces.vehicles import Population
 
 
@@ -104,9 +106,29 @@ def build_env(
         for name, node in cfg.reward.terms.items()
     ]
     pieces.append(TotalReward(list(cfg.reward.terms)))
+    _check_wiring(pieces)
     clock = Clock(scenario.horizon, batch_size, seed=seed, device=device)
     env = TransformedEnv(clock, Compose(*pieces))
     return env.to(device) if device is not None else env
+
+
+def _check_wiring(pieces: Sequence[Piece]) -> None:
+    """Check that every entry read is written by the clock, the policy or a piece.
+
+    Raises:
+        ConfigError: naming the entry and the piece that reads it.
+    """
+    own = [SEED, STEP, ("action",), ("done",), ("terminated",)]
+    written = {arrived(key) for piece in pieces for key in piece.out_keys} | set(own)
+    for piece in pieces:
+        written |= set(piece.constants) if isinstance(piece, Transition) else set()
+    for piece in pieces:
+        for key in map(arrived, piece.in_keys):
+            if key not in written:
+                raise ConfigError(
+                    f"{type(piece).__name__} reads {'.'.join(key)}, which no piece of the "
+                    "scenario writes; was a piece removed?"
+                )
 
 
 def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Any:

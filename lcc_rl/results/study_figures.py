@@ -147,7 +147,10 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     episodes = rows.groupby(["profile", "driver_id"])["leader_speed"]
     spread = episodes.transform("std")
     first = rows.iloc[int(spread.to_numpy().argmax())]
-    return rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
+    rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
+    # Of a string of followers the nearest one is shown.
+    nearest = {name: f"hdv{name[4:]}" for name in rows.columns if name.startswith("hdv1_")}
+    return rows.rename(columns=nearest) if "hdv_speed" not in rows else rows
 
 
 def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:

@@ -9,6 +9,16 @@ from rich.table import Table
 KEYS = ["profile_id", "driver_id"]
 
 
+CAR_COLUMNS = (
+    *(f"{v}_{kind}" for v in ("cav", "total") for kind in ("energy_kj", "net_energy_kj")),
+    "cav_distance_m",
+    "min_ttc_s",
+    "share_ttc_unsafe",
+    "share_time_gap_long",
+    "rms_jerk_mps3",
+)
+
+
 def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
     """Put strategies side by side: one row per (profile, driver), the mean over training seeds."""
     return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
@@ -26,6 +36,9 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         than with each, and the safety measures. Savings are positive where energy is saved;
         entries that do not exist for a strategy are missing.
     """
+    # A string without a controlled car has no energies of one.
+    cars = [column for column in CAR_COLUMNS if column not in episodes]
+    episodes = episodes.assign(**dict.fromkeys(cars, float("nan")))
     total, net = paired(episodes, "total_energy_kj"), paired(episodes, "total_net_energy_kj")
     rows = []
     for strategy, group in episodes.groupby("strategy", sort=False):
