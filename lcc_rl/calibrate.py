@@ -18,7 +18,8 @@ from lcc_rl.calibration.population import from_table
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import build, config_hash, plain
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.calibration_figures import calibration_figure, joint_figure, save
+from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
+from lcc_rl.results.drawing import save
 from lcc_rl.results.files import write_parquet
 
 

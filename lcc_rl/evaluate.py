@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import load
-from lcc_rl.envs.factory import Inputs, build_agent, load_inputs
+from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.results.runs import load_policy, save_config
@@ -44,7 +44,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
     folder = Path(folder)
     prepare_torch(cfg)
     check_sizes(cfg)
-    if cfg.policy is not None and cfg.variant in BASELINES:
+    if cfg.policy is not None and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     inputs = load_inputs(cfg)
     for line in inputs.report:
@@ -86,8 +86,6 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
     """
     agent = build_agent(cfg, inputs.population, cfg.device)
     if not agent.learns:
-        if cfg.policy is not None:
-            raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
         return Strategy(cfg.variant, cfg, agent.policy)
     if cfg.policy is None:
         raise ConfigError(

@@ -13,15 +13,16 @@ import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl import calibrate, evaluate, train
+from lcc_rl import calibrate, evaluate, results, train
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import build, load, plain, require
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.progress import watch
+from lcc_rl.results.drawing import save
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.runs import save_config
-from lcc_rl.results.study_figures import write_study_figures
+from lcc_rl.results.study_figures import learning_curve
 
 log = logging.getLogger("lcc_rl")
 
@@ -76,7 +77,9 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
         str(folder / name) for name in cfg.variants if (folder / name / "policy.pt").exists()
     ]
     episodes = evaluate.run(final, folder / "evaluation", own=False)
-    write_study_figures(folder / "evaluation", folder if final.compare else None)
+    if final.compare:
+        curve = learning_curve(results.load(folder, "training"))
+        save(curve, folder / "evaluation" / "figures" / "learning_curve.png")
     return episodes
 
 

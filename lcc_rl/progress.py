@@ -24,6 +24,18 @@ def clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
+def bar(console: Console) -> Progress:
+    """Return a bar for tasks with a ``note``; it draws nothing where there is no terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
+        TimeElapsedColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
 class ProgressReporter:
     """Shows how far a long job is: rate, ETA and current values.
 
@@ -55,14 +67,7 @@ class ProgressReporter:
         self.console = console or Console(stderr=True)
         self.live = self.console.is_terminal
         self.begun = self.last_line = time.monotonic()
-        self.bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=self.console,
-            disable=not self.live,
-        )
+        self.bar = bar(self.console)
         self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note="")
 
     def __enter__(self) -> ProgressReporter:
@@ -123,16 +128,10 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
         every: seconds between plain lines where there is no terminal.
     """
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
-        TimeElapsedColumn(),
-    )
     last = time.monotonic()
     futures = [future for _, future in jobs.values()]
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        tasks = {name: bar.add_task(name, total=None, note="starting") for name in jobs}
+    with bar(console) as shown:
+        tasks = {name: shown.add_task(name, total=None, note="starting") for name in jobs}
         while wait(futures, 1.0, FIRST_EXCEPTION).not_done:
             due = not console.is_terminal and time.monotonic() - last >= every
             last = time.monotonic() if due else last
@@ -141,7 +140,7 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
                 if state is None:
                     continue
                 note = f"reward {state.get('reward', 0.0):.4g}  ETA {clock(state['eta_s'])}"
-                bar.update(tasks[name], completed=state["done"], total=state["total"], note=note)
+                shown.update(tasks[name], completed=state["done"], total=state["total"], note=note)
                 if due and not future.done():
                     log.info("%s: iteration %s/%s  %s", name, state["done"], state["total"], note)
             if any(future.done() and future.exception() for future in futures):

@@ -8,6 +8,7 @@ training equals one that never stopped, bit for bit.
 from __future__ import annotations
 
 import hashlib
+import math
 import signal
 import threading
 import time
@@ -195,7 +196,7 @@ class Trainer:
 
     def _check_finite(self, row: dict[str, float]) -> None:
         for name, value in row.items():
-            if value != value or abs(value) == float("inf"):
+            if not math.isfinite(value):
                 raise Diverged(
                     f"{name} became {value} in iteration {self.iteration} of {self.iterations}; "
                     f"the last good state is in {self.folder / 'checkpoint.pt'}. Lower "

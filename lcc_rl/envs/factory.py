@@ -37,13 +37,12 @@ class Inputs:
     report: tuple[str, ...] = ()
 
 
-def load_inputs(cfg: DictConfig, episodes: Any = None, population: Any = None) -> Inputs:
+def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     """Read the trajectories, split their leaders' profiles and build the population.
 
     Args:
         cfg: configuration of a study.
         episodes: table of episodes if already at hand; else ``cfg.data`` is read.
-        population: drivers if already at hand; else ``cfg.drivers`` is built.
 
     Raises:
         DataError, ConfigError: naming the file, row or option at fault.
@@ -55,12 +54,10 @@ def load_inputs(cfg: DictConfig, episodes: Any = None, population: Any = None) -
     scenario = cfg.scenario
     profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
     training, evaluation = build(cfg.split, "split")(profiles)
-    if population is None:
-        population = build(cfg.drivers, "drivers")
     return Inputs(
         training,
         evaluation.windows(scenario.horizon, cfg.evaluation.profiles),
-        population,
+        build(cfg.drivers, "drivers"),
         tuple(report),
     )
 
@@ -131,6 +128,11 @@ def _check_wiring(pieces: Sequence[Piece]) -> None:
                 )
 
 
+def learns(cfg: DictConfig) -> bool:
+    """Whether the agent of a configuration learns anything."""
+    return bool(getattr(find_target(cfg.agent[TARGET], "agent"), "learns", True))
+
+
 def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Any:
     """Build the agent of a configuration: something with ``policy`` and ``learns``.
 
@@ -138,10 +140,9 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         ConfigError: naming the option at fault.
     """
     node = plain(cfg.agent)
-    target = find_target(node[TARGET], "agent")
-    if not getattr(target, "learns", True):
+    if not learns(cfg):
         # A recipe's learning settings mean nothing to those that do not learn.
-        known = inspect.signature(target).parameters
+        known = inspect.signature(find_target(node[TARGET], "agent")).parameters
         node = {key: value for key, value in node.items() if key in known or key == TARGET}
     cav = cfg.scenario.pieces.get("cav")
     observation: Piece = build(cfg.observation, "observation")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import DataError
-from lcc_rl.results.files import atomic_path
+from lcc_rl.results.drawing import new_figure, unbox
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
 INK, GREY = "#222222", "#8a8a8a"
@@ -42,7 +39,7 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
     # Parameters held constant in every mode would be empty panels.
     shown = {name: pair for name, pair in PARAMETERS.items() if drivers[pair[0]].nunique() > 1}
     rows = 1 + len(shown) // 3
-    figure = _figure(10.0, 0.4 + 2.7 * rows)
+    figure = new_figure(10.0, 0.4 + 2.7 * rows)
     axes = figure.subplots(rows, 3).ravel()
     for axis in axes[1 + len(shown) :]:
         axis.remove()
@@ -80,7 +77,7 @@ def joint_figure(drivers: pd.DataFrame, mode: str | None = None) -> Figure:
     speed = table["desired_speed_mps"].to_numpy(float)
     gap = table["time_gap_s"].to_numpy(float)
     bound = table["desired_speed_at_bound"].to_numpy(bool)
-    figure = _figure(6.6, 6.2)
+    figure = new_figure(6.6, 6.2)
     grid = figure.add_gridspec(2, 2, width_ratios=(4, 1), height_ratios=(1, 4))
     centre = figure.add_subplot(grid[1, 0])
     top = figure.add_subplot(grid[0, 0], sharex=centre)
@@ -93,23 +90,6 @@ def joint_figure(drivers: pd.DataFrame, mode: str | None = None) -> Figure:
         fontsize=11,
         color=INK,
     )
-    return figure
-
-
-def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
-    """Write a figure atomically; the format follows the file's suffix.
-
-    Raises:
-        ResultsError: if the file cannot be written.
-    """
-    suffix = Path(path).suffix.lstrip(".") or "png"
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, format=suffix)
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
     return figure
 
 
@@ -248,5 +228,5 @@ def _plain(axis: Axes) -> None:
     """A light grid behind the data and no box around it."""
     axis.grid(visible=True, axis="both", color="#e6e6e6", linewidth=0.8)
     axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
+    unbox(axis)
     axis.tick_params(labelsize=9)

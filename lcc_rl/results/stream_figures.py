@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lcc_rl.data.statistics import UNITS, WINDOW_S, motion
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.files import atomic_path
+from lcc_rl.results.drawing import new_figure, save, unbox
 
 COLOURS = ("#1b6ca8", "#d1661f")  # blue and orange, distinct without red-green vision and in grey
 LABELS = {
@@ -46,8 +45,7 @@ def figure_leaders(sets: Mapping[str, pd.DataFrame]) -> Figure:
     """
     if len(sets) != 2:
         raise ConfigError(f"a figure of leaders compares two sets of episodes, got {len(sets)}")
-    figure = Figure(figsize=(10.0, 6.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10.0, 6.2)
     above, below = np.asarray(figure.subfigures(2, 1)).flat
     motions = {name: motion(episodes) for name, episodes in sets.items()}
     for axes, quantity in zip(above.subplots(1, 3).flat, UNITS, strict=True):
@@ -79,8 +77,7 @@ def save_leaders(sets: Mapping[str, pd.DataFrame], path: str | Path) -> None:
     known = figure.canvas.get_supported_filetypes()
     if kind not in known:
         raise ConfigError(f"{path}: the ending must be one of {', '.join(sorted(known))}")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format=kind, dpi=150)
+    save(figure, path)
 
 
 def _distribution(axes: Axes, quantity: str, values: Mapping[str, NDArray[np.float64]]) -> None:
@@ -106,7 +103,7 @@ def _distribution(axes: Axes, quantity: str, values: Mapping[str, NDArray[np.flo
     axes.set_ylabel(f"density [1/({unit})]" if "/" in unit else f"density [1/{unit}]")
     axes.set_ylim(top=1.3 * axes.get_ylim()[1])  # room for the legend
     axes.legend(frameon=False, fontsize="small", loc="upper right")
-    axes.spines[["top", "right"]].set_visible(False)
+    unbox(axes)
 
 
 def _traces(axes: Axes, name: str, episodes: pd.DataFrame, colour: str) -> None:
@@ -123,4 +120,4 @@ def _traces(axes: Axes, name: str, episodes: pd.DataFrame, colour: str) -> None:
         axes.plot(time, trace["leader_speed_mps"], color=colour, alpha=shade, linewidth=1.3)
     axes.set_title(f"{name}: {len(chosen)} of {len(order)} leaders", fontsize="medium")
     axes.set_xlabel("time since the episode began [s]")
-    axes.spines[["top", "right"]].set_visible(False)
+    unbox(axes)

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lcc_rl.results.files import atomic_path, read_parquet
-from lcc_rl.results.runs import load
+from lcc_rl.results.drawing import new_figure, save, unbox
+from lcc_rl.results.files import read_parquet
 from lcc_rl.results.tables import paired
 
 # Distinct without colour vision and in grey.
@@ -30,25 +29,11 @@ def colour(strategy: str) -> str:
     return COLOURS.get(strategy) or OTHERS[sum(strategy.encode()) % len(OTHERS)]
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure that needs no display."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def style(axis: Axes, xlabel: str, ylabel: str) -> None:
     """Label an axis and take away what carries no information."""
     axis.set_xlabel(xlabel)
     axis.set_ylabel(ylabel)
-    axis.spines[["top", "right"]].set_visible(False)
-
-
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, whole or not at all."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=150)
-    return path
+    unbox(axis)
 
 
 def learning_curve(training: pd.DataFrame) -> Figure:
@@ -210,12 +195,11 @@ def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
     style(axis, "drivers, sorted", label)
 
 
-def write_study_figures(folder: str | Path, training: str | Path | None = None) -> list[Path]:
-    """Draw every figure that the parquet files of a folder allow.
+def write_study_figures(folder: str | Path) -> list[Path]:
+    """Draw every figure that the parquet files of an evaluation allow.
 
     Args:
         folder: holds episodes.parquet and steps.parquet; figures go to ``figures`` in it.
-        training: folder above the trainings, for the learning curve; None for none.
 
     Returns:
         The figures' paths.
@@ -232,20 +216,16 @@ def write_study_figures(folder: str | Path, training: str | Path | None = None) 
     cars = [name for name in names if name != "direct"]
     paths = []
     if len(steps) and "idm" in names and cars[-1] != "idm":
-        paths.append(save_figure(overview(episodes, steps, cars[-1]), target / "overview.png"))
-    if training is not None:
-        paths.append(
-            save_figure(learning_curve(load(training, "training")), target / "learning_curve.png")
-        )
+        paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
     for name in cars:
         if len(steps) and (steps["strategy"] == name).any():
-            paths.append(save_figure(sample_episode(steps, name), target / f"episode_{name}.png"))
+            paths.append(save(sample_episode(steps, name), target / f"episode_{name}.png"))
         if "direct" in names:
             figure = human_energy(episodes, name)
-            paths.append(save_figure(figure, target / f"human_energy_{name}.png"))
+            paths.append(save(figure, target / f"human_energy_{name}.png"))
         for baseline in ("idm", "reference"):
             if baseline in names and baseline != name and name != "idm":
                 figure = paired_improvement(episodes, name, baseline)
                 path = target / f"improvement_{name}_vs_{baseline}.png"
-                paths.append(save_figure(figure, path))
+                paths.append(save(figure, path))
     return paths

@@ -21,11 +21,7 @@ T = 0.1
 def play(env, actions):
     """Step through actions ``[time, *batch, 1]`` without resets; returns the list of moments."""
     td = env.reset()
-    moments = [td]
-    for action in actions:
-        td = step_mdp(env.step(td.set("action", action)))
-        moments.append(td)
-    return moments
+    return [td, *play_from(env, td, actions)]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -4,7 +4,8 @@ import pytest
 
 from lcc_rl.calibration.population import load_drivers
 from lcc_rl.errors import DataError, ResultsError
-from lcc_rl.results.calibration_figures import calibration_figure, joint_figure, save
+from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
+from lcc_rl.results.drawing import save
 
 
 @pytest.fixture
