@@ -65,6 +65,8 @@ class NGSIMLeader(Transition):
             raise ConfigError(f"{name}.profile must lie in 0…{len(profiles) - 1}, got {profile}")
         self.name, self.start, self.time_step = name, start, time_step
         self.profile = profile
+        self.profile_stream = stream_id(f"{name}.profile")
+        self.start_stream = stream_id(f"{name}.start")
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("starts", profiles.lengths - horizon)
@@ -86,13 +88,13 @@ class NGSIMLeader(Transition):
         if profile is None and self.profile is not None:
             profile = torch.full_like(seed, self.profile)
         elif profile is None:
-            profile = choose(seed, len(self.offsets), stream_id(f"{self.name}.profile"))
+            profile = choose(seed, len(self.offsets), self.profile_stream)
         elif bool(((profile < 0) | (profile >= len(self.offsets))).any()):
             raise ConfigError(f"profile ids must lie in 0…{len(self.offsets) - 1}, got {profile}")
         if first is None:
             first = torch.zeros_like(profile)
             if self.start == "random":
-                first = choose(seed, self.starts[profile], stream_id(f"{self.name}.start"))
+                first = choose(seed, self.starts[profile], self.start_stream)
         speed = self.speeds[self.offsets[profile] + first]
         start.set(self.choices[0], profile)
         start.set(self.choices[1], first)

@@ -90,6 +90,7 @@ class CAVMotion(Transition):
             choices=factor,
         )
         self.lowest, self.highest = float(lowest), float(highest)
+        self.factor_stream = stream_id(f"{name}.gap_factor")
         self.time_step, self.max_acceleration = time_step, max_acceleration
         self.standstill_gap, self.initial_time_gap = standstill_gap, initial_time_gap
         self.name, self.predecessor = name, predecessor
@@ -115,7 +116,7 @@ class CAVMotion(Transition):
         still = torch.zeros_like(speed)
         factor = given.get(self.choices[0], None)
         if factor is None:
-            draw = uniform(start.get(SEED), 0, stream_id(f"{self.name}.gap_factor"))
+            draw = uniform(start.get(SEED), 0, self.factor_stream)
             factor = self.lowest + (self.highest - self.lowest) * draw
         gap = factor * (self.standstill_gap + self.initial_time_gap * speed)
         values = (factor, speed, gap, still, still, still)
@@ -191,6 +192,7 @@ class IDMFollower(Transition):
         self.time_step, self.noise, self.cap_time_gap = time_step, noise, cap_time_gap
         self.name, self.predecessor, self.drivers = name, predecessor, population.constants
         self.noise_stream = stream_id(f"{name}.noise")
+        self.driver_stream = stream_id(f"{name}.driver")
         self.register_buffer("desired_speeds", population.desired_speed)
         self.register_buffer("time_gaps", population.time_gap)
         self.register_buffer("index", torch.arange(followers).unsqueeze(-1))
@@ -231,7 +233,7 @@ class IDMFollower(Transition):
         driver = given.get(self.choices[0], None)
         count = len(self.desired_speeds)
         if driver is None:
-            stream = stream_id(f"{self.name}.driver") + self.index
+            stream = self.driver_stream + self.index
             driver = choose(start.get(SEED).unsqueeze(-2), count, stream)
         elif bool(((driver < 0) | (driver >= count)).any()):
             raise ConfigError(f"driver ids must lie in 0…{count - 1}, got {driver}")
