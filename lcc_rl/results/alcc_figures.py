@@ -178,8 +178,8 @@ def _whiskers(
 
 PANELS = {
     "saving_against_idm_pct": ("total energy saved\nagainst idm [%]", 0.0),
-    "ttc_below_4s_pct": ("time with TTC < 4 s [%]", 0.1),
-    "time_gap_above_2_5s_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
+    "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
+    "long_time_gap_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
 }
 
 

@@ -20,6 +20,7 @@ from lcc_rl.results.files import atomic_path
 UNITS = {"kj": "kJ", "pct": "%", "s": "s", "m": "m", "mps": "m/s", "mps3": "m/s³"}
 UNITS |= {"kj_per_km": "kJ/km", "ms": "ms"}
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")
+INITIALS = ("cav", "hdv", "ttc", "sd")
 MISSING = "–"
 
 STYLE = """
@@ -174,8 +175,12 @@ def heading(column: str) -> str:
     """Return a column's name for readers: ``"total_energy_kj"`` → ``"total energy [kJ]"``."""
     for suffix, unit in sorted(UNITS.items(), key=lambda item: -len(item[0])):
         if column.endswith(f"_{suffix}"):
-            return f"{column.removesuffix(f'_{suffix}').replace('_', ' ')} [{unit}]"
-    return column.replace("_", " ")
+            return f"{_words(column.removesuffix(f'_{suffix}'))} [{unit}]"
+    return _words(column)
+
+
+def _words(name: str) -> str:
+    return " ".join(word.upper() if word in INITIALS else word for word in name.split("_"))
 
 
 def _is_bound(frame: pd.DataFrame, column: str) -> bool:
@@ -203,11 +208,11 @@ def _places(values: pd.Series) -> int:
     if not pd.api.types.is_float_dtype(values):
         return 0
     numbers = values.to_numpy(float)
-    finite = np.abs(numbers[np.isfinite(numbers)])
-    largest = finite.max() if len(finite) else 0.0
-    if largest == 0.0:
+    sizes = np.abs(numbers[np.isfinite(numbers) & (numbers != 0.0)])
+    if not len(sizes):
         return 0
-    return int(np.clip(3 - np.floor(np.log10(largest)), 0, 2 if largest >= 0.1 else 4))
+    typical = float(np.median(sizes))
+    return int(np.clip(3 - np.floor(np.log10(typical)), 0, 2 if typical >= 0.1 else 4))
 
 
 def _cell(value: object, places: int) -> str:

@@ -227,7 +227,7 @@ def evaluate_all(
     cfg.compare = [str(path) for path in runs]
     if not _up_to_date(cfg, folder, runs):
         log.info("evaluating %d policies into %s", len(runs), folder)
-        evaluate.run(cfg, folder, own=False)
+        evaluate.run(cfg, folder, own=False, quiet=True)
 
 
 def _up_to_date(cfg: DictConfig, folder: Path, runs: Sequence[Path]) -> bool:
