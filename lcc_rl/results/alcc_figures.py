@@ -161,7 +161,9 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
             axis.annotate(
                 f"{value:+.0f} % {'▲' if up else '▼'}",
                 (place, limit if up else -limit),
-                ha="center",
+                xytext=(-4, 0),
+                textcoords="offset points",
+                ha="right",
                 va="top" if up else "bottom",
                 fontsize=8,
             )
@@ -262,8 +264,11 @@ def single_profile_figure(episodes: pd.DataFrame) -> Figure:
 
 def _gain(episodes: pd.DataFrame) -> str:
     """Write what regard for the driver behind brings on one profile."""
-    found = savings(episodes, "total_energy_kj", "alcc", "reference")
-    return "" if np.isnan(found.value) else f"alcc saves {100 * found.value:+.1f} %\nof reference"
+    energy = per_seed(episodes, "total_energy_kj")
+    if not {"alcc", "reference"} <= set(energy):
+        return ""
+    # Not a percentage: in a jam a profile's energy can be near zero.
+    return f"alcc {energy['alcc'].mean() - energy['reference'].mean():+.1f} kJ\nagainst reference"
 
 
 def _once(axis: Axes, seen: set[str], strategy: str, label: str, mark: str) -> None:
