@@ -10,6 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from lcc_rl.agents import Analytic
+from lcc_rl.agents.analytic import GradientTrainer
 from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import require
@@ -63,7 +65,8 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
         env = build_env(
             cfg, inputs.training, inputs.population, cfg.training.environments, 0, cfg.device
         )
-        trainer = Trainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+        loop = GradientTrainer if isinstance(agent, Analytic) else Trainer
+        trainer = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
         if resume:
             trainer.load()
         trainer.run()
