@@ -12,6 +12,7 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.agents.collection import make_collector
 from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.config import TrainingConfig
@@ -52,13 +53,7 @@ class Trainer(TrainingLoop):
 
     def _source(self) -> Collector:
         policy = TensorDictSequential(self.agent.policy, self.exploration)
-        return Collector(
-            self.env,
-            policy,
-            frames_per_batch=self.env.batch_size[0] * self.settings.segment,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
-        )
+        return make_collector(self.env, policy, self.settings.segment, (*LEARNED_FROM, *REPORTED))
 
     def _iterate(self, collector: Collector) -> dict[str, float]:
         """Play one batch of episodes, learning after every segment of them."""
