@@ -197,10 +197,11 @@ class Trainer:
     def _check_finite(self, row: dict[str, float]) -> None:
         for name, value in row.items():
             if not math.isfinite(value):
+                good = self.folder / "checkpoint.pt"
+                state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
                 raise Diverged(
                     f"{name} became {value} in iteration {self.iteration} of {self.iterations}; "
-                    f"the last good state is in {self.folder / 'checkpoint.pt'}. Lower "
-                    "agent.critic_lr or agent.actor_lr"
+                    f"{state}. Lower agent.critic_lr or agent.actor_lr"
                 )
 
     # -- state ---------------------------------------------------------------------------------
