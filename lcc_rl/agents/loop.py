@@ -133,9 +133,11 @@ class TrainingLoop(ABC):
         """
         for name, value in row.items():
             if not math.isfinite(value):
+                good = self.folder / "checkpoint.pt"
+                state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
                 raise Diverged(
                     f"{name} became {value} in iteration {self.iteration} of {self.iterations}; "
-                    f"the last good state is in {self.folder / 'checkpoint.pt'}. {self.advice}"
+                    f"{state}. {self.advice}"
                 )
         self.rows.append(row)
         times = {"iteration": row["iteration"], "collect_s": collect_s, "learn_s": learn_s}
