@@ -9,14 +9,14 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import TARGET, build, find_target, load, plain
 from lcc_rl.data.profiles import Profiles, leader_profiles
 from lcc_rl.envs.clock import Clock
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Piece, TotalReward
-from lcc_rl.pieces.base import SEED, STEP, Transition, arrived
+from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
 from lcc_rl.pieces.vehicles import Population
 
 
@@ -105,7 +105,7 @@ def build_env(
     pieces.append(TotalReward(list(cfg.reward.terms)))
     _check_wiring(pieces)
     clock = Clock(scenario.horizon, batch_size, seed=seed, device=device)
-    env = TransformedEnv(clock, Compose(*pieces))
+    env = TransformedEnv(clock, Pieces(*pieces))
     return env.to(device) if device is not None else env
 
 
@@ -154,6 +154,7 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         action_size=1,
         max_acceleration=cav.max_acceleration if cav is not None else 1.0,
         seed=cfg.seed,
+        time_step=cfg.scenario.time_step,
         device=device,
     )
 
