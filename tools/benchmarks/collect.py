@@ -70,7 +70,8 @@ def loop(
 
     def act(seen: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor], Any]:
         action = network(seen)
-        return action, *plain.step(state, action)
+        after, written = plain.step(state, action)
+        return action, after, written
 
     advance = torch.compile(act, dynamic=False) if compiled else act
 
