@@ -158,6 +158,8 @@ class Split:
         by: ``"recording"`` holds out whole recordings (no shared traffic wave at all);
             ``"vehicle"`` holds out leaders within every recording.
         evaluation_share: share of the recordings or vehicles held out, 0…1.
+        tuning: for choosing settings: put what would be held out aside, unseen, and hold out a
+            part of the rest, by the same rule, in its place.
 
     Raises:
         ConfigError: if a setting is unknown or out of range.
@@ -165,6 +167,7 @@ class Split:
 
     by: str = "recording"
     evaluation_share: float = 0.34
+    tuning: bool = False
 
     def __post_init__(self) -> None:
         if self.by not in ("recording", "vehicle"):
@@ -180,6 +183,11 @@ class Split:
         Raises:
             DataError: if there are not at least two recordings (or vehicles) to divide.
         """
+        if self.tuning:
+            profiles, _ = self._divide(profiles)
+        return self._divide(profiles)
+
+    def _divide(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
         # The vehicle is the part of the name before the time, so that two episodes behind the
         # same leader never end up on both sides.
         groups = [
@@ -200,3 +208,36 @@ class Split:
         inside = [i for i, group in enumerate(groups) if group in evaluation]
         outside = [i for i, group in enumerate(groups) if group not in evaluation]
         return profiles.select(outside), profiles.select(inside)
+
+
+@dataclass(frozen=True)
+class SingleProfile:
+    """Train on one profile only, as the ALCC paper probably did.
+
+    Args:
+        profile: its number; without ``held_out`` among all profiles long enough, with it among
+            those that ``held_out`` leaves for training.
+        held_out: the split whose evaluation profiles are kept; None evaluates on the training
+            profile itself.
+    """
+
+    profile: int = 0
+    held_out: Split | None = None
+
+    def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
+        """Return the training and the evaluation profiles.
+
+        Raises:
+            ConfigError: if there is no profile of that number.
+            DataError: if ``held_out`` cannot divide the profiles.
+        """
+        training, evaluation = (
+            (profiles, None) if self.held_out is None else self.held_out(profiles)
+        )
+        if not 0 <= self.profile < len(training):
+            raise ConfigError(
+                f"split.profile must lie in 0…{len(training) - 1} with these data, "
+                f"got {self.profile}"
+            )
+        chosen = training.select([self.profile])
+        return chosen, chosen if evaluation is None else evaluation

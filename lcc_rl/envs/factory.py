@@ -154,6 +154,7 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         action_size=1,
         max_acceleration=cav.max_acceleration if cav is not None else 1.0,
         seed=cfg.seed,
+        time_step=cfg.scenario.time_step,
         device=device,
     )
 

@@ -12,6 +12,7 @@ from lcc_rl.pieces.rewards import (
     SafetyReward,
     TotalReward,
 )
+from lcc_rl.pieces.surrogates import SmoothEfficiency, SmoothSafety
 from lcc_rl.pieces.termination import Collision
 from lcc_rl.pieces.vehicles import CAVMotion, IDMFollower
 
@@ -31,6 +32,8 @@ __all__ = [
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
+    "SmoothEfficiency",
+    "SmoothSafety",
     "TimeGap",
     "TimeToCollision",
     "TotalReward",
