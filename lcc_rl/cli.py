@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from lcc_rl.config import explained
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
+from lcc_rl.precision import set_precision
 from lcc_rl.results.states import Busy, forget, input_error, record
 from lcc_rl.sweeps import SweepCallback, conclude, run_job
 
@@ -151,7 +152,7 @@ def is_sweep() -> bool:
 
 
 def prepare_torch(cfg: DictConfig) -> torch.device:
-    """Check ``seed``, ``threads`` and ``device`` of a study, set the threads, return the device.
+    """Check ``seed``, ``threads`` and ``device`` of a study, set up torch, return the device.
 
     Raises:
         ConfigError: if one of them is of the wrong type or impossible on this machine.
@@ -167,6 +168,7 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
     except (RuntimeError, AssertionError, TypeError) as error:
         raise ConfigError(f"device {cfg.device!r} is not available: {error}") from error
     torch.set_num_threads(cfg.threads)
+    set_precision(cfg.get("matmul_precision", "highest"))
     # TorchRL tells of every buffer it allocates.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     return device

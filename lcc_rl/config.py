@@ -52,6 +52,7 @@ class TrainingConfig:
     environments: int = MISSING
     segment: int = MISSING
     checkpoint_every: int = MISSING
+    compiled: bool | None = None
 
 
 @dataclass
@@ -73,6 +74,7 @@ class StudyConfig:
     seed: int = MISSING
     device: str = MISSING
     threads: int = MISSING
+    matmul_precision: str = "highest"
     data: Any = MISSING
     drivers: Any = MISSING
     split: Any = MISSING

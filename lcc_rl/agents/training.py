@@ -8,14 +8,13 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictSequential
-from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.collection import make_collector
 from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.config import TrainingConfig
+from lcc_rl.envs.stepping import Segments
 from lcc_rl.policies import GaussianExploration
 
 LEARNED_FROM = (
@@ -26,6 +25,8 @@ LEARNED_FROM = (
     ("next", "done"),
     ("next", "terminated"),
 )
+
+WORTH_COMPILING = 100_000  # steps of an environment from which on compiling it pays for itself
 
 
 class Trainer(TrainingLoop):
@@ -51,11 +52,21 @@ class Trainer(TrainingLoop):
             generator=self.sampler,
         )
 
-    def _source(self) -> Collector:
+    def _source(self) -> Segments:
         policy = TensorDictSequential(self.agent.policy, self.exploration)
-        return make_collector(self.env, policy, self.settings.segment, (*LEARNED_FROM, *REPORTED))
+        keys = (*LEARNED_FROM, *REPORTED)
+        return Segments(self.env, policy, self.settings.segment, keys, self._compiled())
 
-    def _iterate(self, collector: Collector) -> dict[str, float]:
+    def _compiled(self) -> bool:
+        """Whether to compile the environment: if left open, where the whole training pays for it.
+
+        The whole, not what remains, so that a resumed training computes what it would have.
+        """
+        if self.settings.compiled is not None:
+            return self.settings.compiled
+        return self.iterations * self.horizon >= WORTH_COMPILING
+
+    def _iterate(self, collector: Segments) -> dict[str, float]:
         """Play one batch of episodes, learning after every segment of them."""
         sigma = self.agent.exploration.sigma(self.iteration / self.iterations)
         self.exploration.sigma.fill_(sigma)

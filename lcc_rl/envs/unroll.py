@@ -58,7 +58,7 @@ class Unrolled:
         recurrent = [piece for piece in needed if _is_recurrent(piece)]
         inside = _closure(needed, {OBSERVATION}, recurrent)
         self.after = [piece for piece in needed if piece not in inside]
-        self.steps = [_as_function(piece, piece in self.graded) for piece in inside]
+        self.steps = [as_function(piece, piece in self.graded) for piece in inside]
         self.carried = {SEED, STEP, *_written(inside)}
         entries = {arrived(key) for piece in needed for key in piece.in_keys} | every
         self.recorded = sorted(entries & {*self.carried, ACTION})
@@ -157,7 +157,7 @@ def _closure(
     return [piece for piece in pieces if piece in kept]
 
 
-def _as_function(piece: Piece, graded: bool) -> Callable[[State, State], None]:
+def as_function(piece: Piece, graded: bool) -> Callable[[State, State], None]:
     """Return a piece as a function that reads two moments and writes into the second."""
     transition = isinstance(piece, Transition)
     sources = [(not transition or as_tuple(k)[0] == NEXT, arrived(k)) for k in piece.in_keys]

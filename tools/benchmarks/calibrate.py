@@ -69,8 +69,9 @@ class Problem:
         if compiled is None:
             speeds = [speed.tolist() for speed in speeds]
         known = astuple(IDMConstants())
-        settings = (*speeds, float(observed.gap[index]), observed.time_step, known)
-        self.function, self.settings, self.norm = compiled or squared_error, settings, norm
+        settings: tuple[Any, ...] = (*speeds, float(observed.gap[index]), observed.time_step, known)
+        self.function: Callable[..., float] = compiled or squared_error
+        self.settings, self.norm = settings, norm
 
     def __call__(self, candidate: Any) -> float:
         """Return the error; 0.07 is 7 %."""

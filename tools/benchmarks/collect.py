@@ -9,14 +9,15 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
 from benchmarks.harness import Row, Run, alternate, endings, installed, rows_of
 from benchmarks.plain import PlainLoop, alcc
 from benchmarks.scalar import check_scalar, gymnasium_env
 from lcc_rl.agents import DDPG
-from lcc_rl.agents.collection import make_collector
 from lcc_rl.agents.training import LEARNED_FROM, REPORTED
+from lcc_rl.envs.stepping import Segments
 
 OTHER = "stable-baselines3"
 SIDE_BY_SIDE = 8  # environments of stable-baselines3's DummyVecEnv
@@ -25,9 +26,10 @@ SIDE_BY_SIDE = 8  # environments of stable-baselines3's DummyVecEnv
 def collect(options: Namespace) -> list[Row]:
     """Transitions per second, collected by the actor without exploration, kept for learning.
 
-    "collector" is the training's own. The plain loop runs the same network and stacks what a
-    learner needs. stable-baselines3 calls ``predict`` and steps a DummyVecEnv of 8 plain
-    Gymnasium environments; its network has the same layers.
+    "Segments" is the training's own way, "Collector" TorchRL's, which keeps every entry. The
+    plain loop runs the same network and stacks what a learner needs. stable-baselines3 calls
+    ``predict`` and steps a DummyVecEnv of 8 plain Gymnasium environments; its network has the
+    same layers.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     batch, steps = (16, 10) if options.quick else (1024, 60)
@@ -36,7 +38,8 @@ def collect(options: Namespace) -> list[Row]:
     for ending in endings(options):
         env = alcc(options, batch, 30)
         runs[f"plain loop{ending}"] = loop(env, policy.module, steps, bool(ending))
-        runs[f"collector{ending}"] = collector(env, policy, steps, bool(ending))
+        runs[f"Segments{ending}"] = collector(env, policy, steps, bool(ending))
+    runs["Collector"] = torchrl_collector(alcc(options, batch, 30), policy, steps)
     counts, other = dict.fromkeys(runs, batch * steps), stable_baselines(options)
     if other is not None:
         runs[OTHER], counts[OTHER] = other
@@ -46,7 +49,7 @@ def collect(options: Namespace) -> list[Row]:
     rows: list[Row] = []
     for ending in endings(options):
         plain = f"plain loop{ending}"
-        pair = {name: rates[name] for name in (f"collector{ending}", plain)}
+        pair = {name: rates[name] for name in (f"Segments{ending}", plain)}
         rows += rows_of("collect", pair, "steps/s", plain, batch)
     if other is not None:
         rates = {name: rate for name, rate in rates.items() if not name.startswith("plain")}
@@ -55,9 +58,16 @@ def collect(options: Namespace) -> list[Row]:
 
 
 def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
-    """The training's collector; one call collects so many steps of every environment."""
-    source = make_collector(env, policy, steps, (*LEARNED_FROM, *REPORTED), compiled)
-    batches = iter(source)
+    """The training's collection; one call collects so many steps of every environment."""
+    segments = Segments(env, policy, steps, (*LEARNED_FROM, *REPORTED), compiled)
+    return lambda: next(segments)
+
+
+def torchrl_collector(env: TransformedEnv, policy: Any, steps: int) -> Run:
+    """TorchRL's collector, which keeps every entry."""
+    count = env.batch_size.numel() * steps
+    how = {"track_traj_ids": False, "auto_register_policy_transforms": False}
+    batches = iter(Collector(env, policy, frames_per_batch=count, total_frames=-1, **how))
     return lambda: next(batches)
 
 
@@ -70,7 +80,8 @@ def loop(
 
     def act(seen: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor], Any]:
         action = network(seen)
-        return action, *plain.step(state, action)
+        after, written = plain.step(state, action)
+        return action, after, written
 
     advance = torch.compile(act, dynamic=False) if compiled else act
 

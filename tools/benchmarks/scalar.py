@@ -175,12 +175,12 @@ def check_scalar(env: TransformedEnv, plain: PlainLoop, steps: int) -> None:
     loop, td = ScalarLoop(plain), env.reset()
     seed = int(td[SEED][0])
     factor = float(td["cav", "gap_factor"][0])
-    chosen = (int(td[key][0]) for key in ((("leader", "profile")), ("leader", "start")))
-    loop.begin(*chosen, int(td["hdv", "driver"][0]), factor)
+    profile, start = int(td["leader", "profile"][0]), int(td["leader", "start"][0])
+    loop.begin(profile, start, int(td["hdv", "driver"][0]), factor)
     generator = torch.Generator().manual_seed(0)
 
     def draw(step: int) -> float:
-        bits: Any = hash_bits(seed + step * COUNT + loop.stream * STREAM)  # type: ignore[arg-type]
+        bits: Any = hash_bits(seed + step * COUNT + loop.stream * STREAM)
         return (bits >> 8) * 2.0**-24
 
     for step in range(steps):

@@ -6,6 +6,7 @@ from argparse import Namespace
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from benchmarks.harness import Row, Run, alternate, endings, rows_of
@@ -58,7 +59,7 @@ def stepping(options: Namespace, batch: int, followers: int, steps: int, compile
     return lambda: advance(env, start, zero, steps)
 
 
-def advance(env: TransformedEnv, start: torch.Tensor, action: torch.Tensor, steps: int) -> None:
+def advance(env: TransformedEnv, start: TensorDictBase, action: torch.Tensor, steps: int) -> None:
     """Step and keep nothing."""
     td = start.copy()
     for _ in range(steps):

@@ -59,7 +59,7 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path) -> Run:
     training = Trainer(agent, env, cfg.training, 0, folder, "benchmark")
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
     training.buffer.extend(played.select(*LEARNED_FROM).reshape(-1))
-    collector = training._collector()
+    collector = training._source()
     return lambda: training._iterate(collector)
 
 
