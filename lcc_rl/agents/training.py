@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.config import TrainingConfig
 from lcc_rl.envs.stepping import Segments
 from lcc_rl.policies import GaussianExploration
@@ -36,7 +37,7 @@ class Trainer(TrainingLoop):
 
     def __init__(
         self,
-        agent: DDPG,
+        agent: DDPG | OffPolicy,
         env: TransformedEnv,
         settings: TrainingConfig,
         seed: int,
@@ -44,7 +45,8 @@ class Trainer(TrainingLoop):
         identity: str,
     ) -> None:
         super().__init__(agent, env, settings, seed, folder, identity)
-        self.exploration = GaussianExploration(0.0).to(env.device or "cpu")
+        noise = agent.noise if isinstance(agent, OffPolicy) else GaussianExploration(0.0)
+        self.exploration = noise.to(env.device or "cpu")
         self.sampler = torch.Generator()
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(agent.buffer_size, device=env.device or "cpu"),
