@@ -62,6 +62,7 @@ class EvaluationConfig:
     batch_size: int = MISSING
     seed: int = MISSING
     sample_episodes: int = MISSING
+    full_length: bool = False
 
 
 @dataclass
@@ -75,10 +76,13 @@ class StudyConfig:
     data: Any = MISSING
     drivers: Any = MISSING
     split: Any = MISSING
+    leader: Any = None
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)
     agent: Any = MISSING
+    gains: Any = None
+    controller: Any = None
     # Here, not in TrainConfig, so that one recipe serves every entry point.
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -89,6 +93,7 @@ class TrainConfig(StudyConfig):
     """``python -m lcc_rl.train``."""
 
     resume: str | None = None
+    policy: str | None = None
 
 
 @dataclass

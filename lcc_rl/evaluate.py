@@ -12,6 +12,7 @@ from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import load
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.results.runs import load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
@@ -44,6 +45,8 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
     folder = Path(folder)
     prepare_torch(cfg)
     check_sizes(cfg)
+    if cfg.scenario.name == platoon_cases.SCENARIO:
+        return platoon_cases.run(cfg, folder)
     if cfg.policy is not None and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     inputs = load_inputs(cfg)

@@ -13,8 +13,9 @@ from rich.console import Console
 from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import require
-from lcc_rl.envs.factory import Inputs, build_agent, build_env, load_inputs
+from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, load_inputs
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
 from lcc_rl.results.files import write_parquet
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
@@ -59,7 +60,11 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
         log.info(line)
     save_config(cfg, folder)
     agent = build_agent(cfg, inputs.population, cfg.device)
-    if agent.learns:
+    seed = cfg.seed if agent.learns else None
+    if agent.learns and cfg.get("policy") is not None:
+        seed = platoon_cases.load_learned(agent, cfg)
+        save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
+    elif agent.learns:
         env = build_env(
             cfg, inputs.training, inputs.population, cfg.training.environments, 0, cfg.device
         )
@@ -70,8 +75,7 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
-    seed = cfg.seed if agent.learns else None
-    strategy = Strategy(cfg.variant, cfg, agent.policy, seed)
+    strategy = Strategy(cfg.variant, cfg, build_policy(cfg, agent.policy), seed)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
 
 
@@ -102,6 +106,8 @@ def evaluate_and_write(
     quiet: bool = False,
 ) -> pd.DataFrame:
     """Evaluate strategies on the held-out profiles, write the rows and print the summary."""
+    if cfg.scenario.name == platoon_cases.SCENARIO:
+        return platoon_cases.evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     settings = cfg.evaluation
     results = [
         evaluate(

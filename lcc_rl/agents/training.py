@@ -159,11 +159,12 @@ class Trainer:
         for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             batch = next(segments)
-            self.buffer.extend(batch.select(*LEARNED_FROM).reshape(-1))
+            new = transitions(batch)
+            self.buffer.extend(new)
             played.append(batch.select(*REPORTED))
             collected = time.perf_counter()
-            before = (self.iteration * self.horizon + part * batch.shape[1]) * batch.shape[0]
-            losses.append(self._learn(before, batch.numel()))
+            before = self.iteration * (self.horizon // self.settings.segment) + part
+            losses.append(self._learn(before * len(new), len(new)))
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         episodes = torch.cat(played, dim=1)
@@ -171,7 +172,7 @@ class Trainer:
         row = {
             "iteration": float(self.iteration),
             "episodes": float(self.iteration * self.env.batch_size[0]),
-            "transitions": float(self.iteration * episodes.numel()),
+            "transitions": float(self.iteration * episodes["next", "reward"].numel()),
             "updates": float(self.updates),
             "exploration_sigma": sigma,
             **episode_statistics(episodes),
@@ -244,11 +245,27 @@ class Trainer:
         self.rows, self.times = _rows(state["rows"]), _rows(state["times"])
 
 
+def transitions(batch: TensorDictBase) -> TensorDictBase:
+    """Return what is learned from a batch ``[environments, steps]``, one transition a row.
+
+    In a platoon every follower's is a transition of its own, ``[environments × steps ×
+    followers]``; all of them end when the episode does.
+    """
+    batch = batch.select(*LEARNED_FROM)
+    reward = batch["next", "reward"]
+    shape = reward.shape[:-1]
+    if len(shape) == batch.ndim:
+        return batch.reshape(-1)
+    for key in (("next", "done"), ("next", "terminated")):
+        batch.set(key, batch[key].unsqueeze(-2).expand(reward.shape))
+    return batch.auto_batch_size_(len(shape)).reshape(-1)
+
+
 def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     """Summarise the first episode of every slot of a batch ``[environments, steps]``.
 
     A collision ends an episode early; what the collector appends after it belongs to another
-    episode and is left out.
+    episode and is left out. The followers of a platoon are added up.
 
     Returns:
         Mean sums per episode of the reward and of every term, and the number of collisions.
@@ -257,6 +274,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     alive = (done.cumsum(1) - done == 0).unsqueeze(-1)
 
     def per_episode(entry: Tensor) -> float:
+        entry = entry.flatten(2).sum(-1, keepdim=True)
         return float((entry * alive).sum(1).double().mean())
 
     terms = batch["next", "reward_terms"]
