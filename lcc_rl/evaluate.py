@@ -14,7 +14,7 @@ from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
-from lcc_rl.results.runs import load_policy, save_config
+from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
 from lcc_rl.train import check_sizes, evaluate_and_write
 
@@ -45,10 +45,10 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
     folder = Path(folder)
     prepare_torch(cfg)
     check_sizes(cfg)
+    if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
+        raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     if cfg.scenario.name == platoon_cases.SCENARIO:
         return platoon_cases.run(cfg, folder)
-    if cfg.policy is not None and not learns(cfg):
-        raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
@@ -93,9 +93,9 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
     if cfg.policy is None:
         raise ConfigError(
             f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
-            f"(python -m lcc_rl.train variant={cfg.variant} makes one)"
+            f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
         )
-    weights, own = load_policy(cfg.policy)
+    weights, own = load_policy(cfg.policy, cfg.variant)
     if own.variant != cfg.variant:
         raise ConfigError(
             f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "

@@ -1,4 +1,4 @@
-"""Deep deterministic policy gradient, built from TorchRL's loss (ALCC Table III)."""
+"""Deep deterministic policy gradient, on TorchRL's loss (ALCC Table III)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
+from lcc_rl.agents.fused import FusedUpdate
 from lcc_rl.errors import ConfigError
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
@@ -61,6 +62,9 @@ class DDPG:
         tau: share by which the target networks follow at every update.
         updates_per_transition: updates per collected transition.
         exploration: schedule of the action noise.
+        fused: compute the update with its gradient written out, which gives the numbers of
+            TorchRL's ``DDPGLoss`` up to rounding at up to twice the speed; False uses the loss
+            itself.
         device: where the networks live.
 
     Raises:
@@ -83,6 +87,7 @@ class DDPG:
         tau: float = 0.005,
         updates_per_transition: float = 0.125,
         exploration: dict[str, float] | None = None,
+        fused: bool = True,
         device: str = "cpu",
     ) -> None:
         _check(gamma, batch_size, buffer_size, tau, updates_per_transition)
@@ -92,28 +97,26 @@ class DDPG:
         self.policy: TensorDictModuleBase = make_actor(
             observation_size, action_size, hidden, seed
         ).to(device)
-        critic = ValueOperator(
+        value = ValueOperator(
             seeded_mlp(observation_size + action_size, 1, hidden, seed + 1),
             in_keys=["observation", "action"],
         ).to(device)
         self.loss = DDPGLoss(
-            self.policy, critic, loss_function="l2", delay_actor=True, delay_value=True
+            self.policy, value, loss_function="l2", delay_actor=True, delay_value=True
         )
         self.loss.make_value_estimator(gamma=gamma)
         self.targets = SoftUpdate(self.loss, tau=tau)
-        self.optimizer = torch.optim.Adam(
-            [
-                {
-                    "params": list(self.loss.actor_network_params.flatten_keys().values()),
-                    "lr": actor_lr,
-                },
-                {
-                    "params": list(self.loss.value_network_params.flatten_keys().values()),
-                    "lr": critic_lr,
-                },
-            ],
-            fused=True,
-        )
+        loss = self.loss
+        actor, critic = leaves(loss.actor_network_params), leaves(loss.value_network_params)
+        self.fused: FusedUpdate | None = None
+        if fused:
+            following = (loss.target_actor_network_params, loss.target_value_network_params)
+            targets = (leaves(following[0]), leaves(following[1]))
+            self.fused = FusedUpdate(actor, critic, *targets, (actor_lr, critic_lr), gamma, tau)
+            self.optimizer = self.fused.optimizer
+            return
+        groups = [{"params": actor, "lr": actor_lr}, {"params": critic, "lr": critic_lr}]
+        self.optimizer = torch.optim.Adam(groups, fused=True)
 
     def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
         """Take one gradient step on actor and critic and move the targets.
@@ -125,6 +128,9 @@ class DDPG:
         Returns:
             The two losses, detached.
         """
+        if self.fused is not None:
+            loss_actor, loss_value = self.fused(batch)
+            return {"loss_actor": loss_actor, "loss_value": loss_value}
         losses = self.loss(batch)
         # Only these two: the other entries of TorchRL's result are not losses, and one of them
         # still carries a gradient.
@@ -142,6 +148,11 @@ class DDPG:
         """Restore what :meth:`state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+
+
+def leaves(parameters: TensorDictBase) -> list[torch.Tensor]:
+    """Return the tensors of a network's parameters, in the order of its layers."""
+    return list(parameters.flatten_keys().values())
 
 
 def _check(

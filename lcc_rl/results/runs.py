@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.results.files import atomic_path, read_parquet, read_torch, write_torch
 
 CONFIG = "config.yaml"
+PRETRAINED = "pretrained"
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # Settings that say where and how to run, not what: they do not change any row.
 NOT_IDENTITY = ("resume", "compare", "policy", "jobs")
@@ -54,16 +56,41 @@ def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None
     write_torch({"weights": dict(weights), "config": OmegaConf.to_yaml(plain(cfg))}, path)
 
 
-def load_policy(path: str | Path) -> tuple[dict[str, Any], DictConfig]:
+def pretrained_path(variant: str) -> Path:
+    """Return the policy that ships with the package for a variant.
+
+    Raises:
+        ConfigError: if none does.
+    """
+    shipped = Path(str(files("lcc_rl.assets"))) / "pretrained"
+    path = shipped / f"{variant}.pt"
+    if not path.is_file():
+        names = sorted(file.stem for file in shipped.glob("*.pt"))
+        raise ConfigError(
+            f"no pretrained policy ships for variant {variant}, only for {', '.join(names)}; "
+            f"python -m lcc_rl.train variant={variant} makes one"
+        )
+    return path
+
+
+def load_policy(path: str | Path, variant: str = "") -> tuple[dict[str, Any], DictConfig]:
     """Read a policy file, or that of a run folder; code in it is never run.
+
+    Args:
+        path: the file or the folder; ``"pretrained"`` for the policy that ships for ``variant``,
+            ``"pretrained/reference"`` for that of another one.
+        variant: variant of the study at hand.
 
     Returns:
         The weights and the configuration.
 
     Raises:
+        ConfigError: if no policy ships for the variant.
         ResultsError: if it is missing, damaged or no policy.
     """
     path = Path(path)
+    if path.parts[:1] == (PRETRAINED,) and not path.exists():
+        path = pretrained_path(path.name if len(path.parts) > 1 else variant)
     if path.is_dir():
         path = path / "policy.pt"
     content = read_torch(path)

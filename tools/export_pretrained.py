@@ -1,0 +1,66 @@
+"""Make a shipped policy of a run's: its weights, what it was trained with, where it came from.
+
+    python tools/export_pretrained.py outputs/train/<run> "3 of 8 seeds of …"
+
+Paths are left out of the configuration: they mean nothing on another machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from lcc_rl.errors import LccError
+from lcc_rl.results.files import write_torch
+from lcc_rl.results.runs import load_policy
+
+LOCAL = ("data", "drivers", "split", "resume", "policy", "compare")
+FOLDER = Path(__file__).parents[1] / "lcc_rl" / "assets" / "pretrained"
+
+
+def export(run: str | Path, origin: str, folder: Path = FOLDER) -> Path:
+    """Write the policy of a run into the package.
+
+    Args:
+        run: a run folder or policy file.
+        origin: data, recipe and seed, in a sentence.
+        folder: where the file goes, named by its variant.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ResultsError: if the run holds no policy.
+    """
+    weights, cfg = load_policy(run)
+    OmegaConf.set_struct(cfg, False)
+    for key in LOCAL:
+        cfg.pop(key, None)
+    path = folder / f"{cfg.variant}.pt"
+    provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
+    content = {"weights": weights, "config": OmegaConf.to_yaml(cfg), "provenance": provenance}
+    write_torch(content, path)
+    return path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Export; 1 where the run is at fault."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", help="run folder or policy.pt")
+    parser.add_argument("origin", help="data, recipe and seed, in a sentence")
+    options = parser.parse_args(arguments)
+    try:
+        print(export(options.run, options.origin))
+    except LccError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
