@@ -25,7 +25,7 @@ BASELINES = ("direct", "idm")
 OWN_SETTINGS = {("cav", "max_acceleration")}
 
 
-def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
+def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = False) -> pd.DataFrame:
     """Evaluate a policy, those it is compared with, and the human baselines.
 
     All meet the same profiles, drivers and noise. Writes config.yaml, episodes.parquet,
@@ -35,6 +35,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
         cfg: configuration of the entry point ``evaluate``.
         folder: where the files go.
         own: evaluate the configuration's own variant, not only what it is compared with.
+        quiet: write the rows only: print no table, draw no figures.
 
     Returns:
         The rows of episodes.parquet.
@@ -57,8 +58,9 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True) -> pd.DataFrame:
     if own and cfg.variant not in BASELINES:
         strategies.append(studied(cfg, inputs))
     save_config(cfg, folder)
-    episodes = evaluate_and_write(strategies, cfg, inputs, folder)
-    write_study_figures(folder)
+    episodes = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
+    if not quiet:
+        write_study_figures(folder)
     return episodes
 
 

@@ -52,13 +52,13 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     prepare_torch(cfg)
     require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
     require(cfg.jobs >= 1, f"jobs must be at least 1, got {cfg.jobs}")
-    shared = [item for item in overrides if _root(item) not in OWN]
+    shared = [item for item in overrides if root_key(item) not in OWN]
     # Every part is composed before the first one runs: a typo must not cost an hour.
     parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
-    final = load("evaluate", [*_known(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
+    final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
     with atomic_path(folder / OVERRIDES) as temporary:
         temporary.write_text(json.dumps(overrides))
-    drivers = _calibrate(cfg, folder)
+    drivers = calibrate_once(cfg, folder)
     inputs = {
         "data": {
             "_target_": "lcc_rl.data.sources.EpisodesSource",
@@ -83,7 +83,7 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     return episodes
 
 
-def _calibrate(cfg: DictConfig, folder: Path) -> Path:
+def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
     """Read the trajectories once, keep them, and calibrate; skip what is already there."""
     table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
     if not table.exists():
@@ -146,15 +146,15 @@ def _finished(folder: Path) -> bool:
     return (folder / "episodes.parquet").exists()
 
 
-def _root(override: str) -> str:
+def root_key(override: str) -> str:
     """Return the top-level key that an override changes."""
     return override.lstrip("+~").split("=")[0].split(".")[0].split("@")[0]
 
 
-def _known(overrides: list[str], entry: str) -> list[str]:
+def known_settings(overrides: list[str], entry: str) -> list[str]:
     """Keep the overrides that an entry point has settings for."""
     settings = set(load(entry)) | {"experiment"}
-    return [item for item in overrides if _root(item) in settings]
+    return [item for item in overrides if root_key(item) in settings]
 
 
 @entry_point("pipeline")

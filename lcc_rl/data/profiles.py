@@ -209,3 +209,36 @@ class Split:
         inside = [i for i, group in enumerate(groups) if group in evaluation]
         outside = [i for i, group in enumerate(groups) if group not in evaluation]
         return profiles.select(outside), profiles.select(inside)
+
+
+@dataclass(frozen=True)
+class SingleProfile:
+    """Train on one profile only, as the ALCC paper probably did.
+
+    Args:
+        profile: its number; without ``held_out`` among all profiles long enough, with it among
+            those that ``held_out`` leaves for training.
+        held_out: the split whose evaluation profiles are kept; None evaluates on the training
+            profile itself.
+    """
+
+    profile: int = 0
+    held_out: Split | None = None
+
+    def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
+        """Return the training and the evaluation profiles.
+
+        Raises:
+            ConfigError: if there is no profile of that number.
+            DataError: if ``held_out`` cannot divide the profiles.
+        """
+        training, evaluation = (
+            (profiles, None) if self.held_out is None else self.held_out(profiles)
+        )
+        if not 0 <= self.profile < len(training):
+            raise ConfigError(
+                f"split.profile must lie in 0…{len(training) - 1} with these data, "
+                f"got {self.profile}"
+            )
+        chosen = training.select([self.profile])
+        return chosen, chosen if evaluation is None else evaluation

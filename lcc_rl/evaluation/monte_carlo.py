@@ -26,6 +26,15 @@ from lcc_rl.pieces.vehicles import Population
 # What a strategy's episodes are measured by; those that a scenario lacks are left out.
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 VEHICLES = ("leader", "cav", "hdv")
+# What a step of a sample episode says of its episode.
+SAMPLED = (
+    "strategy",
+    "training_seed",
+    "profile",
+    "driver_id",
+    "desired_speed_mps",
+    "time_gap_s",
+)
 Series = dict[tuple[str, str], Tensor]
 
 
@@ -223,6 +232,5 @@ def sample(
             for place in range(entries.shape[1]):
                 label = vehicle if entries.shape[1] == 1 else f"{vehicle}{place + 1}"
                 frame[f"{label}_{entry}"] = entries[:, place].cpu().numpy()
-        for name in ("time_gap_s", "desired_speed_mps", "driver_id", "profile", "strategy"):
-            frame.insert(0, name, episodes[name].iloc[index])
-        yield frame
+        described = episodes[list(SAMPLED)].iloc[[index] * steps].reset_index(drop=True)
+        yield pd.concat([described, frame], axis=1)

@@ -125,7 +125,7 @@ def load(root: str | Path = "outputs", table: str = "episodes") -> pd.DataFrame:
     for path in sorted(root.rglob(f"{table}.parquet")):
         frame = read_parquet(path)
         folder = path.parent
-        settings = dict(_flatten(plain(load_config(folder)))) if _is_run(folder) else {}
+        settings = dict(flatten(plain(load_config(folder)))) if _is_run(folder) else {}
         extra = {"run": str(folder.relative_to(root)), **settings}
         new = {k: [v] * len(frame) for k, v in extra.items() if k not in frame.columns}
         frames.append(pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1))
@@ -138,10 +138,11 @@ def _is_run(folder: Path) -> bool:
     return (folder / CONFIG).is_file()
 
 
-def _flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every setting of a configuration with its dotted key; lists become text."""
     for key, value in node.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            yield from _flatten(value, f"{name}.")
+            yield from flatten(value, f"{name}.")
         else:
             yield name, str(value) if isinstance(value, list) else value

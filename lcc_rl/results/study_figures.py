@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.files import read_parquet
-from lcc_rl.results.tables import paired
+from lcc_rl.results.intervals import Estimate, band
+from lcc_rl.results.tables import paired, savings
 
 # Distinct without colour vision and in grey.
 COLOURS = {"alcc": "#0072b2", "reference": "#d55e00", "idm": "#6b6b6b", "direct": "#222222"}
@@ -43,7 +44,7 @@ def learning_curve(training: pd.DataFrame) -> Figure:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
 
     Returns:
-        With several seeds of a variant the line is their mean and the band its 95 % confidence
+        With several seeds of a variant the line is their mean and the band its 95 % bootstrap
         interval; with a single one the rolling mean and the 5th to 95th percentile of the same
         window.
     """
@@ -51,25 +52,37 @@ def learning_curve(training: pd.DataFrame) -> Figure:
     axis = figure.subplots()
     floor = 0.0
     for variant, rows in training.groupby("variant", sort=False):
-        curves = rows.pivot_table(index="episodes", columns="seed", values="episode_reward")
-        smooth = curves.rolling(WINDOW, min_periods=1)
-        mean = smooth.mean().mean(axis=1)
-        if curves.shape[1] > 1:
-            error = smooth.mean().std(axis=1) / np.sqrt(curves.shape[1])
-            low, high = mean - 1.96 * error, mean + 1.96 * error
-            label = f"{variant} (n = {curves.shape[1]} seeds, 95 % band)"
-        else:
-            low, high = (smooth.quantile(q).iloc[:, 0] for q in (0.05, 0.95))
-            label = f"{variant} (1 seed; band: 5–95 % of {WINDOW} batches)"
-        axis.plot(mean.index, mean, color=colour(str(variant)), label=label)
-        axis.fill_between(mean.index, low, high, color=colour(str(variant)), alpha=0.2, lw=0)
+        mean, label = draw_curve(axis, rows, "episode_reward", str(variant))
+        axis.lines[-1].set_label(label)
         floor = min(floor, float(mean.iloc[len(mean) // 5 :].min()))
     # The first, random episodes are far below everything else and would set the scale.
     axis.set_ylim(bottom=1.6 * floor - 1.0)
     style(axis, "training episodes", "mean reward per episode")
     axis.legend(frameon=False)
-    axis.set_title("Learning curve, exploration noise included")
+    axis.set_title(f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included")
+    axis.title.set_fontsize(10)
     return figure
+
+
+def draw_curve(axis: Axes, rows: pd.DataFrame, column: str, variant: str) -> tuple[pd.Series, str]:
+    """Draw the rolling mean of one variant's column over its seeds, with its band.
+
+    Returns:
+        The line that was drawn, and what its label should say of the seeds.
+    """
+    # Seeds of different length are compared as far as all of them went.
+    curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
+    smooth = curves.rolling(WINDOW, min_periods=1)
+    line = smooth.mean().mean(axis=1)
+    if curves.shape[1] > 1:
+        low, high = band(smooth.mean().to_numpy(float))
+        label = f"{variant} (n = {curves.shape[1]} seeds, 95 % band)"
+    else:
+        low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
+        label = f"{variant} (1 seed; band: 5–95 % of {WINDOW} batches)"
+    axis.fill_between(line.index, low, high, color=colour(variant), alpha=0.2, lw=0)
+    axis.plot(line.index, line, color=colour(variant))
+    return line, label
 
 
 def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
@@ -129,6 +142,8 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     """Return the time series of a strategy's liveliest sample episode."""
     rows = steps[steps["strategy"] == strategy]
+    if "training_seed" in rows and rows["training_seed"].notna().any():
+        rows = rows[rows["training_seed"] == rows["training_seed"].min()]
     episodes = rows.groupby(["profile", "driver_id"])["leader_speed"]
     spread = episodes.transform("std")
     first = rows.iloc[int(spread.to_numpy().argmax())]
@@ -155,8 +170,10 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     style(left, "energy of the human driver [kJ per episode]", "drivers")
     left.legend(frameon=False)
     _paired_bars(right, 1.0 - a / b, "saving of A against B [%]", colour(strategy))
+    found = savings(episodes, "hdv_energy_kj", strategy, "direct")
     figure.suptitle(
-        f"Human driver's energy with and without the controlled car ahead (n = {len(a)} drivers)",
+        f"Human driver's energy with and without the controlled car ahead (n = {len(a)} drivers)\n"
+        f"mean saving {_with_interval(found)}",
         fontsize=10,
     )
     return figure
@@ -170,13 +187,22 @@ def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> 
     axis = figure.subplots()
     label = f"total energy saved by {strategy} against {baseline} [%]"
     _paired_bars(axis, saving, label, colour(strategy))
+    found = savings(episodes, "total_energy_kj", strategy, baseline)
     figure.suptitle(
-        f"{strategy} against {baseline}: mean {100 * saving.mean():+.2f} %, "
-        f"best {100 * saving.max():+.2f} %, worst {100 * saving.min():+.2f} %\n"
-        f"{int((saving < 0).sum())} of {len(saving)} drivers worse off",
+        f"{strategy} against {baseline}: saving of the mean energy {_with_interval(found)}\n"
+        f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %, "
+        f"{int((saving < 0).sum())} of {len(saving)} worse off",
         fontsize=10,
     )
     return figure
+
+
+def _with_interval(found: Estimate) -> str:
+    """Write a share and how sure it is."""
+    if np.isnan(found.low):
+        return f"{100 * found.value:+.1f} % (1 training seed: no interval)"
+    bounds = f"{100 * found.low:+.1f} … {100 * found.high:+.1f} %"
+    return f"{100 * found.value:+.1f} % (95 % interval over seeds {bounds})"
 
 
 def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-KEYS = ["profile_id", "driver_id"]
+from lcc_rl.results.intervals import Estimate, saving
 
+KEYS = ["profile_id", "driver_id"]
+HUMANS = ("direct", "idm")  # nothing was trained: one value, known exactly
 
 CAR_COLUMNS = (
     *(f"{v}_{kind}" for v in ("cav", "total") for kind in ("energy_kj", "net_energy_kj")),
@@ -22,6 +25,24 @@ CAR_COLUMNS = (
 def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
     """Put strategies side by side: one row per (profile, driver), the mean over training seeds."""
     return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
+
+
+def per_seed(episodes: pd.DataFrame, column: str) -> dict[str, pd.Series]:
+    """Return, for each strategy, the mean of a column over the episodes of each training seed."""
+    found = {}
+    for strategy, rows in episodes.groupby("strategy", sort=False):
+        values = rows.groupby("training_seed", dropna=False)[column].mean()
+        if values.notna().any():
+            found[str(strategy)] = values
+    return found
+
+
+def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> Estimate:
+    """Estimate the share of a strategy's mean energy saved against a baseline."""
+    values = per_seed(episodes, column)
+    if strategy not in values or baseline not in values:
+        return Estimate(np.nan, np.nan, np.nan)
+    return saving(values[strategy], values[baseline], exact=baseline in HUMANS)
 
 
 def summary(episodes: pd.DataFrame) -> pd.DataFrame:

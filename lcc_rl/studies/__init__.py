@@ -1,0 +1,1 @@
+"""Study room: many runs of the entry points, and what they say together."""

@@ -1,0 +1,213 @@
+"""Study room: start many trainings side by side, skip what is finished, go on where one stopped."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from lcc_rl.config import load, plain
+from lcc_rl.errors import Interrupted
+from lcc_rl.progress import clock
+from lcc_rl.results.files import atomic_path
+from lcc_rl.results.runs import CONFIG, NOT_IDENTITY, flatten, load_config
+
+log = logging.getLogger("lcc_rl")
+
+NOTES = "study.json"
+FINISHED, FAILED, FOREIGN = "finished", "failed", "other settings"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: its folder and what one would type after ``python -m lcc_rl.train``."""
+
+    folder: Path
+    overrides: tuple[str, ...]
+
+    def compose(self) -> DictConfig:
+        """Return its configuration.
+
+        Raises:
+            ConfigError: if an override is unknown or of the wrong type.
+        """
+        return load("train", self.overrides)
+
+    def command(self) -> list[str]:
+        """Return the command that starts it, or goes on with it where it has a checkpoint."""
+        words = [sys.executable, "-m", "lcc_rl.train"]
+        if (self.folder / "checkpoint.pt").exists():
+            return [*words, f"resume={quoted(self.folder)}"]
+        return [*words, *self.overrides, f"hydra.run.dir={quoted(self.folder)}"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a run: ``finished``, ``failed`` or ``other settings``, and the reason."""
+
+    run: Run
+    status: str
+    note: str = ""
+
+
+def quoted(path: str | Path) -> str:
+    """Return a path as Hydra's command line takes it, whatever characters are in it."""
+    return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> list[str]:
+    """List the settings in which a run's folder differs from what is wanted of it.
+
+    Args:
+        run: the run; its folder holds a configuration.
+        wanted: the configuration it should have.
+        accept: dotted keys, or beginnings of them, that may differ (``data``, ``drivers.path``).
+
+    Returns:
+        ``key: found → wanted`` for each.
+    """
+    found, asked = (_settings(cfg) for cfg in (load_config(run.folder), wanted))
+    return [
+        f"{key}: {found.get(key)} → {asked.get(key)}"
+        for key in sorted(found.keys() | asked.keys())
+        if found.get(key) != asked.get(key)
+        and not any(key == item or key.startswith(f"{item}.") for item in accept)
+    ]
+
+
+def _settings(cfg: DictConfig) -> dict[str, Any]:
+    return {k: v for k, v in flatten(plain(cfg)) if k not in NOT_IDENTITY}
+
+
+def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:
+    """Do what is left to do of all runs, ``jobs`` at a time; a failure does not stop the others.
+
+    A run whose folder was made with other settings is left alone and reported.
+
+    Raises:
+        ConfigError: if a run's settings are wrong; checked for all before the first starts.
+        Interrupted: on SIGINT or SIGTERM, after every training at hand is saved.
+    """
+    outcomes, todo = [], []
+    for run in runs:
+        wanted = run.compose()
+        known = (run.folder / CONFIG).is_file()
+        other = differences(run, wanted, accept) if known else []
+        if other:
+            outcomes.append(Outcome(run, FOREIGN, "; ".join(other)))
+        elif known and (run.folder / "episodes.parquet").exists():
+            outcomes.append(Outcome(run, FINISHED))
+        else:
+            todo.append(run)
+    log.info("%d runs: %d to do, %d finished before", len(runs), len(todo), len(runs) - len(todo))
+    return outcomes + _start(todo, jobs)
+
+
+def _start(runs: Sequence[Run], jobs: int) -> list[Outcome]:
+    """Run processes side by side; on an interrupt let each save its state."""
+    children: set[subprocess.Popen[str]] = set()
+    stopping = threading.Event()
+    with ThreadPoolExecutor(jobs) as pool, _terminated():
+        futures = [pool.submit(_one, run, children, stopping) for run in runs]
+        try:
+            return [future.result() for future in futures]
+        except KeyboardInterrupt:
+            stopping.set()
+            for child in list(children):
+                child.send_signal(signal.SIGINT)
+            raise Interrupted("stopped; the same command goes on from here") from None
+
+
+def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Event) -> Outcome:
+    if stopping.is_set():
+        return Outcome(run, FAILED, "not started")
+    run.folder.mkdir(parents=True, exist_ok=True)
+    command, begun = run.command(), time.monotonic()
+    log.info("%s: %s", run.folder, "going on" if command[-1].startswith("resume=") else "started")
+    # A session of its own: the terminal's Ctrl-C reaches it once, through this process.
+    child = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    children.add(child)
+    if stopping.is_set():
+        child.send_signal(signal.SIGINT)
+    _, errors = child.communicate()
+    children.discard(child)
+    if child.returncode == 0:
+        log.info("%s: done in %s", run.folder, clock(time.monotonic() - begun))
+        return Outcome(run, FINISHED)
+    lines = [line for line in errors.splitlines() if line.strip()] or ["no message"]
+    if not stopping.is_set():
+        log.error("%s: failed: %s", run.folder, lines[-1])
+    return Outcome(run, FAILED, lines[-1])
+
+
+@contextmanager
+def _terminated() -> Iterator[None]:
+    """Treat SIGTERM as Ctrl-C, so that the trainings are told."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def note(folder: Path, study: str, command: str) -> None:
+    """Keep what was typed, and when, in the study's folder."""
+    notes = read_notes(folder)
+    notes["study"] = study
+    when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    notes["commands"] = [*notes.get("commands", []), f"{when}  {command}"]
+    _write(folder, notes)
+
+
+def note_problems(folder: Path, outcomes: Sequence[Outcome]) -> None:
+    """Keep which runs failed or differ, replacing what was known of these runs before."""
+    notes = read_notes(folder)
+    problems = dict(notes.get("problems", {}))
+    for outcome in outcomes:
+        name = str(outcome.run.folder.relative_to(folder))
+        problems.pop(name, None)
+        if outcome.status != FINISHED:
+            problems[name] = f"{outcome.status}: {outcome.note}"
+    notes["problems"] = problems
+    _write(folder, notes)
+
+
+def read_notes(folder: Path) -> dict[str, Any]:
+    """Return what the study's folder says of itself; empty where it says nothing."""
+    try:
+        return dict(json.loads((folder / NOTES).read_text()))
+    except (OSError, ValueError):
+        return {}
+
+
+def _write(folder: Path, notes: dict[str, Any]) -> None:
+    with atomic_path(folder / NOTES) as temporary:
+        temporary.write_text(json.dumps(notes, indent=1, ensure_ascii=False))

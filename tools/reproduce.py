@@ -1,0 +1,103 @@
+"""Reproduce a paper's study, from trajectories to one page: python tools/reproduce.py alcc.
+
+  python tools/reproduce.py alcc                            # embedded stream, 8 seeds, Table III
+  python tools/reproduce.py alcc data=ngsim data.path=...   # real trajectories; any override
+  python tools/reproduce.py alcc --recipe smoke --seeds 1   # everything once, in seconds
+  python tools/reproduce.py report outputs/alcc             # tables, figures and page, from parquet
+
+The same command goes on where it stopped: what is finished is skipped, a training that was
+interrupted is resumed, one that fails is listed and does not stop the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shlex
+import sys
+from pathlib import Path
+
+from lcc_rl.cli import main_guard
+from lcc_rl.errors import ConfigError
+from lcc_rl.studies import alcc, alcc_report
+from lcc_rl.studies.runner import FINISHED, note, read_notes
+
+log = logging.getLogger("lcc_rl")
+
+# What turns a study's folder into its page.
+REPORTS = {"alcc": alcc_report.write_results}
+
+
+def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
+    """Run the ALCC study and write its page; 1 if a training failed."""
+    study = alcc.Study(
+        folder=arguments.out,
+        recipe=arguments.recipe,
+        seeds=arguments.seeds,
+        overrides=tuple(arguments.overrides),
+        jobs=arguments.jobs,
+        accept=tuple(arguments.accept),
+        ablations=tuple(arguments.ablations) if arguments.ablations else None,
+        profiles=arguments.profiles,
+    )
+    note(study.folder, "alcc", command)
+    outcomes = alcc.run(study, arguments.parts)
+    page = alcc_report.write_results(study.folder)
+    wrong = [outcome for outcome in outcomes if outcome.status != FINISHED]
+    for outcome in wrong:
+        log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
+    log.info("%d of %d trainings in %s", len(outcomes) - len(wrong), len(outcomes), page)
+    return 1 if wrong else 0
+
+
+def rewrite(arguments: argparse.Namespace, command: str) -> int:
+    """Write tables, figures and page of a study's folder anew."""
+    study = read_notes(arguments.folder).get("study", "alcc")
+    log.info("wrote %s", REPORTS[study](arguments.folder))
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the command line: a subcommand per study, and ``report``."""
+    form = argparse.RawDescriptionHelpFormatter
+    top = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    commands = top.add_subparsers(required=True)
+    one = commands.add_parser("alcc", help="Adaptive Leading Cruise Control (arXiv 2210.02147)")
+    one.set_defaults(run=reproduce_alcc)
+    one.add_argument("--out", type=Path, default=Path("outputs/alcc"), help="the study's folder")
+    one.add_argument("--seeds", type=int, default=8, help="trainings of every variant")
+    one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
+    one.add_argument("--recipe", default="paper_alcc", help="experiment: paper_alcc, quickstart …")
+    listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
+    listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(alcc.ABLATIONS))
+    one.add_argument("--profiles", type=int, default=4, help="profiles of the part single")
+    listing(one, "--accept", (), "settings in which runs found in the folder may differ: data,…")
+    again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
+    again.set_defaults(run=rewrite, overrides=[])
+    again.add_argument("folder", type=Path)
+    return top
+
+
+def listing(
+    target: argparse.ArgumentParser, name: str, default: tuple[str, ...], text: str
+) -> None:
+    """Add an option that takes names with commas between them."""
+    target.add_argument(name, type=lambda words: words.split(","), default=default, help=text)
+
+
+def main(words: list[str]) -> int:
+    """Run a command; whatever is no option is an override of every run."""
+    top = parser()
+    arguments, overrides = top.parse_known_args(words)
+    wrong = [item for item in overrides if item.startswith("-")]
+    if wrong or (overrides and "folder" in arguments):
+        top.error(f"unknown: {' '.join(wrong or overrides)}")
+    if any("=" not in item and not item.startswith("~") for item in overrides):
+        raise ConfigError(f"expected overrides such as data=stream, got {' '.join(overrides)}")
+    arguments.overrides = overrides
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    return int(arguments.run(arguments, shlex.join(["python", "tools/reproduce.py", *words])))
+
+
+if __name__ == "__main__":
+    sys.exit(main_guard(main)(sys.argv[1:]))
