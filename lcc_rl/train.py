@@ -59,10 +59,14 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
     for line in inputs.report:
         log.info(line)
     save_config(cfg, folder)
-    agent = build_agent(cfg, inputs.population, cfg.device)
-    seed = cfg.seed if agent.learns else None
+    agent, seed = build_agent(cfg, inputs.population, cfg.device), cfg.seed
     if agent.learns and cfg.get("policy") is not None:
-        seed = platoon_cases.load_learned(agent, cfg)
+        require(
+            cfg.controller is not None,
+            f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
+            "or say python -m lcc_rl.evaluate to evaluate one",
+        )
+        agent, seed = platoon_cases.load_learned(cfg, inputs)
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     elif agent.learns:
         env = build_env(
@@ -75,7 +79,8 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
-    strategy = Strategy(cfg.variant, cfg, build_policy(cfg, agent.policy), seed)
+    policy = build_policy(cfg, agent.policy)
+    strategy = Strategy(cfg.variant, cfg, policy, seed if agent.learns else None)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
 
 

@@ -125,7 +125,7 @@ def build_env(
         build(node, f"reward.terms.{name}", name=name, **resources)
         for name, node in cfg.reward.terms.items()
     ]
-    moved = [piece.event_shape for piece in pieces if ("action",) in piece.in_keys]
+    moved = [piece.event_shape for piece in pieces if ("action",) in map(arrived, piece.in_keys)]
     action_shape = moved[0] if moved else (1,)
     # What is rewarded is what acts: one car, or every follower of a platoon.
     pieces.append(TotalReward(list(cfg.reward.terms), action_shape))
