@@ -60,6 +60,9 @@ class DDPG:
         batch_size: transitions per update.
         buffer_size: transitions that the replay buffer holds.
         tau: share by which the target networks follow at every update.
+        saturation: weight of a penalty on the square of the actor's output before its tanh; 0 is
+            the literal algorithm. Without it some seeds brake fully for ever: where every action
+            leads to the same end, nothing else draws the actor back from the tanh's flat part.
         updates_per_transition: updates per collected transition.
         exploration: schedule of the action noise.
         fused: compute the update with its gradient written out, which gives the numbers of
@@ -85,6 +88,7 @@ class DDPG:
         batch_size: int = 1024,
         buffer_size: int = 20000,
         tau: float = 0.005,
+        saturation: float = 0.001,
         updates_per_transition: float = 0.125,
         exploration: dict[str, float] | None = None,
         fused: bool = True,
@@ -92,7 +96,7 @@ class DDPG:
     ) -> None:
         _check(gamma, batch_size, buffer_size, tau, updates_per_transition)
         self.gamma, self.batch_size, self.buffer_size = gamma, batch_size, buffer_size
-        self.updates_per_transition = updates_per_transition
+        self.updates_per_transition, self.saturation = updates_per_transition, saturation
         self.exploration = Exploration(**(exploration or {}))
         self.policy: TensorDictModuleBase = make_actor(
             observation_size, action_size, hidden, seed
@@ -112,7 +116,9 @@ class DDPG:
         if fused:
             following = (loss.target_actor_network_params, loss.target_value_network_params)
             targets = (leaves(following[0]), leaves(following[1]))
-            self.fused = FusedUpdate(actor, critic, *targets, (actor_lr, critic_lr), gamma, tau)
+            self.fused = FusedUpdate(
+                actor, critic, *targets, (actor_lr, critic_lr), gamma, tau, saturation
+            )
             self.optimizer = self.fused.optimizer
             return
         groups = [{"params": actor, "lr": actor_lr}, {"params": critic, "lr": critic_lr}]
@@ -132,9 +138,11 @@ class DDPG:
             loss_actor, loss_value = self.fused(batch)
             return {"loss_actor": loss_actor, "loss_value": loss_value}
         losses = self.loss(batch)
+        raw = self.policy.module[0](batch["observation"])
+        penalty = self.saturation * raw.square().mean()
         # Only these two: the other entries of TorchRL's result are not losses, and one of them
         # still carries a gradient.
-        (losses["loss_actor"] + losses["loss_value"]).backward()
+        (losses["loss_actor"] + losses["loss_value"] + penalty).backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.targets.step()

@@ -90,6 +90,7 @@ class FusedUpdate:
         learning_rates: of actor and critic.
         gamma: discount.
         tau: share by which the targets follow.
+        saturation: weight of the penalty on the actor's square output before the tanh.
     """
 
     def __init__(
@@ -101,8 +102,9 @@ class FusedUpdate:
         learning_rates: tuple[float, float],
         gamma: float,
         tau: float,
+        saturation: float,
     ) -> None:
-        self.gamma, self.tau = gamma, tau
+        self.gamma, self.tau, self.saturation = gamma, tau, saturation
         self.online = [join(actor), join(critic)]
         self.following = [join(target_actor).data, join(target_critic).data]
         self.actor, self.critic = layers(actor), layers(critic)
@@ -145,10 +147,11 @@ class FusedUpdate:
         return error.square_().mean()
 
     def _actor(self, observation: Tensor) -> Tensor:
-        action, inputs = forward(self.actor, observation)
-        action.tanh_()
+        raw, inputs = forward(self.actor, observation)
+        action = raw.tanh()
         value, judged = forward(self.critic, torch.cat([observation, action], -1))
         slope = torch.full_like(value, -1.0 / len(value))
         slope = backward(self.critic, judged, slope, None)[:, observation.shape[-1] :]
-        backward(self.actor, inputs, slope * (1.0 - action * action), self.actor_slopes)
+        slope = slope * (1.0 - action * action) + raw * (2.0 * self.saturation / len(raw))
+        backward(self.actor, inputs, slope, self.actor_slopes)
         return -value.mean()

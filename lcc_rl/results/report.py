@@ -159,7 +159,7 @@ def _table(caption: str, frame: pd.DataFrame) -> str:
     shown = [c for c in frame.columns if not _is_bound(frame, str(c))]
     columns = {name: _column(frame, name) for name in shown}
     # Text stands left, numbers right.
-    right = {c: ' class="number"' if pd.api.types.is_numeric_dtype(frame[c]) else "" for c in shown}
+    right = {c: ' class="number"' if _is_number(frame[c]) else "" for c in shown}
     head = "".join(f"<th{right[c]}>{escape(heading(str(c)))}</th>" for c in shown)
     rows = "".join(
         "<tr>" + "".join(f"<td{right[c]}>{escape(columns[c][i])}</td>" for c in shown) + "</tr>\n"
@@ -187,6 +187,11 @@ def _is_bound(frame: pd.DataFrame, column: str) -> bool:
     return any(
         column.endswith(end) and column.removesuffix(end) in frame for end in ("_low", "_high")
     )
+
+
+def _is_number(values: pd.Series) -> bool:
+    kinds = pd.api.types
+    return kinds.is_numeric_dtype(values) and not kinds.is_bool_dtype(values)
 
 
 def _column(frame: pd.DataFrame, name: str) -> list[str]:

@@ -62,7 +62,8 @@ class Study:
         overrides: further settings of every run, data and calibration included.
         jobs: trainings at a time.
         accept: settings in which a run found in the folder may differ.
-        ablations: names of those to run; None for all.
+        ablations: which to run: a name of :data:`ABLATIONS`, or one's own as
+            ``name:override``, e.g. ``early:reward.terms.safety.threshold=6``; None for all.
         profiles: how many profiles the single-profile protocol is tried on.
     """
 
@@ -78,9 +79,8 @@ class Study:
     def __post_init__(self) -> None:
         for name in ("seeds", "jobs", "profiles"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1")
-        for name in self.ablations or ():
-            if name not in ABLATIONS:
-                raise unknown_name("ablation", name, ABLATIONS)
+        for item in self.ablations or ():
+            chosen_ablation(item)
 
     def settings(
         self, entry: str, variant: str, *own: str, recipes: Sequence[str] = ()
@@ -112,6 +112,20 @@ class Study:
             for seed in range(self.seeds)
             for variant in variants
         ]
+
+
+def chosen_ablation(item: str) -> tuple[str, Ablation]:
+    """Return the name and the ablation that an item of a command line stands for.
+
+    Raises:
+        ConfigError: if it is neither known nor says what to override.
+    """
+    name, _, override = item.partition(":")
+    if override:
+        return name, Ablation((override,))
+    if name not in ABLATIONS:
+        raise unknown_name("ablation", name, ABLATIONS)
+    return name, ABLATIONS[name]
 
 
 def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
@@ -160,15 +174,16 @@ def _ablations(study: Study, wanted: DictConfig) -> list[Outcome]:
     chosen = study.ablations or tuple(
         name for name in ABLATIONS if name != f"gamma_{wanted.agent.gamma:g}"
     )
-    folders = {name: study.folder / "ablations" / name for name in chosen}
+    changes = dict(chosen_ablation(item) for item in chosen)
+    folders = {name: study.folder / "ablations" / name for name in changes}
     runs = [
         run
         for name, folder in folders.items()
-        for run in study.runs(folder, ABLATIONS[name].overrides, ABLATIONS[name].variants)
+        for run in study.runs(folder, changes[name].overrides, changes[name].variants)
     ]
     outcomes = run_all(runs, study.jobs, study.accept)
     for name, folder in folders.items():
-        settings = study.settings("evaluate", "alcc", *ABLATIONS[name].overrides)
+        settings = study.settings("evaluate", "alcc", *changes[name].overrides)
         evaluate_all(settings, folder, folder / "evaluation", foreign(outcomes))
     return outcomes
 

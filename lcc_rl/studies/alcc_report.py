@@ -150,9 +150,9 @@ def _episode(page: Page) -> Figures:
 def _constraints(page: Page, episodes: pd.DataFrame, size: str) -> None:
     text = (
         "The study asks for no collision in any episode, time with TTC < 4 s of at most 0.1 %, "
-        "and time with a time gap > 2.5 s of at most 1 %, for every seed. Columns: unsafe TTC is the "
-        "share of time with TTC < 4 s, long time gap that with a time gap > 2.5 s; a least TTC of "
-        "1,000 s means that the car never closed in."
+        "and time with a time gap > 2.5 s of at most 1 %, for every seed. Columns: unsafe TTC is "
+        "the share of time with TTC < 4 s, long time gap that with a time gap > 2.5 s; a least TTC "
+        "of 1,000 s means that the car never closed in."
     )
     tables = [
         page.table("constraints", f"All episodes, {size}", alcc_tables.constraints(episodes)),

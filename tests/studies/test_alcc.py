@@ -1,0 +1,184 @@
+"""The ALCC study: every run composes; what is finished, foreign or broken is told apart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from helpers import wavy_profiles
+from omegaconf import OmegaConf
+
+from lcc_rl import train
+from lcc_rl.data.profiles import SingleProfile, Split
+from lcc_rl.errors import ConfigError, LccError, ResultsError
+from lcc_rl.results.files import read_parquet
+from lcc_rl.studies import alcc, alcc_report, runner
+from lcc_rl.studies.runner import FAILED, FINISHED, FOREIGN, Outcome, Run
+
+TINY = (
+    "data.platoons=4",
+    "data.recordings=2",
+    "scenario.horizon=40",
+    "agent.batch_size=64",
+    "agent.hidden=[16,16]",
+    "calibration.local_genetic.generations=2",
+    "calibration.global_genetic.generations=2",
+)
+
+
+def in_this_process(runs: Sequence[Run], jobs: int) -> list[Outcome]:
+    """Train here instead of in processes of their own, which start for seconds."""
+    outcomes = []
+    for run in runs:
+        cfg = run.compose()
+        if (run.folder / "checkpoint.pt").exists():
+            cfg.resume = str(run.folder)
+        try:
+            train.run(cfg, run.folder, quiet=True)
+            outcomes.append(Outcome(run, FINISHED))
+        except LccError as error:
+            outcomes.append(Outcome(run, FAILED, str(error)))
+    return outcomes
+
+
+@pytest.fixture
+def small(tmp_path, monkeypatch) -> alcc.Study:
+    monkeypatch.setattr(runner, "_start", in_this_process)
+    return alcc.Study(tmp_path / "a study, its folder", "smoke", 2, TINY, profiles=1)
+
+
+def test_every_run_of_the_study_composes(tmp_path) -> None:
+    study = alcc.Study(tmp_path, "paper_alcc", 1)
+    for name, ablation in alcc.ABLATIONS.items():
+        for run in study.runs(tmp_path / name, ablation.overrides, ablation.variants):
+            assert run.compose().training.episodes == 3000, name
+    (run, _) = study.runs(tmp_path, ("split.profile=5",), alcc.VARIANTS, ("single_profile",))
+    cfg = run.compose()
+    assert (cfg.split.profile, cfg.scenario.pieces.leader.start) == (5, "first")
+    assert cfg.training.episodes == 3000
+
+
+def test_each_ablation_changes_the_recipe(tmp_path) -> None:
+    study = alcc.Study(tmp_path, "paper_alcc", 1)
+    main = study.runs(tmp_path, (), ("alcc",))[0].compose()
+    seen = []
+    for name, ablation in alcc.ABLATIONS.items():
+        cfg = study.runs(tmp_path, ablation.overrides, ("alcc",))[0].compose()
+        changed = cfg != main
+        assert changed == (name != "gamma_0.9"), name
+        seen.append(OmegaConf.to_yaml(cfg))
+    assert len(set(seen)) == len(seen)
+
+
+def test_the_whole_study_in_small(small) -> None:
+    study = alcc.Study(**{**vars(small), "ablations": ("gamma_0.99", "late:agent.tau=0.01")})
+    outcomes = alcc.run(study)
+    assert [outcome.status for outcome in outcomes] == [FINISHED] * (4 + 2 * 4 + 4)
+    page = alcc_report.write_results(study.folder)
+    episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
+    counts = episodes.groupby("strategy")["training_seed"].nunique()
+    assert counts.to_dict() == {"alcc": 2, "direct": 0, "idm": 0, "reference": 2}
+    tables = {path.stem for path in (study.folder / "tables").iterdir()}
+    assert {"headline", "table_iv", "ablations", "single_profile", "learning"} <= tables
+    ablated = read_parquet(study.folder / "tables" / "ablations.parquet")
+    assert set(ablated["ablation"]) == {alcc_report.ITSELF, "gamma_0.99", "late"}
+    html = page.read_text()
+    for words in ("Ablations", "Table IV", "One profile", "gamma_0.99", "seed_1", "Configuration"):
+        assert words in html, words
+    # The single profile is both trained on and evaluated on.
+    (folder,) = (study.folder / "single").iterdir()
+    once = read_parquet(folder / "evaluation" / "episodes.parquet")
+    assert once["profile_id"].nunique() == 1
+    _everything_is_skipped(study)
+    _the_page_needs_the_parquet_files_only(study)
+
+
+def _everything_is_skipped(study: alcc.Study) -> None:
+    before = {p: p.stat().st_mtime_ns for p in study.folder.rglob("*.parquet")}
+    assert {outcome.status for outcome in alcc.run(study)} == {FINISHED}
+    assert before == {p: p.stat().st_mtime_ns for p in study.folder.rglob("*.parquet")}
+
+
+def _the_page_needs_the_parquet_files_only(study: alcc.Study) -> None:
+    tables = {p.name: read_parquet(p) for p in (study.folder / "tables").iterdir()}
+    for path in (*study.folder.rglob("*.pt"), *(study.folder / "tables").iterdir()):
+        path.unlink()
+    alcc_report.write_results(study.folder)
+    for name, frame in tables.items():
+        again = read_parquet(study.folder / "tables" / name)
+        pd.testing.assert_frame_equal(frame, again, check_exact=True)
+
+
+def test_foreign_and_broken_runs_do_not_stop_the_others(small) -> None:
+    study = alcc.Study(**{**vars(small), "overrides": (*TINY, "training.episodes=8")})
+    alcc.run(study, ["main"])
+    train_folder = study.folder / "train"
+    broken, other = train_folder / "alcc" / "seed_0", train_folder / "alcc" / "seed_1"
+    (broken / "episodes.parquet").unlink()
+    (broken / "checkpoint.pt").write_bytes(b"no checkpoint")
+    text = (other / "config.yaml").read_text()
+    (other / "config.yaml").write_text(text.replace("tau: 0.005", "tau: 0.5"))
+    outcomes = {outcome.run.folder: outcome for outcome in alcc.run(study, ["main"])}
+    assert outcomes[broken].status == FAILED
+    assert "checkpoint.pt" in outcomes[broken].note
+    assert outcomes[other].status == FOREIGN
+    assert outcomes[other].note == "agent.tau: 0.5 → 0.005"
+    episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
+    assert set(episodes["strategy"]) == {"direct", "idm", "reference"}
+    alcc_report.write_results(study.folder)  # without alcc, some sections are left out
+    problems = json.loads((study.folder / runner.NOTES).read_text())["problems"]
+    assert set(problems) == {"train/alcc/seed_0", "train/alcc/seed_1"}
+    # Accepted, the same run counts as finished; the broken one is made anew.
+    (broken / "checkpoint.pt").unlink()
+    accepting = alcc.Study(**{**vars(study), "accept": ("agent",)})
+    assert {outcome.status for outcome in alcc.run(accepting, ["main"])} == {FINISHED}
+    assert json.loads((study.folder / runner.NOTES).read_text())["problems"] == {}
+    episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
+    assert episodes["strategy"].nunique() == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"seeds": 0}, "seeds must be at least 1"),
+        ({"ablations": ("no_safty",)}, "no_safety"),
+    ],
+)
+def test_impossible_studies(tmp_path, settings, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        alcc.Study(tmp_path, **settings)
+
+
+def test_unknown_parts_and_typing_errors_come_before_any_work(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="ablations"):
+        alcc.run(alcc.Study(tmp_path, seeds=1), ["ablation"])
+    with pytest.raises(ConfigError, match="sede"):
+        alcc.run(alcc.Study(tmp_path, seeds=1, overrides=("sede=1",)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_without_an_evaluation_has_no_page(tmp_path) -> None:
+    with pytest.raises(ResultsError, match=r"no evaluation/episodes\.parquet"):
+        alcc_report.write_results(tmp_path)
+
+
+def test_one_profile_for_both_sides() -> None:
+    profiles = wavy_profiles()
+    training, evaluation = SingleProfile(2)(profiles)
+    assert training.names == evaluation.names == (profiles.names[2],)
+    split = Split("vehicle", 0.5)
+    many, held_out = split(profiles)
+    training, evaluation = SingleProfile(1, split)(profiles)
+    assert training.names == (many.names[1],)
+    assert evaluation.names == held_out.names
+    with pytest.raises(ConfigError, match=r"split\.profile must lie in 0…3"):
+        SingleProfile(4)(profiles)
+
+
+def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
+    folder = tmp_path / "it's a, [strange]=folder"
+    run = alcc.Study(folder, "smoke", 1).runs(folder / "train", (), ("alcc",))[0]
+    assert Path(run.compose().data.path) == folder / "trajectories.parquet"

@@ -1,0 +1,61 @@
+"""The command as a user types it: once through, again without work, and refused in one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from lcc_rl.results.files import read_parquet
+
+SCRIPT = Path(__file__).resolve().parents[2] / "tools" / "reproduce.py"
+TINY = (
+    *("--recipe", "smoke", "--seeds", "1", "--parts", "main"),
+    "data.platoons=4",
+    "data.recordings=2",
+    "scenario.horizon=40",
+    "agent.batch_size=64",
+    "agent.hidden=[16,16]",
+)
+
+
+def reproduce(*words: str, cwd: Path, code: int = 0) -> str:
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *words],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=300,
+    )
+    assert done.returncode == code, done.stderr
+    return done.stderr
+
+
+def test_from_data_to_page_and_on_from_where_it_stopped(tmp_path) -> None:
+    reproduce("alcc", "--out", "study", *TINY, cwd=tmp_path)
+    study = tmp_path / "study"
+    assert "Table IV" in (study / "report.html").read_text()
+    episodes = read_parquet(study / "evaluation" / "episodes.parquet")
+    # One training lost its end: it goes on from its checkpoint, the other is skipped.
+    (study / "train" / "alcc" / "seed_0" / "episodes.parquet").unlink()
+    said = reproduce("alcc", "--out", "study", *TINY, cwd=tmp_path)
+    assert "2 runs: 1 to do, 1 finished before" in said
+    assert "study/train/alcc/seed_0: going on" in said
+    assert read_parquet(study / "evaluation" / "episodes.parquet").equals(episodes)
+    (study / "report.html").unlink()
+    reproduce("report", "study", cwd=tmp_path)
+    assert (study / "report.html").exists()
+
+
+def test_bad_input_is_one_line(tmp_path) -> None:
+    for words, expected in (
+        (["alcc", "--recipe", "smok"], "smok"),
+        (["alcc", "--parts", "mian"], "Did you mean 'main'?"),
+        (["alcc", "data"], "expected overrides"),
+        (["report", "nowhere"], "no evaluation/episodes.parquet"),
+    ):
+        said = reproduce(*words, cwd=tmp_path, code=2)
+        assert expected in said
+        assert "Traceback" not in said
