@@ -49,7 +49,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     if cfg.scenario.name == platoon_cases.SCENARIO:
-        return platoon_cases.run(cfg, folder)
+        return platoon_cases.run(cfg, folder, quiet)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)

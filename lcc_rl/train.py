@@ -66,7 +66,9 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFram
             f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
             "or say python -m lcc_rl.evaluate to evaluate one",
         )
-        agent, seed = platoon_cases.load_learned(cfg, inputs)
+        agent, own = platoon_cases.load_learned(cfg, inputs)
+        cfg.agent, seed = own.agent, own.seed
+        save_config(cfg, folder)
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     elif agent.learns:
         env = build_env(

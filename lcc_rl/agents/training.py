@@ -168,11 +168,12 @@ class Trainer:
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         episodes = torch.cat(played, dim=1)
+        learned = len(new) * len(played)
         self.iteration += 1
         row = {
             "iteration": float(self.iteration),
             "episodes": float(self.iteration * self.env.batch_size[0]),
-            "transitions": float(self.iteration * episodes["next", "reward"].numel()),
+            "transitions": float(self.iteration * learned),
             "updates": float(self.updates),
             "exploration_sigma": sigma,
             **episode_statistics(episodes),

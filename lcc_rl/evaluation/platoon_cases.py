@@ -45,10 +45,15 @@ Series = dict[str, Tensor]
 # -- strategies ------------------------------------------------------------------------------------
 
 
-def run(cfg: DictConfig, folder: Path) -> pd.DataFrame:
+def run(cfg: DictConfig, folder: Path, quiet: bool = False) -> pd.DataFrame:
     """Evaluate the variant of a configuration beside the yardsticks, and draw the figures.
 
     Writes config.yaml, episodes.parquet, steps.parquet and figures.
+
+    Args:
+        cfg: configuration of the entry point ``evaluate``, of a variant of the platoon.
+        folder: where the files go.
+        quiet: do not print the tables.
 
     Returns:
         The rows of episodes.parquet: one per strategy, run and follower.
@@ -62,7 +67,7 @@ def run(cfg: DictConfig, folder: Path) -> pd.DataFrame:
     strategies = [*yardsticks(cfg), *(trained(cfg, path, inputs) for path in cfg.compare)]
     strategies += studied(cfg, inputs)
     save_config(cfg, folder)
-    episodes = evaluate_and_write(strategies, cfg, inputs, folder)
+    episodes = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     write_platoon_figures(folder)
     return episodes
 
@@ -78,7 +83,7 @@ def yardsticks(cfg: DictConfig) -> list[Strategy]:
     return rules + [Strategy(name, cfg, DeadBeatPolicy(step, limit, mode)) for name, mode in beats]
 
 
-def named_gains(name: str) -> dict[str, float]:
+def named_gains(name: str) -> dict[str, Any]:
     """Return one of the shipped sets of gains."""
     return dict(plain(load("evaluate", ["variant=cacc", f"gains={name}"]).gains))
 
@@ -99,10 +104,10 @@ def studied(cfg: DictConfig, inputs: Inputs) -> list[Strategy]:
             f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
             f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
         )
-    agent, seed = load_learned(cfg, inputs)
+    agent, own = load_learned(cfg, inputs)
     if cfg.controller is None:
-        return [Strategy(cfg.variant, cfg, agent.policy, seed)]
-    return hybrids(cfg, agent.policy, seed)
+        return [Strategy(cfg.variant, cfg, agent.policy, own.seed)]
+    return hybrids(cfg, agent.policy, own.seed)
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -112,11 +117,18 @@ def _same(one: Any, other: Any) -> bool:
     )
 
 
+def changed(cfg: DictConfig, **settings: Any) -> DictConfig:
+    """Return a configuration with other settings of its controller."""
+    cfg = cfg.copy()
+    for name, value in settings.items():
+        cfg.controller[name] = value
+    return cfg
+
+
 def hybrids(cfg: DictConfig, learned: Any, seed: int | None) -> list[Strategy]:
     """Build a hybrid strategy, the parents it is composed of, and its oracle."""
     step, limit = cfg.scenario.time_step, cfg.scenario.pieces.platoon.max_acceleration
-    oracle = cfg.copy()
-    oracle.controller.lookahead = "oracle"
+    oracle = changed(cfg, lookahead="oracle")
     rule = build(cfg.controller.rule, "controller.rule", time_step=step, max_acceleration=limit)
     known = any(_same(rule, strategy.policy) for strategy in yardsticks(cfg))
     return [
@@ -127,11 +139,11 @@ def hybrids(cfg: DictConfig, learned: Any, seed: int | None) -> list[Strategy]:
     ]
 
 
-def load_learned(cfg: DictConfig, inputs: Inputs) -> tuple[Any, int]:
+def load_learned(cfg: DictConfig, inputs: Inputs) -> tuple[Any, DictConfig]:
     """Build the agent that ``cfg.policy`` holds, whichever variant of the platoon trained it.
 
     Returns:
-        The agent with its weights, and the seed that it was trained with.
+        The agent with its weights, and the configuration that it was trained with.
 
     Raises:
         ConfigError: if the policy is of another scenario or observation.
@@ -156,17 +168,17 @@ def load_learned(cfg: DictConfig, inputs: Inputs) -> tuple[Any, int]:
         raise ResultsError(
             f"{cfg.policy}: the weights do not fit the policy network: {error}"
         ) from error
-    return agent, int(own.seed)
+    return agent, own
 
 
 def trained(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
     """Build a strategy to compare with, as it was trained, in the scenario under study."""
-    _, own = load_policy(path, LEARNED)
     other = cfg.copy()
     OmegaConf.set_struct(other, False)
-    other.policy, other.controller = path, own.get("controller")
-    agent, seed = load_learned(other, inputs)
-    return Strategy(str(own.variant), other, build_policy(other, agent.policy), seed)
+    other.policy = path
+    agent, own = load_learned(other, inputs)
+    other.controller = own.get("controller")
+    return Strategy(str(own.variant), other, build_policy(other, agent.policy), own.seed)
 
 
 # -- playing ---------------------------------------------------------------------------------------
@@ -299,7 +311,8 @@ def evaluate(
         series = play(strategy, case, inputs, cfg.device)
         frame = measure(series)
         frame.insert(0, "strategy", strategy.name)
-        frame.insert(1, "training_seed", pd.array([strategy.seed] * len(frame), dtype="Int64"))
+        seeds = pd.Series([strategy.seed] * len(frame), dtype="Int64")
+        frame.insert(1, "training_seed", seeds)
         frame.insert(2, "case", case.name)
         frame.insert(3, "profile", [case.profile.names[i] for i in frame["run_id"]])
         frame.insert(4, "followers", case.followers)

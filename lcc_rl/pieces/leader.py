@@ -192,6 +192,6 @@ class PlatoonLeader(RecordedLeader):
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
         seed, still = start.get(SEED), torch.zeros_like(start.get(SEED))
-        window = [start.get(key) for key in self.choices]
-        start.set((self.name, "speed"), self.speed_at(*window, still, seed))
-        start.set((self.name, "next_speed"), self.speed_at(*window, still + 1, seed))
+        profile, first = (start.get(key) for key in self.choices)
+        start.set((self.name, "speed"), self.speed_at(profile, first, still, seed))
+        start.set((self.name, "next_speed"), self.speed_at(profile, first, still + 1, seed))

@@ -56,7 +56,7 @@ class DeadBeatPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        speed, *leader = (tensordict.get(key) for key in self.in_keys)
-        target = next_leader_speed(*leader, self.lookahead, self.time_step)
+        speed, leader, acceleration, true = (tensordict.get(key) for key in self.in_keys)
+        target = next_leader_speed(leader, acceleration, true, self.lookahead, self.time_step)
         wanted = dead_beat_acceleration(speed, target, self.time_step, self.max_acceleration)
         return tensordict.set("action", wanted / self.max_acceleration)

@@ -118,14 +118,14 @@ class HCFSPolicy(TensorDictModuleBase):
             for policy in (self.rule, self.learned)
         )
         speed, last, gap, speed_error = (tensordict.get(key) for key in self._own_keys)
-        leader = (tensordict.get(key) for key in self._leader_keys)
+        leader, leading, true = (tensordict.get(key) for key in self._leader_keys)
         return hybrid_decision(
             rule,
             learned,
             speed,
             last,
             self._last_winner(tensordict),
-            next_leader_speed(*leader, self.lookahead, self.time_step),
+            next_leader_speed(leader, leading, true, self.lookahead, self.time_step),
             jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
             if self.clamp
             else None,

@@ -45,9 +45,10 @@ def _panels(steps: pd.DataFrame, names: list[str], title: str) -> tuple[Figure, 
 
 def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
     followers = int(rows["follower"].max())
-    for follower, own in rows[rows["follower"] > 0].groupby("follower"):
+    for follower in range(1, followers + 1):
+        own = rows[rows["follower"] == follower]
         label = f"follower {follower}" if follower in (1, followers) else None
-        colour = hue(int(str(follower)), followers)
+        colour = hue(follower, followers)
         axis.plot(own["time_s"], own[column], color=colour, lw=1.0, label=label)
 
 

@@ -90,9 +90,7 @@ def full_env(batch_size: int | tuple[int, ...] = 3, name: str = "NGSIMLeader") -
     return TransformedEnv(clock, Compose(*(make() for make in makers.values())))
 
 
-def rollout(
-    batch_size: int | tuple[int, ...] = 3, name: str = "NGSIMLeader"
-) -> TensorDictBase:
+def rollout(batch_size: int | tuple[int, ...] = 3, name: str = "NGSIMLeader") -> TensorDictBase:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return full_env(batch_size, name).rollout(HORIZON, break_when_any_done=False)

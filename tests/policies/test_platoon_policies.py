@@ -8,10 +8,10 @@ import pytest
 import torch
 from helpers import POPULATION
 from platoons import (
-    ACTORS,
     A_MAX,
-    T,
+    ACTORS,
     Actor,
+    T,
     cacc,
     env_of,
     hcfs,
@@ -95,14 +95,12 @@ def test_cacc_closes_its_gaps() -> None:
     assert (td["platoon", "gap"] - 5.0).abs().max() > 0.5
     with torch.no_grad():
         end = env.rollout(400, cacc(), tensordict=td, auto_reset=False)[:, -1]["next"]
-    torch.testing.assert_close(
-        end["platoon", "gap"], torch.full((4, 6, 1), 5.0), atol=0.06, rtol=0
-    )
+    torch.testing.assert_close(end["platoon", "gap"], torch.full((4, 6, 1), 5.0), atol=0.06, rtol=0)
     assert end["platoon", "leader_speed_error"].abs().max() < 1e-3
 
 
 def test_unstable_gains_are_refused_by_the_policy() -> None:
-    with pytest.raises(ConfigError, match="kv = k2 [+] k4 = 2.6 must be below 2"):
+    with pytest.raises(ConfigError, match=r"kv = k2 \+ k4 = 2\.6 must be below 2"):
         CACCPolicy(T, A_MAX, k2=1.3)
 
 
