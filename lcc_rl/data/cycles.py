@@ -196,7 +196,7 @@ class RecordLeaders:
         training: stretches to train on, by name: ``path``, ``scale``, ``from_s``, ``to_s``.
             A shared record need not be repeated: see ``path``.
         held_out: stretches that windows for evaluation are cut from, likewise.
-        cases: by name: ``path``, ``scale``, ``start_s`` and ``followers``.
+        cases: by name (``case_1`` for "case 1"): ``path``, ``scale``, ``start_s``, ``followers``.
         full_length: a stretch driven from end to end; None for none.
         least_variation: windows whose leader changes its speed by less in total are left out:
             nothing happens in them [m/s].
@@ -261,7 +261,7 @@ class RecordLeaders:
             raise ConfigError(f"leader.cases.{name}.followers must be at least 1, got {followers}")
         end = start + horizon * time_step
         profile = stretch(time_step=time_step, from_s=start, to_s=end, **given)
-        return Case(name, profile, followers)
+        return Case(name.replace("_", " "), profile, followers)
 
     def _checked(self, node: Any, where: str, known: set[str]) -> dict[str, Any]:
         """Return a stretch as a dictionary with a path.

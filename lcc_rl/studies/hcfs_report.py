@@ -79,7 +79,7 @@ def _headline(page: Page, episodes: pd.DataFrame) -> None:
     windows = int(table["windows"].max())
     best = max(PARENTS[:1] + PARENTS[-1:], key=lambda name: _mean_reward(episodes, name))
     own, other = _mean_reward(episodes, "hcfs"), _mean_reward(episodes, best)
-    text = f"""The paper reports that HCFS beats both its parents by a factor of about six in case 1.
+    text = f"""The paper reports that HCFS beats both its parents six times over in case 1.
         On {windows} held-out windows of cycles never trained on, with {_trainings(episodes)}
         trainings of the DDPG parent, HCFS with the tuned CACC earns {own:.2f} a window on average;
         the better of its two parents, {best}, earns {other:.2f}. The share of windows in which HCFS
@@ -144,10 +144,10 @@ def _windows(page: Page, episodes: pd.DataFrame) -> None:
     if "full length" in set(episodes["case"]):
         table = case_table(episodes, "full length")
         tables.append(page.table("full_length", "A whole record, first training", table))
-    text = """Every window of 20 s of the held-out records in which the leader changes its speed by at
-        least 2 m/s in total, six followers each; and one record from end to end. The string ratio
-        is the energy of the speed error to the predecessor over that of the vehicle ahead, the
-        worst of all; above 1 a disturbance grows along the string.
+    text = """Every window of 20 s of the held-out records in which the leader changes its
+        speed by at least 2 m/s in total, six followers each; and one record from end to end. The
+        string ratio is the energy of the speed error to the predecessor over that of the vehicle
+        ahead, the worst of all; above 1 a disturbance grows along the string.
 
         The literal rule has neither the clamp to the jerk bound nor the safe cap: its peak jerk
         exceeds J = 10 m/s³, which the paper's theorem takes for granted."""
