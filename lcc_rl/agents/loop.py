@@ -195,7 +195,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     """Summarise the first episode of every slot of a batch ``[environments, steps]``.
 
     A collision ends an episode early; what the collector appends after it belongs to another
-    episode and is left out.
+    episode and is left out. The followers of a platoon are added up.
 
     Returns:
         Mean sums per episode of the reward and of every term, and the number of collisions.
@@ -204,6 +204,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     alive = (done.cumsum(1) - done == 0).unsqueeze(-1)
 
     def per_episode(entry: Tensor) -> float:
+        entry = entry.flatten(2).sum(-1, keepdim=True)
         return float((entry * alive).sum(1).double().mean())
 
     terms = batch["next", "reward_terms"]
