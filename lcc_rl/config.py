@@ -93,6 +93,7 @@ class TrainConfig(StudyConfig):
     resume: str | None = None
     sweep: str | None = None
     objective: Any = "total_net_energy_kj"
+    logger: Any = MISSING
 
 
 @dataclass

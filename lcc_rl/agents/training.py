@@ -12,7 +12,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,8 @@ class Trainer:
         self.iterations = settings.episodes // batch
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
+        # Told every row as it appears; see lcc_rl.results.loggers.
+        self.on_row: Callable[[dict[str, float]], None] = lambda row: None
         self.times: list[dict[str, float]] = []
         self.exploration = GaussianExploration(0.0).to(env.device or "cpu")
         self.sampler = torch.Generator()
@@ -123,6 +125,7 @@ class Trainer:
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
                 row = self._iterate(collector)
+                self.on_row(row)
                 progress.update(
                     self.iteration, {"reward": row["episode_reward"], "loss": row["loss_value"]}
                 )
