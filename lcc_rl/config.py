@@ -100,6 +100,7 @@ class TrainConfig(StudyConfig):
     sweep: str | None = None
     objective: Any = "total_net_energy_kj"
     policy: str | None = None
+    logger: Any = MISSING
 
 
 @dataclass

@@ -106,7 +106,8 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
         trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
         if resume:
             trainer.load()
-        trainer.run()
+        with build(cfg.logger, "logger").opened(folder) as trainer.on_row:
+            trainer.run()
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
@@ -151,7 +152,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     """
     check_sizes(cfg)
     check_objective(cfg)
-    for key in ("data", "split"):
+    for key in ("data", "split", "logger"):
         build(cfg[key], key)
     population = build(cfg.drivers, "drivers")
     agent = build_agent(cfg, population, cfg.device)

@@ -12,7 +12,7 @@ import math
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -87,6 +87,8 @@ class TrainingLoop(ABC):
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
         self.times: list[dict[str, float]] = []
+        # Told every row as it appears; see lcc_rl.results.loggers.
+        self.on_row: Callable[[dict[str, float]], None] = lambda row: None
 
     @abstractmethod
     def _source(self) -> Any:
@@ -111,6 +113,7 @@ class TrainingLoop(ABC):
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
                 row = self._iterate(source)
+                self.on_row(row)
                 progress.update(
                     self.iteration, {"reward": row["episode_reward"], "loss": row[self.watched]}
                 )

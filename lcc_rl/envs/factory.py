@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,12 +61,19 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     scenario = cfg.scenario
     profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
     training, evaluation = build(cfg.split, "split")(profiles)
-    return Inputs(
-        training,
-        evaluation.windows(scenario.horizon, cfg.evaluation.profiles),
-        build(cfg.drivers, "drivers"),
-        tuple(report),
-    )
+    windows = evaluation.windows(scenario.horizon, cfg.evaluation.profiles)
+    population = build(cfg.drivers, "drivers")
+    available = {"profiles": len(windows), "drivers": len(population.time_gap)}
+    return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
+
+
+def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
+    """Return a line for everything that an evaluation asks more of than there is."""
+    return [
+        f"evaluation.{name}={cfg.evaluation[name]}: only {count} are available; taking all"
+        for name, count in available.items()
+        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count
+    ]
 
 
 def _platoon_inputs(cfg: DictConfig) -> Inputs:
