@@ -21,7 +21,7 @@ from lcc_rl.functional.idm import (
 from lcc_rl.functional.power import traction_force
 
 QUICK = settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+    max_examples=5, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 STEPS, STEP = 20, 0.1
 
