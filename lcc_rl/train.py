@@ -26,6 +26,7 @@ from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
 from lcc_rl.pieces.vehicles import Population
 from lcc_rl.results.files import parquet_metadata, read_parquet, write_parquet
+from lcc_rl.results.loggers import Silent
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
 from lcc_rl.results.states import working
 from lcc_rl.results.tables import as_rich, summary
@@ -106,7 +107,7 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
         trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
         if resume:
             trainer.load()
-        with build(cfg.logger, "logger").opened(folder) as trainer.on_row:
+        with row_logger(cfg).opened(folder) as trainer.on_row:
             trainer.run()
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
@@ -114,6 +115,12 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     policy = build_policy(cfg, agent.policy)
     strategy = Strategy(cfg.variant, cfg, policy, seed if agent.learns else None)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+
+
+def row_logger(cfg: DictConfig) -> Any:
+    """Build what is told every training row; nothing is, in runs from before there was a choice."""
+    node = cfg.get("logger")
+    return Silent() if node is None else build(node, "logger")
 
 
 def make_trainer(
@@ -152,7 +159,8 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     """
     check_sizes(cfg)
     check_objective(cfg)
-    for key in ("data", "split", "logger"):
+    row_logger(cfg)
+    for key in ("data", "split"):
         build(cfg[key], key)
     population = build(cfg.drivers, "drivers")
     agent = build_agent(cfg, population, cfg.device)
@@ -195,7 +203,8 @@ def check_objective(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the unknown one.
     """
-    names = [cfg.objective] if isinstance(cfg.objective, str) else list(cfg.objective)
+    wanted = cfg.get("objective", OBJECTIVES[0])
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
     require(bool(names), "objective is empty: name at least one column of the summary")
     for name in names:
         if name not in OBJECTIVES:
