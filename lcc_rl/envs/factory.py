@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import TARGET, build, find_target, load, plain
 from lcc_rl.data.profiles import Profiles, leader_profiles
-from lcc_rl.envs.clock import Clock
+from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Piece, TotalReward
 from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
@@ -105,7 +105,7 @@ def build_env(
     pieces.append(TotalReward(list(cfg.reward.terms)))
     _check_wiring(pieces)
     clock = Clock(scenario.horizon, batch_size, seed=seed, device=device)
-    env = TransformedEnv(clock, Pieces(*pieces))
+    env = Traffic(clock, Pieces(*pieces))
     return env.to(device) if device is not None else env
 
 

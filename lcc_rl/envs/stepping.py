@@ -124,4 +124,5 @@ def leaves(key: NestedKey, known: Sequence[tuple[str, ...]]) -> list[tuple[str, 
 
 def entries(td: TensorDictBase) -> State:
     """Return the entries of a moment by their full keys."""
-    return {as_tuple(key): td.get(key) for key in td.keys(True, True)}
+    # Copies: entries that begin as one tensor would cost the compiler a graph of their own.
+    return {as_tuple(key): td.get(key).clone() for key in td.keys(True, True)}
