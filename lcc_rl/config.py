@@ -64,6 +64,7 @@ class EvaluationConfig:
     batch_size: int = MISSING
     seed: int = MISSING
     sample_episodes: int = MISSING
+    full_length: bool = False
 
 
 @dataclass
@@ -78,10 +79,13 @@ class StudyConfig:
     data: Any = MISSING
     drivers: Any = MISSING
     split: Any = MISSING
+    leader: Any = None
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)
     agent: Any = MISSING
+    gains: Any = None
+    controller: Any = None
     # Here, not in TrainConfig, so that one recipe serves every entry point.
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -95,6 +99,8 @@ class TrainConfig(StudyConfig):
     resume: str | None = None
     sweep: str | None = None
     objective: Any = "total_net_energy_kj"
+    policy: str | None = None
+    logger: Any = MISSING
 
 
 @dataclass

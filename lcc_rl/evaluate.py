@@ -13,6 +13,7 @@ from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import load
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
@@ -48,6 +49,8 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+    if cfg.scenario.name == platoon_cases.SCENARIO:
+        return platoon_cases.run(cfg, folder, quiet)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)

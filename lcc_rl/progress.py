@@ -117,7 +117,7 @@ class ProgressReporter:
             "eta_s": round(remaining, 1),
             **{name: float(f"{value:.6g}") for name, value in values.items()},
         }
-        with atomic_path(self.folder / PROGRESS) as temporary:
+        with atomic_path(self.folder / PROGRESS, durable=False) as temporary:
             temporary.write_text(json.dumps(state))
 
 

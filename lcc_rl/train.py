@@ -19,9 +19,10 @@ from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, is_sweep, prepare_torch, run_folder
 from lcc_rl.config import build, load, require
 from lcc_rl.data.profiles import Profiles, from_records
-from lcc_rl.envs.factory import Inputs, build_agent, build_env, load_inputs
+from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, load_inputs
 from lcc_rl.envs.factory import learns as learned
 from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
 from lcc_rl.pieces.vehicles import Population
 from lcc_rl.results.files import parquet_metadata, read_parquet, write_parquet
@@ -90,17 +91,28 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     for line in inputs.report:
         log.info(line)
     save_config(cfg, folder)
-    agent = build_agent(cfg, inputs.population, cfg.device)
-    if agent.learns:
+    agent, seed = build_agent(cfg, inputs.population, cfg.device), cfg.seed
+    if agent.learns and cfg.get("policy") is not None:
+        require(
+            cfg.controller is not None,
+            f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
+            "or say python -m lcc_rl.evaluate to evaluate one",
+        )
+        agent, own = platoon_cases.load_learned(cfg, inputs)
+        cfg.agent, seed = own.agent, own.seed
+        save_config(cfg, folder)
+        save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
+    elif agent.learns:
         trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
         if resume:
             trainer.load()
-        trainer.run()
+        with build(cfg.logger, "logger").opened(folder) as trainer.on_row:
+            trainer.run()
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
-    seed = cfg.seed if agent.learns else None
-    strategy = Strategy(cfg.variant, cfg, agent.policy, seed)
+    policy = build_policy(cfg, agent.policy)
+    strategy = Strategy(cfg.variant, cfg, policy, seed if agent.learns else None)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
 
 
@@ -140,7 +152,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     """
     check_sizes(cfg)
     check_objective(cfg)
-    for key in ("data", "split"):
+    for key in ("data", "split", "logger"):
         build(cfg[key], key)
     population = build(cfg.drivers, "drivers")
     agent = build_agent(cfg, population, cfg.device)
@@ -217,6 +229,8 @@ def evaluate_and_write(
     quiet: bool = False,
 ) -> pd.DataFrame:
     """Evaluate strategies on the held-out profiles, write the rows and print the summary."""
+    if cfg.scenario.name == platoon_cases.SCENARIO:
+        return platoon_cases.evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     settings = cfg.evaluation
     results = [
         evaluate(

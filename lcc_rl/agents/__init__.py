@@ -2,5 +2,7 @@
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.ddpg import DDPG
+from lcc_rl.agents.sac import SAC
+from lcc_rl.agents.td3 import TD3
 
-__all__ = ["DDPG", "Analytic"]
+__all__ = ["DDPG", "SAC", "TD3", "Analytic"]

@@ -12,7 +12,7 @@ import math
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -87,6 +87,8 @@ class TrainingLoop(ABC):
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
         self.times: list[dict[str, float]] = []
+        # Told every row as it appears; see lcc_rl.results.loggers.
+        self.on_row: Callable[[dict[str, float]], None] = lambda row: None
 
     @abstractmethod
     def _source(self) -> Any:
@@ -111,6 +113,7 @@ class TrainingLoop(ABC):
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
                 row = self._iterate(source)
+                self.on_row(row)
                 progress.update(
                     self.iteration, {"reward": row["episode_reward"], "loss": row[self.watched]}
                 )
@@ -195,7 +198,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     """Summarise the first episode of every slot of a batch ``[environments, steps]``.
 
     A collision ends an episode early; what the collector appends after it belongs to another
-    episode and is left out.
+    episode and is left out. The followers of a platoon are added up.
 
     Returns:
         Mean sums per episode of the reward and of every term, and the number of collisions.
@@ -204,6 +207,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     alive = (done.cumsum(1) - done == 0).unsqueeze(-1)
 
     def per_episode(entry: Tensor) -> float:
+        entry = entry.flatten(2).sum(-1, keepdim=True)
         return float((entry * alive).sum(1).double().mean())
 
     terms = batch["next", "reward_terms"]

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.config import TrainingConfig
 from lcc_rl.envs.stepping import Segments
 from lcc_rl.policies import GaussianExploration
@@ -36,7 +38,7 @@ class Trainer(TrainingLoop):
 
     def __init__(
         self,
-        agent: DDPG,
+        agent: DDPG | OffPolicy,
         env: TransformedEnv,
         settings: TrainingConfig,
         seed: int,
@@ -44,7 +46,8 @@ class Trainer(TrainingLoop):
         identity: str,
     ) -> None:
         super().__init__(agent, env, settings, seed, folder, identity)
-        self.exploration = GaussianExploration(0.0).to(env.device or "cpu")
+        noise = agent.noise if isinstance(agent, OffPolicy) else GaussianExploration(0.0)
+        self.exploration = noise.to(env.device or "cpu")
         self.sampler = torch.Generator()
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(agent.buffer_size, device=env.device or "cpu"),
@@ -78,19 +81,21 @@ class Trainer(TrainingLoop):
         for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             batch = next(segments)
-            self.buffer.extend(batch.select(*LEARNED_FROM).reshape(-1))
+            new = transitions(batch)
+            self.buffer.extend(new)
             played.append(batch.select(*REPORTED))
             collected = time.perf_counter()
-            before = (self.iteration * self.horizon + part * batch.shape[1]) * batch.shape[0]
-            losses.append(self._learn(before, batch.numel()))
+            before = self.iteration * (self.horizon // self.settings.segment) + part
+            losses.append(self._learn(before * len(new), len(new)))
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         episodes = torch.cat(played, dim=1)
+        learned = len(new) * len(played)
         self.iteration += 1
         row = {
             "iteration": float(self.iteration),
             "episodes": float(self.iteration * self.env.batch_size[0]),
-            "transitions": float(self.iteration * episodes.numel()),
+            "transitions": float(self.iteration * learned),
             "updates": float(self.updates),
             "exploration_sigma": sigma,
             **episode_statistics(episodes),
@@ -116,3 +121,19 @@ class Trainer(TrainingLoop):
     def _remember(self, memory: dict[str, Any]) -> None:
         self.buffer.load_state_dict(memory["buffer"])
         self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
+
+
+def transitions(batch: TensorDictBase) -> TensorDictBase:
+    """Return what is learned from a batch ``[environments, steps]``, one transition a row.
+
+    In a platoon every follower's is a transition of its own, ``[environments × steps ×
+    followers]``; all of them end when the episode does.
+    """
+    batch = batch.select(*LEARNED_FROM)
+    reward = batch["next", "reward"]
+    shape = reward.shape[:-1]
+    if len(shape) == batch.ndim:
+        return batch.reshape(-1)
+    for key in (("next", "done"), ("next", "terminated")):
+        batch.set(key, batch[key].unsqueeze(-2).expand(reward.shape))
+    return batch.auto_batch_size_(len(shape)).reshape(-1)

@@ -3,14 +3,17 @@
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, Transition
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, Observation, TimeGap, TimeToCollision
-from lcc_rl.pieces.leader import NGSIMLeader
+from lcc_rl.pieces.leader import NGSIMLeader, PlatoonLeader
+from lcc_rl.pieces.platoon import PlatoonErrors, PlatoonMotion, PlatoonObservation
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
     EnergyReward,
+    JerkReward,
     RewardTerm,
     SafetyReward,
     TotalReward,
+    VelocityReward,
 )
 from lcc_rl.pieces.surrogates import SmoothEfficiency, SmoothSafety
 from lcc_rl.pieces.termination import Collision
@@ -25,10 +28,15 @@ __all__ = [
     "EnergyReward",
     "Feature",
     "IDMFollower",
+    "JerkReward",
     "MotorPower",
     "NGSIMLeader",
     "Observation",
     "Piece",
+    "PlatoonErrors",
+    "PlatoonLeader",
+    "PlatoonMotion",
+    "PlatoonObservation",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
@@ -38,4 +46,5 @@ __all__ = [
     "TimeToCollision",
     "TotalReward",
     "Transition",
+    "VelocityReward",
 ]

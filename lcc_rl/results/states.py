@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lcc_rl.errors import Interrupted, LccError, ResultsError
-from lcc_rl.results.files import atomic_path
+from lcc_rl.results.files import atomic_path, remove_leftovers
 
 try:
     import fcntl
@@ -118,6 +118,7 @@ def working(folder: Path) -> Iterator[None]:
     """Claim a folder, and record why the work in it failed, where it does."""
     with claim(folder):
         forget(folder)
+        remove_leftovers(folder)
         try:
             yield
         except Interrupted:
