@@ -90,7 +90,7 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
 
 
 def _settings(cfg: DictConfig) -> dict[str, Any]:
-    return {k: v for k, v in flatten(plain(cfg)) if k not in NOT_IDENTITY}
+    return {k: v for k, v in flatten(plain(cfg)) if k.split(".")[0] not in NOT_IDENTITY}
 
 
 def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:
