@@ -19,6 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from lcc_rl.config_errors import check_keys, explain, refused_key
 from lcc_rl.errors import ConfigError, LccError, unknown_name
 
 TARGET = "_target_"
@@ -51,6 +52,7 @@ class TrainingConfig:
     environments: int = MISSING
     segment: int = MISSING
     checkpoint_every: int = MISSING
+    compiled: bool | None = None
 
 
 @dataclass
@@ -73,6 +75,7 @@ class StudyConfig:
     seed: int = MISSING
     device: str = MISSING
     threads: int = MISSING
+    matmul_precision: str = "highest"
     data: Any = MISSING
     drivers: Any = MISSING
     split: Any = MISSING
@@ -86,6 +89,7 @@ class StudyConfig:
     # Here, not in TrainConfig, so that one recipe serves every entry point.
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    trust: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -93,7 +97,10 @@ class TrainConfig(StudyConfig):
     """``python -m lcc_rl.train``."""
 
     resume: str | None = None
+    sweep: str | None = None
+    objective: Any = "total_net_energy_kj"
     policy: str | None = None
+    logger: Any = MISSING
 
 
 @dataclass
@@ -140,12 +147,31 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigError: if an override is unknown or of the wrong type.
     """
     try:
-        if GlobalHydra.instance().is_initialized():
-            return compose(entry, overrides=list(overrides))
-        with initialize_config_module(CONF, version_base="1.3"):
-            return compose(entry, overrides=list(overrides))
+        cfg = _compose(entry, overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(str(explained(error, entry, overrides))) from error
+    check_keys(cfg)
+    return cfg
+
+
+def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictConfig:
+    if GlobalHydra.instance().is_initialized():
+        return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+    with initialize_config_module(CONF, version_base="1.3"):
+        return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+
+
+def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Exception:
+    """Return a clearer error for what Hydra refused, naming the nearest option that exists."""
+    key = refused_key(error)
+    others = [item for item in overrides if key is None or key not in item]
+    for kept in (others, []):
+        try:
+            valid = _compose(entry, kept, hydra=key is not None and key.startswith("hydra."))
+        except (HydraException, OmegaConfBaseException):
+            continue
+        return explain(error, valid)
+    return error
 
 
 def build(node: Any, where: str, **resources: Any) -> Any:

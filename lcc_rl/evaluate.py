@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -57,11 +58,30 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     strategies += [trained(cfg, path, inputs) for path in cfg.compare]
     if own and cfg.variant not in BASELINES:
         strategies.append(studied(cfg, inputs))
+    check_distinct(strategies)
     save_config(cfg, folder)
     episodes = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet:
         write_study_figures(folder)
     return episodes
+
+
+def check_distinct(strategies: Sequence[Strategy]) -> None:
+    """Refuse two policies that no row could tell apart.
+
+    Raises:
+        ConfigError: naming the variant and the seed.
+    """
+    seen = set()
+    for strategy in strategies:
+        key = (strategy.name, strategy.seed)
+        if key in seen:
+            seed = "" if strategy.seed is None else f" with training seed {strategy.seed}"
+            raise ConfigError(
+                f"policy and compare name two policies of variant {strategy.name}{seed}; their "
+                "rows could not be told apart: evaluate them one after the other"
+            )
+        seen.add(key)
 
 
 def baseline(cfg: DictConfig, variant: str, inputs: Inputs) -> Strategy:
@@ -97,7 +117,7 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
             f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
             f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
         )
-    weights, own = load_policy(cfg.policy, cfg.variant)
+    weights, own = load_policy(cfg.policy, cfg.variant, tuple(cfg.trust))
     if own.variant != cfg.variant:
         raise ConfigError(
             f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
@@ -113,7 +133,7 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
 
 def trained(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
     """Build a trained strategy from its policy file, in the scenario under study."""
-    weights, own = load_policy(path)
+    weights, own = load_policy(path, trust=tuple(cfg.trust))
     share_scenario(cfg, own)
     return with_weights(own, weights, own.seed, path, inputs)
 

@@ -94,7 +94,7 @@ class DDPG:
         fused: bool = True,
         device: str = "cpu",
     ) -> None:
-        _check(gamma, batch_size, buffer_size, tau, updates_per_transition)
+        check_settings(gamma, batch_size, buffer_size, tau, updates_per_transition)
         self.gamma, self.batch_size, self.buffer_size = gamma, batch_size, buffer_size
         self.updates_per_transition, self.saturation = updates_per_transition, saturation
         self.exploration = Exploration(**(exploration or {}))
@@ -163,9 +163,14 @@ def leaves(parameters: TensorDictBase) -> list[torch.Tensor]:
     return list(parameters.flatten_keys().values())
 
 
-def _check(
+def check_settings(
     gamma: float, batch_size: int, buffer_size: int, tau: float, updates_per_transition: float
 ) -> None:
+    """Check settings that all agents with a replay buffer share.
+
+    Raises:
+        ConfigError: naming the one at fault.
+    """
     if not 0.0 <= gamma < 1.0:
         raise ConfigError(f"agent.gamma must lie in [0, 1), got {gamma}")
     if not 0.0 < tau <= 1.0:

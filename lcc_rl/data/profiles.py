@@ -167,6 +167,8 @@ class Split:
         by: ``"recording"`` holds out whole recordings (no shared traffic wave at all);
             ``"vehicle"`` holds out leaders within every recording.
         evaluation_share: share of the recordings or vehicles held out, 0…1.
+        tuning: for choosing settings: put what would be held out aside, unseen, and hold out a
+            part of the rest, by the same rule, in its place.
 
     Raises:
         ConfigError: if a setting is unknown or out of range.
@@ -174,6 +176,7 @@ class Split:
 
     by: str = "recording"
     evaluation_share: float = 0.34
+    tuning: bool = False
 
     def __post_init__(self) -> None:
         if self.by not in ("recording", "vehicle"):
@@ -189,6 +192,11 @@ class Split:
         Raises:
             DataError: if there are not at least two recordings (or vehicles) to divide.
         """
+        if self.tuning:
+            profiles, _ = self._divide(profiles)
+        return self._divide(profiles)
+
+    def _divide(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
         # The vehicle is the part of the name before the time, so that two episodes behind the
         # same leader never end up on both sides.
         groups = [

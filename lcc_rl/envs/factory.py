@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import TARGET, build, find_target, load, plain
 from lcc_rl.data.cycles import Case
@@ -17,7 +17,7 @@ from lcc_rl.data.profiles import Profiles, leader_profiles
 from lcc_rl.envs.clock import Clock
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Piece, TotalReward
-from lcc_rl.pieces.base import SEED, STEP, Transition, arrived
+from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
 from lcc_rl.pieces.vehicles import Population
 
 
@@ -61,12 +61,19 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     scenario = cfg.scenario
     profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
     training, evaluation = build(cfg.split, "split")(profiles)
-    return Inputs(
-        training,
-        evaluation.windows(scenario.horizon, cfg.evaluation.profiles),
-        build(cfg.drivers, "drivers"),
-        tuple(report),
-    )
+    windows = evaluation.windows(scenario.horizon, cfg.evaluation.profiles)
+    population = build(cfg.drivers, "drivers")
+    available = {"profiles": len(windows), "drivers": len(population.time_gap)}
+    return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
+
+
+def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
+    """Return a line for everything that an evaluation asks more of than there is."""
+    return [
+        f"evaluation.{name}={cfg.evaluation[name]}: only {count} are available; taking all"
+        for name, count in available.items()
+        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count
+    ]
 
 
 def _platoon_inputs(cfg: DictConfig) -> Inputs:
@@ -131,7 +138,7 @@ def build_env(
     pieces.append(TotalReward(list(cfg.reward.terms), action_shape))
     _check_wiring(pieces)
     clock = Clock(scenario.horizon, batch_size, action_shape, seed, device)
-    env = TransformedEnv(clock, Compose(*pieces))
+    env = TransformedEnv(clock, Pieces(*pieces))
     return env.to(device) if device is not None else env
 
 
@@ -178,9 +185,9 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         population=population,
         observation_size=observation.event_shape[-1],
         action_size=1,
-        time_step=cfg.scenario.time_step,
         max_acceleration=vehicle.max_acceleration if vehicle is not None else 1.0,
         seed=cfg.seed,
+        time_step=cfg.scenario.time_step,
         device=device,
     )
 

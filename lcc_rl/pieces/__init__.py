@@ -15,6 +15,7 @@ from lcc_rl.pieces.rewards import (
     TotalReward,
     VelocityReward,
 )
+from lcc_rl.pieces.surrogates import SmoothEfficiency, SmoothSafety
 from lcc_rl.pieces.termination import Collision
 from lcc_rl.pieces.vehicles import CAVMotion, IDMFollower
 
@@ -39,6 +40,8 @@ __all__ = [
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
+    "SmoothEfficiency",
+    "SmoothSafety",
     "TimeGap",
     "TimeToCollision",
     "TotalReward",

@@ -10,7 +10,8 @@ import torch
 from helpers import POPULATION, compose, wavy_profiles
 
 from lcc_rl.agents.ddpg import Exploration
-from lcc_rl.agents.training import Trainer, episode_statistics
+from lcc_rl.agents.loop import episode_statistics
+from lcc_rl.agents.training import Trainer
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
 from lcc_rl.results.files import read_parquet, write_torch
@@ -148,7 +149,7 @@ def test_statistics_leave_out_what_follows_a_collision(tmp_path) -> None:
     with torch.no_grad():
         trainer.agent.policy.module[0][-1].bias.fill_(9.0)  # full throttle into the leader
     batch = torch.cat(
-        [next(segments) for segments in [iter(trainer._collector())] for _ in range(10)], 1
+        [next(segments) for segments in [iter(trainer._source())] for _ in range(10)], 1
     )
     row = episode_statistics(batch)
     assert row["collisions"] == 4

@@ -1,0 +1,253 @@
+"""What every training loop does besides learning: record, checkpoint, stop and go on.
+
+Iteration i of a training is a function of the state before it and of (seed, i) alone: every
+generator is seeded anew from these at its start. A checkpoint therefore holds tensors and a
+counter, and a resumed training equals one that never stopped, bit for bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pandas as pd
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.config import TrainingConfig, require
+from lcc_rl.errors import Diverged, Interrupted, ResultsError
+from lcc_rl.progress import ProgressReporter
+from lcc_rl.results.files import read_torch, write_parquet, write_torch
+
+# What the record of an iteration is made from.
+REPORTED = (("next", "reward"), ("next", "reward_terms"), ("next", "done"), ("next", "terminated"))
+
+
+def derived_seed(*parts: object) -> int:
+    """Return a seed that depends on all parts; distinct purposes get independent streams."""
+    digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1
+
+
+class TrainingLoop(ABC):
+    """Runs iterations to the end and keeps their record; a subclass says what an iteration is.
+
+    Args:
+        agent: what learns: has ``policy``, ``state_dict`` and ``load_state_dict``.
+        env: the training environment, ``[environments]`` episodes side by side.
+        settings: length and bookkeeping.
+        seed: seed of everything random.
+        folder: where training.parquet, timing.parquet, checkpoint.pt and progress.json go.
+        identity: hash of the configuration; a checkpoint of another one is refused.
+
+    Raises:
+        ConfigError: if the settings contradict each other.
+    """
+
+    advice: ClassVar[str]  # what to do when the training diverges
+    watched: ClassVar[str] = "loss_value"  # the entry of the record shown as the loss
+
+    def __init__(
+        self,
+        agent: Any,
+        env: TransformedEnv,
+        settings: TrainingConfig,
+        seed: int,
+        folder: Path,
+        identity: str,
+    ) -> None:
+        batch, self.horizon = env.batch_size[0], env.base_env.horizon
+        require(
+            settings.episodes >= batch,
+            f"training.episodes ({settings.episodes}) must be at least "
+            f"training.environments ({batch})",
+        )
+        require(
+            settings.episodes % batch == 0,
+            f"training.episodes ({settings.episodes}) must be a multiple of "
+            f"training.environments ({batch})",
+        )
+        require(
+            settings.segment >= 1 and self.horizon % settings.segment == 0,
+            f"training.segment ({settings.segment}) must divide scenario.horizon ({self.horizon})",
+        )
+        require(settings.checkpoint_every >= 1, "training.checkpoint_every must be at least 1")
+        self.agent, self.env, self.settings = agent, env, settings
+        self.seed, self.folder, self.identity = seed, folder, identity
+        self.iterations = settings.episodes // batch
+        self.iteration, self.updates = 0, 0
+        self.rows: list[dict[str, float]] = []
+        self.times: list[dict[str, float]] = []
+        # Told every row as it appears; see lcc_rl.results.loggers.
+        self.on_row: Callable[[dict[str, float]], None] = lambda row: None
+
+    @abstractmethod
+    def _source(self) -> Any:
+        """Return what :meth:`_iterate` plays episodes with; made once per run."""
+
+    @abstractmethod
+    def _iterate(self, source: Any) -> dict[str, float]:
+        """Play and learn from one batch of episodes; append to the record and return the row."""
+
+    def run(self) -> pd.DataFrame:
+        """Train to the end and return the record, one row per iteration.
+
+        Raises:
+            Interrupted: on SIGINT or SIGTERM, after the iteration at hand is saved.
+            Diverged: if a loss or the reward is not finite.
+        """
+        title = f"train {self.folder.name}"
+        progress = ProgressReporter(
+            title, self.iterations, start=self.iteration, folder=self.folder
+        )
+        source = self._source()
+        with stop_signal() as stop, progress:
+            while self.iteration < self.iterations:
+                row = self._iterate(source)
+                self.on_row(row)
+                progress.update(
+                    self.iteration, {"reward": row["episode_reward"], "loss": row[self.watched]}
+                )
+                if stop.is_set():
+                    self.save()
+                    raise Interrupted(
+                        f"stopped after iteration {self.iteration} of {self.iterations}; go on "
+                        f"with: python -m lcc_rl.train resume={self.folder}"
+                    )
+                if self.iteration % self.settings.checkpoint_every == 0:
+                    self.save()
+        self.save()
+        return pd.DataFrame(self.rows)
+
+    def _record(self, row: dict[str, float], collect_s: float, learn_s: float) -> None:
+        """Append an iteration to the record.
+
+        Raises:
+            Diverged: if a value is not finite.
+        """
+        for name, value in row.items():
+            if not math.isfinite(value):
+                good = self.folder / "checkpoint.pt"
+                state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
+                raise Diverged(
+                    f"{name} became {value} in iteration {self.iteration} of {self.iterations}; "
+                    f"{state}. {self.advice}"
+                )
+        self.rows.append(row)
+        times = {"iteration": row["iteration"], "collect_s": collect_s, "learn_s": learn_s}
+        self.times.append(times)
+
+    # -- state ---------------------------------------------------------------------------------
+
+    def _memory(self) -> dict[str, Any]:
+        """Return what a checkpoint holds besides the agent and the record."""
+        return {}
+
+    def _remember(self, memory: dict[str, Any]) -> None:
+        """Restore what :meth:`_memory` returned."""
+        assert not memory, "a loop that keeps a memory restores it"
+
+    def save(self) -> None:
+        """Write training.parquet, timing.parquet and checkpoint.pt, each whole or not at all."""
+        rows, times = pd.DataFrame(self.rows), pd.DataFrame(self.times)
+        metadata = {"lcc_rl.config": self.identity}
+        write_torch(
+            {
+                "identity": self.identity,
+                "iteration": self.iteration,
+                "updates": self.updates,
+                "agent": self.agent.state_dict(),
+                "rows": _columns(rows),
+                "times": _columns(times),
+                "memory": self._memory(),
+            },
+            self.folder / "checkpoint.pt",
+        )
+        write_parquet(rows, self.folder / "training.parquet", metadata)
+        write_parquet(times, self.folder / "timing.parquet", metadata)
+
+    def load(self) -> None:
+        """Go on from checkpoint.pt.
+
+        Raises:
+            ResultsError: if it is missing, damaged or belongs to another configuration.
+        """
+        path = self.folder / "checkpoint.pt"
+        state = read_torch(path)
+        if state.get("identity") != self.identity:
+            raise ResultsError(
+                f"{path}: belongs to another configuration (hash {state.get('identity')}, this "
+                f"run has {self.identity}); resume with the settings it was started with"
+            )
+        self.iteration, self.updates = state["iteration"], state["updates"]
+        self.agent.load_state_dict(state["agent"])
+        self._remember(state["memory"])
+        self.rows, self.times = _rows(state["rows"]), _rows(state["times"])
+
+
+def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
+    """Summarise the first episode of every slot of a batch ``[environments, steps]``.
+
+    A collision ends an episode early; what the collector appends after it belongs to another
+    episode and is left out. The followers of a platoon are added up.
+
+    Returns:
+        Mean sums per episode of the reward and of every term, and the number of collisions.
+    """
+    done = batch["next", "done"].squeeze(-1).int()
+    alive = (done.cumsum(1) - done == 0).unsqueeze(-1)
+
+    def per_episode(entry: Tensor) -> float:
+        entry = entry.flatten(2).sum(-1, keepdim=True)
+        return float((entry * alive).sum(1).double().mean())
+
+    terms = batch["next", "reward_terms"]
+    return {
+        "episode_reward": per_episode(batch["next", "reward"]),
+        **{f"reward_{name}": per_episode(terms[name]) for name in terms.keys()},  # noqa: SIM118
+        "collisions": float((batch["next", "terminated"] & alive).sum()),
+    }
+
+
+@contextmanager
+def stop_signal() -> Iterator[threading.Event]:
+    """Turn the first SIGINT or SIGTERM into a request to stop; the second acts at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = {kind: signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM)}
+
+    def request(number: int, frame: Any) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, before[signal.SIGINT])
+        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+
+    for kind in before:
+        signal.signal(kind, request)
+    try:
+        yield event
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+
+
+def _columns(frame: pd.DataFrame) -> dict[str, Tensor]:
+    return {str(name): torch.tensor(frame[name].to_numpy(float)) for name in frame.columns}
+
+
+def _rows(columns: dict[str, Tensor]) -> list[dict[str, float]]:
+    names = list(columns)
+    return [
+        dict(zip(names, values, strict=True))
+        for values in zip(*(columns[name].tolist() for name in names), strict=True)
+    ]

@@ -1,0 +1,115 @@
+"""Smooth stand-ins for reward terms with thresholds: what a gradient can follow, in training only.
+
+The literal terms have no slope where it matters: an indicator has none at all, a penalty that
+begins at a threshold has none before it. Each stand-in takes a ``threshold`` of its own, to be
+set a little on the safe side of the term's, and a ``width`` over which it bends.
+"""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.pieces.rewards import RewardTerm
+
+
+def excess(value: Tensor, width: float) -> Tensor:
+    """Return max(0, value), bent: quadratic up to about ``width``, then straight; same shape.
+
+    Nothing of it reaches below zero: a tail, however small, is paid in every step of every
+    episode and would outweigh what it stands for.
+    """
+    above = value.clamp(min=0.0)
+    return width * ((1.0 + (above / width).square()).sqrt() - 1.0)
+
+
+class SmoothSafety(RewardTerm):
+    """−max(0, log(threshold / TTC)), smooth in gap and approach rate (stands in for A10–A11).
+
+    Unlike the literal term it has a slope beyond the threshold, at contact and behind it, all of
+    which lead back to safety.
+
+    Args:
+        name, weight: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
+        threshold: time-to-collision that is safe enough [s].
+        width: range over which the logarithm bends.
+        margin: gap that counts as contact [m].
+        gap_width: range of gaps over which contact bends [m].
+        rate_width: range of approach rates over which closing begins [m/s].
+        vehicle: namespace of the vehicle.
+
+    Raises:
+        ConfigError: if a threshold or width is not positive.
+    """
+
+    def __init__(
+        self,
+        name: str = "safety",
+        weight: float = 1.0,
+        threshold: float = 4.0,
+        width: float = 0.1,
+        margin: float = 1.0,
+        gap_width: float = 0.2,
+        rate_width: float = 0.1,
+        vehicle: str = "cav",
+    ) -> None:
+        _require_positive(
+            name, threshold=threshold, width=width, gap_width=gap_width, rate_width=rate_width
+        )
+        super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "relative_speed")])
+        self.log_threshold, self.width, self.margin = math.log(threshold), width, margin
+        self.gap_width, self.rate_width = gap_width, rate_width
+
+    def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        room = _log_softplus((gap - self.margin) / self.gap_width) + math.log(self.gap_width)
+        rate = _log_softplus(-relative_speed / self.rate_width) + math.log(self.rate_width)
+        return -excess(self.log_threshold + rate - room, self.width)
+
+
+class SmoothEfficiency(RewardTerm):
+    """−max(0, log(TG / threshold)), smooth (stands in for A12–A13).
+
+    Args:
+        name, weight: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
+        threshold: time gap that is too long [s].
+        width: range over which the logarithm bends.
+        speed_floor: speeds below this count as this [m/s].
+        vehicle: namespace of the vehicle.
+
+    Raises:
+        ConfigError: if a setting is not positive.
+    """
+
+    def __init__(
+        self,
+        name: str = "efficiency",
+        weight: float = 1.0,
+        threshold: float = 2.5,
+        width: float = 0.1,
+        speed_floor: float = 1.0,
+        vehicle: str = "cav",
+    ) -> None:
+        _require_positive(name, threshold=threshold, width=width, speed_floor=speed_floor)
+        super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "speed")])
+        self.threshold, self.width, self.speed_floor = threshold, width, speed_floor
+
+    def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        longest = self.threshold * speed.clamp(min=self.speed_floor)
+        # Behind contact nothing is too long.
+        return -excess((gap / longest).clamp(min=1e-3).log(), self.width)
+
+
+def _log_softplus(value: Tensor) -> Tensor:
+    """log(log(1 + eˣ)), which is x far below zero, where softplus itself is rounded to zero."""
+    return softplus(value.clamp(min=-15.0)).log() + (value + 15.0).clamp(max=0.0)
+
+
+def _require_positive(name: str, **settings: float) -> None:
+    for key, value in settings.items():
+        if not value > 0:
+            raise ConfigError(f"agent.surrogates.{name}.{key} must be positive, got {value}")
