@@ -100,9 +100,10 @@ def test_constructor_arguments_and_yaml_are_in_parity() -> None:
     }
     for variant in VARIANTS:
         cfg = compose(variant)
-        nodes = {**cfg.scenario.pieces, **cfg.reward.terms, "observation": cfg.observation}
+        nodes = {**cfg.scenario.pieces, **cfg.reward.terms}
         if variant in PLATOON:
-            nodes |= {"agent": cfg.agent, "leader": cfg.leader}
+            own = ("agent", "observation", "leader")
+            nodes |= {f"{group} of {variant}": cfg[group] for group in own}
             offered |= {"max_acceleration", "learned", "path", "observation_size", "action_size"}
             offered |= {"seed", "device"}
         if cfg.controller is not None:
