@@ -173,6 +173,7 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     assert second.returncode == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("launcher", "package"),
     [("lcc_joblib", "hydra_joblib_launcher"), ("lcc_submitit_local", "hydra_submitit_launcher")],
