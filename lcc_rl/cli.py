@@ -77,7 +77,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 def sweep(command: Callable[[], Any]) -> None:
     """Run a Hydra command; where it was a sweep, say how its runs ended."""
     SweepCallback.folder = None
-    command()
+    try:
+        command()
+    except KeyboardInterrupt:
+        if SweepCallback.folder is None:
+            raise
+        raise Interrupted(f"stopped; the same command goes on in {SweepCallback.folder}") from None
     if SweepCallback.folder is not None:
         conclude(SweepCallback.folder)
 

@@ -164,14 +164,17 @@ def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictC
 def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Exception:
     """Return a clearer error for what Hydra refused, naming the nearest option that exists."""
     key = refused_key(error)
-    others = [item for item in overrides if key is None or key not in item]
-    for kept in (others, []):
+    hydra = key is not None and key.startswith("hydra.")
+    # What exists may depend on the other overrides: leave out only those that fail.
+    kept, wrong = list(overrides), key
+    while True:
+        kept = [item for item in kept if wrong and wrong not in item]
         try:
-            valid = _compose(entry, kept, hydra=key is not None and key.startswith("hydra."))
-        except (HydraException, OmegaConfBaseException):
-            continue
-        return explain(error, valid)
-    return error
+            return explain(error, _compose(entry, kept, hydra))
+        except (HydraException, OmegaConfBaseException) as next_error:
+            if not kept:
+                return error
+            wrong = refused_key(next_error)
 
 
 def build(node: Any, where: str, **resources: Any) -> Any:

@@ -26,6 +26,7 @@ from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
 from lcc_rl.pieces.vehicles import Population
 from lcc_rl.results.files import parquet_metadata, read_parquet, write_parquet
+from lcc_rl.results.loggers import Silent
 from lcc_rl.results.platoon_tables import case_table
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
 from lcc_rl.results.states import working
@@ -109,7 +110,7 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
         trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
         if resume:
             trainer.load()
-        with build(cfg.logger, "logger").opened(folder) as trainer.on_row:
+        with row_logger(cfg).opened(folder) as trainer.on_row:
             trainer.run()
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
@@ -117,6 +118,12 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     policy = build_policy(cfg, agent.policy)
     strategy = Strategy(cfg.variant, cfg, policy, seed if agent.learns else None)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+
+
+def row_logger(cfg: DictConfig) -> Any:
+    """Build what is told every training row; nothing is, in runs from before there was a choice."""
+    node = cfg.get("logger")
+    return Silent() if node is None else build(node, "logger")
 
 
 def make_trainer(
@@ -139,19 +146,18 @@ def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
 
 def objective(cfg: DictConfig, episodes: pd.DataFrame) -> float | list[float]:
     """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
-    platoon = cfg.scenario.name == platoon_cases.SCENARIO
+    # By its rows: a resumed run is not of the variant that the command line composed.
+    platoon = "follower" in episodes
     table = case_table(episodes, platoon_cases.WINDOWS) if platoon else summary(episodes)
-    values = [float(table.iloc[-1][name]) for name in objectives(cfg)]
+    values = [float(table.iloc[-1][name]) for name in objectives(cfg, platoon)]
     return values[0] if isinstance(cfg.objective, str) else values
 
 
-def objectives(cfg: DictConfig) -> list[str]:
-    """Return the columns that ``objective`` names."""
-    names = [cfg.objective] if isinstance(cfg.objective, str) else list(cfg.objective)
-    platoon = cfg.scenario.name == platoon_cases.SCENARIO
-    if platoon and names == [TrainConfig.objective]:
-        return [PLATOON_OBJECTIVES[0]]
-    return names
+def objectives(cfg: DictConfig, platoon: bool) -> list[str]:
+    """Return the columns that ``objective`` names; a run made before there was any has none."""
+    wanted = cfg.get("objective", TrainConfig.objective)
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    return [PLATOON_OBJECTIVES[0]] if platoon and names == [TrainConfig.objective] else names
 
 
 def check_settings(cfg: DictConfig, folder: Path) -> None:
@@ -164,7 +170,8 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     """
     check_sizes(cfg)
     check_objective(cfg)
-    for key in ("data", "split", "logger"):
+    row_logger(cfg)
+    for key in ("data", "split"):
         build(cfg[key], key)
     population = build(cfg.drivers, "drivers")
     agent = build_agent(cfg, population, cfg.device)
@@ -207,7 +214,8 @@ def check_objective(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the unknown one.
     """
-    names, platoon = objectives(cfg), cfg.scenario.name == platoon_cases.SCENARIO
+    platoon = cfg.scenario.name == platoon_cases.SCENARIO
+    names = objectives(cfg, platoon)
     require(bool(names), "objective is empty: name at least one column of the summary")
     known = PLATOON_OBJECTIVES if platoon else OBJECTIVES
     for name in names:

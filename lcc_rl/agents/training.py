@@ -28,7 +28,8 @@ LEARNED_FROM = (
     ("next", "terminated"),
 )
 
-WORTH_COMPILING = 100_000  # steps of an environment from which on compiling it pays for itself
+# Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
+WORTH_COMPILING = 40_000
 
 
 class Trainer(TrainingLoop):

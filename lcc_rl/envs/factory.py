@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.config import TARGET, build, find_target, load, plain
 from lcc_rl.data.cycles import Case
 from lcc_rl.data.profiles import Profiles, leader_profiles
-from lcc_rl.envs.clock import Clock
+from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Piece, TotalReward
 from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
@@ -138,7 +138,7 @@ def build_env(
     pieces.append(TotalReward(list(cfg.reward.terms), action_shape))
     _check_wiring(pieces)
     clock = Clock(scenario.horizon, batch_size, action_shape, seed, device)
-    env = TransformedEnv(clock, Pieces(*pieces))
+    env = Traffic(clock, Pieces(*pieces))
     return env.to(device) if device is not None else env
 
 

@@ -14,7 +14,7 @@ from torch._dynamo.exc import TorchDynamoException
 from torch._inductor.exc import InductorError
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.envs.unroll import as_function
+from lcc_rl.envs.unroll import as_function, closure
 from lcc_rl.pieces.base import NEXT, SEED, STEP, arrived, as_tuple
 
 log = logging.getLogger("lcc_rl")
@@ -51,7 +51,6 @@ class Segments:
         self.env, self.policy, self.steps = env, policy, steps
         self.reads = [as_tuple(key) for key in policy.in_keys if as_tuple(key) != ACTION]
         self.horizon = env.base_env.horizon
-        self.pieces = [as_function(piece, True) for piece in env.transform]
         self.advance: Callable[[State], tuple[State, list[Tensor], Tensor]] = self._advance
         if compiled:
             # One graph for this size: a graph for any size would be slower.
@@ -60,6 +59,9 @@ class Segments:
         rewards = env.full_reward_spec.keys(True, True)
         known = [*self.state, ACTION, *map(as_tuple, rewards)]
         self.keys = list(dict.fromkeys(leaf for key in keys for leaf in leaves(key, known)))
+        wanted = {*map(arrived, self.keys), *self.reads, DONE}
+        # Pieces that none of this depends on, which only an evaluation measures, are left out.
+        self.pieces = [as_function(piece, True) for piece in closure(list(env.transform), wanted)]
 
     def reset(self) -> None:
         """Begin new episodes everywhere."""
@@ -96,7 +98,8 @@ class Segments:
         for piece in self.pieces:
             piece(before, reached)
         kept = [reached[key[1:]] if key[0] == NEXT else before[key] for key in self.keys]
-        return {key: reached[key] for key in state}, kept, reached[DONE].any()
+        after = {key: reached.get(key, value) for key, value in state.items()}
+        return after, kept, reached[DONE].any()
 
     def _attempt(self, state: State) -> tuple[State, list[Tensor], Tensor]:
         """Take a compiled step, or a plain one where there is no compiler."""
@@ -124,4 +127,5 @@ def leaves(key: NestedKey, known: Sequence[tuple[str, ...]]) -> list[tuple[str, 
 
 def entries(td: TensorDictBase) -> State:
     """Return the entries of a moment by their full keys."""
-    return {as_tuple(key): td.get(key) for key in td.keys(True, True)}
+    # Copies: entries that begin as one tensor would cost the compiler a graph of their own.
+    return {as_tuple(key): td.get(key).clone() for key in td.keys(True, True)}

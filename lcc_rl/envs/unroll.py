@@ -54,9 +54,9 @@ class Unrolled:
         pieces: list[Piece] = list(env.transform)
         graded = {as_tuple(key) for key in wanted} | {OBSERVATION}
         every = graded | {as_tuple(key) for key in observed} | {TERMINATED}
-        needed, self.graded = _closure(pieces, every), _closure(pieces, graded)
+        needed, self.graded = closure(pieces, every), closure(pieces, graded)
         recurrent = [piece for piece in needed if _is_recurrent(piece)]
-        inside = _closure(needed, {OBSERVATION}, recurrent)
+        inside = closure(needed, {OBSERVATION}, recurrent)
         self.after = [piece for piece in needed if piece not in inside]
         self.steps = [as_function(piece, piece in self.graded) for piece in inside]
         self.carried = {SEED, STEP, *_written(inside)}
@@ -143,9 +143,7 @@ def _is_recurrent(piece: Piece) -> bool:
     return bool(past & _written([piece]))
 
 
-def _closure(
-    pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()
-) -> list[Piece]:
+def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
     """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
     kept = list(chosen)
     keys = set(wanted) | {arrived(key) for piece in kept for key in piece.in_keys}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -141,6 +142,17 @@ def read_torch(path: str | Path) -> Any:
     if not path.is_file():
         raise ResultsError(f"{path}: no such file")
     try:
+        _check_sums(path)
         return torch.load(path, weights_only=True, map_location="cpu")
     except Exception as error:  # torch raises many kinds for damaged or malicious files
         raise ResultsError(f"{path}: not a readable weights file: {error}") from error
+
+
+def _check_sums(path: Path) -> None:
+    """Compare every part of a weights file with its checksum, which torch itself leaves out."""
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ResultsError(f"{damaged} does not match its checksum")

@@ -20,7 +20,16 @@ PRETRAINED = "pretrained"
 # The rooms whose classes a stored configuration may name.
 REGISTRY = tuple(
     f"lcc_rl.{room}"
-    for room in ("agents", "calibration", "data", "evaluation", "functional", "pieces", "policies")
+    for room in (
+        "agents",
+        "calibration",
+        "data",
+        "evaluation",
+        "functional",
+        "pieces",
+        "policies",
+        "results.loggers",
+    )
 )
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # Settings that say where and how to run, not what: they do not change any row.

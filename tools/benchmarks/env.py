@@ -37,7 +37,7 @@ def env_rates(options: Namespace, batch: int, ending: str) -> dict[str, np.ndarr
         # One graph per size, which is faster than one for any size; and none of other sizes, whose
         # guards would be tried first and count towards the compiler's limit.
         torch.compiler.reset()
-        env.compile(dynamic=False)
+        env.compile(warmup=3, dynamic=False)
         advance = torch.compile(plain.step, dynamic=False)
 
     def rollout() -> None:

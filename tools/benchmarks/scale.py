@@ -55,7 +55,7 @@ def stepping(options: Namespace, batch: int, followers: int, steps: int, compile
     if compiled:
         # One graph per size; each environment is an object of its own, so none is tried in vain.
         torch._dynamo.config.recompile_limit = 64
-        env.compile(dynamic=False)
+        env.compile(warmup=3, dynamic=False)
     return lambda: advance(env, start, zero, steps)
 
 
