@@ -17,7 +17,7 @@ from lcc_rl.agents.analytic import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, is_sweep, prepare_torch, run_folder
-from lcc_rl.config import build, load, require
+from lcc_rl.config import TrainConfig, build, load, require
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, load_inputs
 from lcc_rl.envs.factory import learns as learned
@@ -27,6 +27,7 @@ from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
 from lcc_rl.pieces.vehicles import Population
 from lcc_rl.results.files import parquet_metadata, read_parquet, write_parquet
 from lcc_rl.results.loggers import Silent
+from lcc_rl.results.platoon_tables import case_table
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
 from lcc_rl.results.states import working
 from lcc_rl.results.tables import as_rich, summary
@@ -47,6 +48,8 @@ OBJECTIVES = (
     "share_time_gap_long",
     "rms_jerk_mps3",
 )
+# ... and of a platoon's table of windows; it has no energies, the default is read as the first.
+PLATOON_OBJECTIVES = ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3")
 MEASURED = ("cav_ttc", "cav_time_gap", "cav_power", "hdv_power")
 
 
@@ -143,10 +146,18 @@ def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
 
 def objective(cfg: DictConfig, episodes: pd.DataFrame) -> float | list[float]:
     """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
-    row = summary(episodes).iloc[-1]
-    names = [cfg.objective] if isinstance(cfg.objective, str) else list(cfg.objective)
-    values = [float(row[name]) for name in names]
+    # By its rows: a resumed run is not of the variant that the command line composed.
+    platoon = "follower" in episodes
+    table = case_table(episodes, platoon_cases.WINDOWS) if platoon else summary(episodes)
+    values = [float(table.iloc[-1][name]) for name in objectives(cfg, platoon)]
     return values[0] if isinstance(cfg.objective, str) else values
+
+
+def objectives(cfg: DictConfig, platoon: bool) -> list[str]:
+    """Return the columns that ``objective`` names; a run made before there was any has none."""
+    wanted = cfg.get("objective", TrainConfig.objective)
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    return [PLATOON_OBJECTIVES[0]] if platoon and names == [TrainConfig.objective] else names
 
 
 def check_settings(cfg: DictConfig, folder: Path) -> None:
@@ -203,12 +214,13 @@ def check_objective(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the unknown one.
     """
-    wanted = cfg.get("objective", OBJECTIVES[0])
-    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    platoon = cfg.scenario.name == platoon_cases.SCENARIO
+    names = objectives(cfg, platoon)
     require(bool(names), "objective is empty: name at least one column of the summary")
+    known = PLATOON_OBJECTIVES if platoon else OBJECTIVES
     for name in names:
-        if name not in OBJECTIVES:
-            raise unknown_name("objective", str(name), OBJECTIVES)
+        if name not in known:
+            raise unknown_name("objective", str(name), known)
 
 
 def check_sizes(cfg: DictConfig) -> None:

@@ -132,7 +132,9 @@ def trainer(folder: Path, *overrides: str) -> Trainer:
 
 def test_transitions_are_those_of_every_follower(tmp_path) -> None:
     with torch.no_grad():
-        batch = next(iter(trainer(tmp_path)._source()))
+        source = trainer(tmp_path)._source()
+        source.reset()
+        batch = next(iter(source))
     flat = transitions(batch)
     envs, steps = batch.shape
     assert flat.shape == (envs * steps * 6,)
@@ -146,7 +148,9 @@ def test_followers_explore_each_on_their_own(tmp_path) -> None:
     made = trainer(tmp_path)
     made.exploration.sigma.fill_(0.3)
     with torch.no_grad():
-        batch = next(iter(made._source()))
+        source = made._source()
+        source.reset()
+        batch = next(iter(source))
         mean = made.agent.policy(batch.copy())["action"]
     noise = (batch["action"] - mean).flatten(0, 1).squeeze(-1)
     correlation = torch.corrcoef(noise.T)
