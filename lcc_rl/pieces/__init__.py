@@ -3,6 +3,7 @@
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, Transition
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, Observation, TimeGap, TimeToCollision
+from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
@@ -12,7 +13,7 @@ from lcc_rl.pieces.rewards import (
     SafetyReward,
     TotalReward,
 )
-from lcc_rl.pieces.surrogates import SmoothEfficiency, SmoothSafety
+from lcc_rl.pieces.surrogates import SmoothEfficiency, Smoothness, SmoothSafety
 from lcc_rl.pieces.termination import Collision
 from lcc_rl.pieces.vehicles import CAVMotion, IDMFollower
 
@@ -25,15 +26,18 @@ __all__ = [
     "EnergyReward",
     "Feature",
     "IDMFollower",
+    "LeaderPreview",
     "MotorPower",
     "NGSIMLeader",
     "Observation",
+    "ObservationMemory",
     "Piece",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
     "SmoothEfficiency",
     "SmoothSafety",
+    "Smoothness",
     "TimeGap",
     "TimeToCollision",
     "TotalReward",
