@@ -33,7 +33,7 @@ from lcc_rl.studies.runner import FINISHED, Run, run_all
 log = logging.getLogger("lcc_rl")
 
 AGENTS = ("analytic", "ddpg", "td3", "sac")
-PREVIEWS = (0.0, 1.0, 2.0, 5.0, 10.0)  # [s]
+PREVIEWS = (1.0, 2.0, 5.0, 10.0)  # [s]; five speeds, evenly spread up to there
 EPISODES = "episodes.parquet"
 ENERGY, UNSAFE, LONG = "total_energy_kj", "share_ttc_unsafe", "share_time_gap_long"
 
@@ -69,6 +69,23 @@ def runs_of_followers(options: argparse.Namespace) -> list[Run]:
         for number in options.numbers
         for gamma in options.gammas
         for variant in ("reference", "alcc")
+        for seed in range(options.seeds)
+    ]
+
+
+def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
+    """Return a training without, with memory and with previews of several lengths, per seed."""
+    kinds: dict[str, list[str]] = {"none": [], "memory": ["+knowledge=memory"]}
+    for seconds in PREVIEWS:
+        ahead = ",".join(f"{seconds * part / 5:g}" for part in range(1, 6))
+        horizons = f"scenario.pieces.preview.horizons=[{ahead}]"
+        kinds[f"preview_{seconds:g}s"] = ["+knowledge=preview", horizons]
+    return [
+        Run(
+            options.out / kind / f"seed_{seed}",
+            (f"agent={options.agent}", f"seed={seed}", *changes, *options.overrides),
+        )
+        for kind, changes in kinds.items()
         for seed in range(options.seeds)
     ]
 
@@ -202,6 +219,33 @@ def figure_of_followers(folder: Path) -> Figure:
     return figure
 
 
+def table_of_knowledge(folder: Path) -> pd.DataFrame:
+    """Return one row per kind of knowledge: what it is worth.
+
+    Raises:
+        ResultsError: if no training is finished.
+    """
+    runs = table_of_agents(folder)
+    runs["knowledge"] = [Path(run).parent.name for run in runs["run"]]
+    grouped = runs.groupby("knowledge")
+    table = grouped[[ENERGY, "net_energy_kj", UNSAFE, LONG, "collisions"]].mean()
+    table["energy_sd"], table["seeds"] = grouped[ENERGY].std(), grouped.size()
+    if "none" in table.index:
+        table["saving"] = 1.0 - table[ENERGY] / float(grouped[ENERGY].mean()["none"])
+    return table.reset_index()
+
+
+def figure_of_knowledge(folder: Path) -> Figure:
+    """Total energy against what the car knows."""
+    table = table_of_knowledge(folder).sort_values(ENERGY, ascending=False)
+    figure = new_figure(6.5, 3.6)
+    axis = figure.subplots()
+    error = table["energy_sd"].fillna(0.0)
+    axis.errorbar(table["knowledge"], table[ENERGY], error, fmt="o", color=colour("alcc"))
+    style(axis, "what the car knows besides the present", "total energy [kJ per episode]")
+    return figure
+
+
 Part = tuple[
     Callable[[argparse.Namespace], list[Run]],
     Callable[[Path], pd.DataFrame],
@@ -210,6 +254,7 @@ Part = tuple[
 PARTS: dict[str, Part] = {
     "agents": (runs_of_agents, table_of_agents, figure_of_agents),
     "followers": (runs_of_followers, table_of_followers, figure_of_followers),
+    "knowledge": (runs_of_knowledge, table_of_knowledge, figure_of_knowledge),
 }
 
 
@@ -245,8 +290,9 @@ def parser() -> argparse.ArgumentParser:
         if part == "agents":
             one.add_argument("--agents", type=words, default=list(AGENTS))
             one.add_argument("--variants", type=words, default=["alcc", "reference"])
-        if part == "followers":
+        if part != "agents":
             one.add_argument("--agent", default="analytic")
+        if part == "followers":
             one.add_argument("--numbers", type=numbers, default=[1, 2, 5, 10])
             one.add_argument("--gammas", type=words, default=["default"])
     return top

@@ -69,13 +69,22 @@ def test_table_of_agents(tmp_path) -> None:
     assert (tmp_path / "agents.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("part", ["agents", "followers"])
+def test_what_knowledge_is_worth(tmp_path) -> None:
+    fabricate(tmp_path / "none" / "seed_0", "alcc", 100.0, "agent=analytic")
+    fabricate(tmp_path / "preview_5s" / "seed_0", "alcc", 90.0, "agent=analytic")
+    assert tool.main(["knowledge", "--draw", "--out", str(tmp_path)]) == 0
+    table = read_parquet(tmp_path / "knowledge.parquet").set_index("knowledge")
+    assert table.loc["preview_5s", "saving"] == pytest.approx(0.1)
+    assert (tmp_path / "knowledge.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("part", ["agents", "followers", "knowledge"])
 def test_every_run_it_would_start_composes(part, tmp_path) -> None:
     words = [part, "--seeds", "1", "--out", str(tmp_path), "experiment=smoke"]
     options, overrides = tool.parser().parse_known_args(words)
     options.overrides = overrides
     runs = tool.PARTS[part][0](options)
-    assert len(runs) == {"agents": 4 * 2 + 1, "followers": 4 * 2}[part]
+    assert len(runs) == {"agents": 4 * 2 + 1, "followers": 4 * 2, "knowledge": 6}[part]
     assert len({run.folder for run in runs}) == len(runs)
     for run in runs:
         assert run.compose().scenario.horizon == 60
