@@ -21,12 +21,13 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 from lcc_rl.results.drawing import save
 from lcc_rl.results.files import write_parquet
+from lcc_rl.results.runs import save_config
 
 
 def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
     """Calibrate the drivers of ``cfg.data`` as ``cfg.calibration`` says.
 
-    Writes ``drivers.parquet``, ``calibration.png`` and ``joint_distribution.png``.
+    Writes ``config.yaml``, ``drivers.parquet``, ``calibration.png`` and ``joint_distribution.png``.
 
     Args:
         cfg: a configuration with data, calibration, seed, device and threads.
@@ -50,6 +51,7 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
     calibrator = build(cfg.calibration, "calibration")
     dataset = build(cfg.data, "data").load()
     _say(console, dataset.report)
+    save_config(cfg, Path(folder))
     start = perf_counter()
     with _progress(console) as bar:
         task = bar.add_task("calibration")

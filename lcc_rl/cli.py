@@ -18,7 +18,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from lcc_rl.config import explained
+from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
+from lcc_rl.precision import set_precision
+from lcc_rl.results.states import Busy, forget, input_error, record
+from lcc_rl.sweeps import SweepCallback, conclude, run_job
 
 # OSError: Hydra cannot make the run's folder, a disk is full, a file is not ours to read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
@@ -30,8 +35,9 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     """Make a function of a configuration a command: Hydra around it, clear errors around Hydra.
 
     Whatever is wrong with the input (an option, a file, a row) ends in one line on stderr and
-    exit code 2; Ctrl-C in exit code 130. A bug still shows its traceback. In a sweep a failed job
-    lets the others finish first. ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
+    exit code 2, and in ``error.txt`` of the run's folder; Ctrl-C in exit code 130. A bug still
+    shows its traceback. In a sweep a failed run does not stop the others; all are named at the end.
+    ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
 
     Args:
         config_name: the entry point's configuration in ``lcc_rl.conf``, without suffix.
@@ -40,10 +46,13 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
         @wraps(function)
         def job(config: DictConfig) -> Any:
-            # In a sweep Hydra collects failures, so they must reach it as exceptions.
-            if HydraConfig.get().mode is RunMode.MULTIRUN:
+            def checked(config: DictConfig) -> Any:
+                check_keys(config)
                 return function(config)
-            return main_guard(function)(config)
+
+            if is_sweep():
+                return run_job(checked, config, run_folder())
+            return main_guard(recorded(checked))(config)
 
         command = hydra.main(
             version_base="1.3", config_path="pkg://lcc_rl.conf", config_name=config_name
@@ -55,7 +64,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             # Makes Hydra hand errors over instead of printing them in its own way.
             os.environ.setdefault(TRACEBACK, "1")
             try:
-                command() if wanted else main_guard(command)()
+                sweep(command) if wanted else main_guard(explaining(sweep, config_name))(command)
             finally:
                 if not wanted:
                     os.environ.pop(TRACEBACK, None)
@@ -63,6 +72,51 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         return main
 
     return decorate
+
+
+def sweep(command: Callable[[], Any]) -> None:
+    """Run a Hydra command; where it was a sweep, say how its runs ended."""
+    SweepCallback.folder = None
+    try:
+        command()
+    except KeyboardInterrupt:
+        if SweepCallback.folder is None:
+            raise
+        raise Interrupted(f"stopped; the same command goes on in {SweepCallback.folder}") from None
+    if SweepCallback.folder is not None:
+        conclude(SweepCallback.folder)
+
+
+def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
+    """Say what Hydra says about a wrong option again, with the nearest option that exists."""
+
+    def explained_function(*arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except HydraException as error:
+            overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
+            clearer = explained(error, entry, overrides)
+            if clearer is error:
+                raise
+            raise clearer from error
+
+    return explained_function
+
+
+def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """Leave ``error.txt`` in the run's folder where it fails."""
+
+    def recording(cfg: DictConfig) -> Any:
+        forget(run_folder())
+        try:
+            return function(cfg)
+        except (Interrupted, Busy):
+            raise
+        except Exception as error:
+            record(run_folder(), error)
+            raise
+
+    return recording
 
 
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -83,9 +137,7 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _stop(error: Exception) -> NoReturn:
     """Print an error in one line; Hydra wraps those of a constructor, which says more."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, LccError):
-        cause = cause.__cause__
+    cause = input_error(error)
     text = " ".join(str(cause or error).split())
     if isinstance(cause, Interrupted):
         print(f"lcc_rl: {text}", file=sys.stderr)
@@ -99,8 +151,13 @@ def run_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
+def is_sweep() -> bool:
+    """Whether the present job is one of a sweep."""
+    return bool(HydraConfig.get().mode is RunMode.MULTIRUN)
+
+
 def prepare_torch(cfg: DictConfig) -> torch.device:
-    """Check ``seed``, ``threads`` and ``device`` of a study, set the threads, return the device.
+    """Check ``seed``, ``threads`` and ``device`` of a study, set up torch, return the device.
 
     Raises:
         ConfigError: if one of them is of the wrong type or impossible on this machine.
@@ -116,6 +173,7 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
     except (RuntimeError, AssertionError, TypeError) as error:
         raise ConfigError(f"device {cfg.device!r} is not available: {error}") from error
     torch.set_num_threads(cfg.threads)
+    set_precision(cfg.get("matmul_precision", "highest"))
     # TorchRL tells of every buffer it allocates.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     return device

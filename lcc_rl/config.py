@@ -19,6 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from lcc_rl.config_errors import check_keys, explain, refused_key
 from lcc_rl.errors import ConfigError, LccError, unknown_name
 
 TARGET = "_target_"
@@ -51,6 +52,7 @@ class TrainingConfig:
     environments: int = MISSING
     segment: int = MISSING
     checkpoint_every: int = MISSING
+    compiled: bool | None = None
 
 
 @dataclass
@@ -62,6 +64,7 @@ class EvaluationConfig:
     batch_size: int = MISSING
     seed: int = MISSING
     sample_episodes: int = MISSING
+    full_length: bool = False
 
 
 @dataclass
@@ -72,16 +75,21 @@ class StudyConfig:
     seed: int = MISSING
     device: str = MISSING
     threads: int = MISSING
+    matmul_precision: str = "highest"
     data: Any = MISSING
     drivers: Any = MISSING
     split: Any = MISSING
+    leader: Any = None
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)
     agent: Any = MISSING
+    gains: Any = None
+    controller: Any = None
     # Here, not in TrainConfig, so that one recipe serves every entry point.
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    trust: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -89,6 +97,10 @@ class TrainConfig(StudyConfig):
     """``python -m lcc_rl.train``."""
 
     resume: str | None = None
+    sweep: str | None = None
+    objective: Any = "total_net_energy_kj"
+    policy: str | None = None
+    logger: Any = MISSING
 
 
 @dataclass
@@ -135,12 +147,34 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigError: if an override is unknown or of the wrong type.
     """
     try:
-        if GlobalHydra.instance().is_initialized():
-            return compose(entry, overrides=list(overrides))
-        with initialize_config_module(CONF, version_base="1.3"):
-            return compose(entry, overrides=list(overrides))
+        cfg = _compose(entry, overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(str(explained(error, entry, overrides))) from error
+    check_keys(cfg)
+    return cfg
+
+
+def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictConfig:
+    if GlobalHydra.instance().is_initialized():
+        return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+    with initialize_config_module(CONF, version_base="1.3"):
+        return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+
+
+def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Exception:
+    """Return a clearer error for what Hydra refused, naming the nearest option that exists."""
+    key = refused_key(error)
+    hydra = key is not None and key.startswith("hydra.")
+    # What exists may depend on the other overrides: leave out only those that fail.
+    kept, wrong = list(overrides), key
+    while True:
+        kept = [item for item in kept if wrong and wrong not in item]
+        try:
+            return explain(error, _compose(entry, kept, hydra))
+        except (HydraException, OmegaConfBaseException) as next_error:
+            if not kept:
+                return error
+            wrong = refused_key(next_error)
 
 
 def build(node: Any, where: str, **resources: Any) -> Any:

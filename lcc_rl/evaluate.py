@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -12,6 +13,7 @@ from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import load
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
@@ -47,6 +49,8 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+    if cfg.scenario.name == platoon_cases.SCENARIO:
+        return platoon_cases.run(cfg, folder, quiet)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
@@ -54,11 +58,30 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     strategies += [trained(cfg, path, inputs) for path in cfg.compare]
     if own and cfg.variant not in BASELINES:
         strategies.append(studied(cfg, inputs))
+    check_distinct(strategies)
     save_config(cfg, folder)
     episodes = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet:
         write_study_figures(folder)
     return episodes
+
+
+def check_distinct(strategies: Sequence[Strategy]) -> None:
+    """Refuse two policies that no row could tell apart.
+
+    Raises:
+        ConfigError: naming the variant and the seed.
+    """
+    seen = set()
+    for strategy in strategies:
+        key = (strategy.name, strategy.seed)
+        if key in seen:
+            seed = "" if strategy.seed is None else f" with training seed {strategy.seed}"
+            raise ConfigError(
+                f"policy and compare name two policies of variant {strategy.name}{seed}; their "
+                "rows could not be told apart: evaluate them one after the other"
+            )
+        seen.add(key)
 
 
 def baseline(cfg: DictConfig, variant: str, inputs: Inputs) -> Strategy:
@@ -94,7 +117,7 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
             f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
             f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
         )
-    weights, own = load_policy(cfg.policy, cfg.variant)
+    weights, own = load_policy(cfg.policy, cfg.variant, tuple(cfg.trust))
     if own.variant != cfg.variant:
         raise ConfigError(
             f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
@@ -110,7 +133,7 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
 
 def trained(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
     """Build a trained strategy from its policy file, in the scenario under study."""
-    weights, own = load_policy(path)
+    weights, own = load_policy(path, trust=tuple(cfg.trust))
     share_scenario(cfg, own)
     return with_weights(own, weights, own.seed, path, inputs)
 

@@ -6,6 +6,7 @@ import json
 import logging
 import multiprocessing
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -153,8 +154,12 @@ def root_key(override: str) -> str:
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:
     """Keep the overrides that an entry point has settings for."""
-    settings = set(load(entry)) | {"experiment"}
-    return [item for item in overrides if root_key(item) in settings]
+    return [item for item in overrides if root_key(item) in _settings_of(entry)]
+
+
+@cache
+def _settings_of(entry: str) -> frozenset[str]:
+    return frozenset(map(str, load(entry))) | {"experiment"}
 
 
 @entry_point("pipeline")

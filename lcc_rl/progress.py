@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from lcc_rl.results.files import atomic_path
+from lcc_rl.results.states import PROGRESS, read_progress
 
 log = logging.getLogger("lcc_rl")
 
@@ -116,7 +117,7 @@ class ProgressReporter:
             "eta_s": round(remaining, 1),
             **{name: float(f"{value:.6g}") for name, value in values.items()},
         }
-        with atomic_path(self.folder / "progress.json") as temporary:
+        with atomic_path(self.folder / PROGRESS, durable=False) as temporary:
             temporary.write_text(json.dumps(state))
 
 
@@ -136,7 +137,7 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
             due = not console.is_terminal and time.monotonic() - last >= every
             last = time.monotonic() if due else last
             for name, (folder, future) in jobs.items():
-                state = read_state(folder)
+                state = read_progress(folder)
                 if state is None:
                     continue
                 note = f"reward {state.get('reward', 0.0):.4g}  ETA {clock(state['eta_s'])}"
@@ -145,11 +146,3 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
                     log.info("%s: iteration %s/%s  %s", name, state["done"], state["total"], note)
             if any(future.done() and future.exception() for future in futures):
                 return
-
-
-def read_state(folder: Path) -> dict[str, Any] | None:
-    """Return what ``progress.json`` of a run folder says, or None where there is none yet."""
-    try:
-        return dict(json.loads((folder / "progress.json").read_text()))
-    except (OSError, ValueError):
-        return None

@@ -4,78 +4,211 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
+import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lcc_rl.agents import Analytic
 from lcc_rl.agents.analytic import GradientTrainer
+from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.training import Trainer
-from lcc_rl.cli import entry_point, prepare_torch, run_folder
-from lcc_rl.config import require
-from lcc_rl.envs.factory import Inputs, build_agent, build_env, load_inputs
-from lcc_rl.errors import ConfigError
+from lcc_rl.cli import entry_point, is_sweep, prepare_torch, run_folder
+from lcc_rl.config import build, load, require
+from lcc_rl.data.profiles import Profiles, from_records
+from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, load_inputs
+from lcc_rl.envs.factory import learns as learned
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
-from lcc_rl.results.files import write_parquet
+from lcc_rl.pieces.vehicles import Population
+from lcc_rl.results.files import parquet_metadata, read_parquet, write_parquet
+from lcc_rl.results.loggers import Silent
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
+from lcc_rl.results.states import working
 from lcc_rl.results.tables import as_rich, summary
 
 log = logging.getLogger("lcc_rl")
 
+EPISODES = "episodes.parquet"
+# What a sweeper may optimise: columns of the summary that need no other strategy beside them.
+OBJECTIVES = (
+    "kj_per_km",
+    "total_energy_kj",
+    "total_net_energy_kj",
+    "cav_energy_kj",
+    "hdv_energy_kj",
+    "collisions",
+    "min_ttc_s",
+    "share_ttc_unsafe",
+    "share_time_gap_long",
+    "rms_jerk_mps3",
+)
 MEASURED = ("cav_ttc", "cav_time_gap", "cav_power", "hdv_power")
 
 
-def run(cfg: DictConfig, folder: str | Path, quiet: bool = False) -> pd.DataFrame:
+def run(
+    cfg: DictConfig, folder: str | Path, quiet: bool = False, go_on: bool = False
+) -> pd.DataFrame:
     """Train the variant of a configuration, then evaluate it.
 
-    Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt,
-    episodes.parquet and steps.parquet; the first four only where something is learned.
+    Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
+    and, last, episodes.parquet; the first four after config.yaml only where something is learned.
 
     Args:
         cfg: configuration of the entry point ``train``; with ``resume`` the run in that folder
             goes on with its own settings instead.
         folder: where the files go.
         quiet: do not print the table.
+        go_on: go on from a checkpoint of the same configuration where the folder has one.
 
     Returns:
         The rows of episodes.parquet.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
+        LccError: one clear error for whatever is wrong with settings, data or files; it is also
+            left in the folder as error.txt.
     """
     folder, resume = Path(folder), cfg.resume is not None
     if resume:
         folder = Path(cfg.resume)
-        cfg = load_config(folder)
-    elif (folder / "checkpoint.pt").exists():
+        cfg = load_config(folder, tuple(cfg.trust))
+    elif (folder / "checkpoint.pt").exists() and not go_on:
         raise ConfigError(
             f"{folder} already holds a training; go on with resume={folder} or choose another "
             "hydra.run.dir"
         )
+    with working(folder):
+        return _run(cfg, folder, quiet, resume or (folder / "checkpoint.pt").exists())
+
+
+def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFrame:
     prepare_torch(cfg)
-    check_sizes(cfg)
+    check_settings(cfg, folder)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
     save_config(cfg, folder)
-    agent = build_agent(cfg, inputs.population, cfg.device)
-    if agent.learns:
-        env = build_env(
-            cfg, inputs.training, inputs.population, cfg.training.environments, 0, cfg.device
+    agent, seed = build_agent(cfg, inputs.population, cfg.device), cfg.seed
+    if agent.learns and cfg.get("policy") is not None:
+        require(
+            cfg.controller is not None,
+            f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
+            "or say python -m lcc_rl.evaluate to evaluate one",
         )
-        loop = GradientTrainer if isinstance(agent, Analytic) else Trainer
-        trainer = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+        agent, own = platoon_cases.load_learned(cfg, inputs)
+        cfg.agent, seed = own.agent, own.seed
+        save_config(cfg, folder)
+        save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
+    elif agent.learns:
+        trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
         if resume:
             trainer.load()
-        trainer.run()
+        with row_logger(cfg).opened(folder) as trainer.on_row:
+            trainer.run()
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
     else:
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
-    seed = cfg.seed if agent.learns else None
-    strategy = Strategy(cfg.variant, cfg, agent.policy, seed)
+    policy = build_policy(cfg, agent.policy)
+    strategy = Strategy(cfg.variant, cfg, policy, seed if agent.learns else None)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+
+
+def row_logger(cfg: DictConfig) -> Any:
+    """Build what is told every training row; nothing is, in runs from before there was a choice."""
+    node = cfg.get("logger")
+    return Silent() if node is None else build(node, "logger")
+
+
+def make_trainer(
+    cfg: DictConfig, agent: Any, profiles: Profiles, population: Population, folder: Path
+) -> TrainingLoop:
+    """Build the training loop of an agent with its environment."""
+    env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
+    loop = GradientTrainer if isinstance(agent, Analytic) else Trainer
+    return loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+
+
+def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
+    """Bring a run of a sweep to its end: skip it where finished, go on where it stopped."""
+    table = folder / EPISODES
+    if table.exists() and parquet_metadata(table).get("lcc_rl.config") == identity(cfg):
+        log.info("%s: finished before", folder.name)
+        return read_parquet(table)
+    return run(cfg, folder, quiet=True, go_on=True)
+
+
+def objective(cfg: DictConfig, episodes: pd.DataFrame) -> float | list[float]:
+    """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
+    row = summary(episodes).iloc[-1]
+    names = [cfg.objective] if isinstance(cfg.objective, str) else list(cfg.objective)
+    values = [float(row[name]) for name in names]
+    return values[0] if isinstance(cfg.objective, str) else values
+
+
+def check_settings(cfg: DictConfig, folder: Path) -> None:
+    """Check every setting before the data are read, which may take long.
+
+    Everything is built once, around a leader at constant speed.
+
+    Raises:
+        ConfigError: naming the option.
+    """
+    check_sizes(cfg)
+    check_objective(cfg)
+    row_logger(cfg)
+    for key in ("data", "split"):
+        build(cfg[key], key)
+    population = build(cfg.drivers, "drivers")
+    agent = build_agent(cfg, population, cfg.device)
+    check_variant(cfg, agent.learns)
+    trial = cfg.copy()
+    OmegaConf.set_struct(trial, False)
+    if "profile" in trial.scenario.pieces.get("leader", {}):
+        trial.scenario.pieces.leader.profile = None  # the name of a record is known to the data
+    steps = cfg.scenario.horizon + 1
+    speed = torch.full((max(2, steps),), 10.0)
+    profiles = from_records([speed], ["trial"], ["trial"], cfg.scenario.time_step)
+    if agent.learns:
+        make_trainer(trial, agent, profiles, population, folder)
+    else:
+        build_env(trial, profiles, population, 1, 0, cfg.device)
+
+
+def check_variant(cfg: DictConfig, learns: bool) -> None:
+    """Refuse an agent that learns nothing under the name of a variant that is learned.
+
+    Raises:
+        ConfigError: naming both.
+    """
+    if learns:
+        return
+    try:
+        own = load("train", [f"variant={cfg.variant}"])
+    except ConfigError:  # a variant of the user's own, known to this command line only
+        return
+    if learned(own):
+        raise ConfigError(
+            f"variant={cfg.variant} is a learned controller, agent {cfg.agent._target_} learns "
+            "nothing; for a human driver say variant=idm"
+        )
+
+
+def check_objective(cfg: DictConfig) -> None:
+    """Check that ``objective`` names columns of the summary.
+
+    Raises:
+        ConfigError: naming the unknown one.
+    """
+    wanted = cfg.get("objective", OBJECTIVES[0])
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    require(bool(names), "objective is empty: name at least one column of the summary")
+    for name in names:
+        if name not in OBJECTIVES:
+            raise unknown_name("objective", str(name), OBJECTIVES)
 
 
 def check_sizes(cfg: DictConfig) -> None:
@@ -105,6 +238,8 @@ def evaluate_and_write(
     quiet: bool = False,
 ) -> pd.DataFrame:
     """Evaluate strategies on the held-out profiles, write the rows and print the summary."""
+    if cfg.scenario.name == platoon_cases.SCENARIO:
+        return platoon_cases.evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     settings = cfg.evaluation
     results = [
         evaluate(
@@ -122,8 +257,9 @@ def evaluate_and_write(
     metadata = {"lcc_rl.config": identity(cfg)}
     episodes = pd.concat([rows for rows, _ in results], ignore_index=True)
     steps = pd.concat([trace for _, trace in results], ignore_index=True)
-    write_parquet(episodes, folder / "episodes.parquet", metadata)
     write_parquet(steps, folder / "steps.parquet", metadata)
+    # Last: who finds it finds a finished run.
+    write_parquet(episodes, folder / EPISODES, metadata)
     title = (
         f"{len(inputs.evaluation)} held-out profiles × "
         f"{episodes['driver_id'].nunique()} drivers, {cfg.scenario.horizon} steps"
@@ -134,16 +270,19 @@ def evaluate_and_write(
 
 
 @entry_point("train")
-def main(cfg: DictConfig) -> None:
-    """Train into the run's folder."""
-    others = [item for item in HydraConfig.get().overrides.task if not item.startswith("resume=")]
+def main(cfg: DictConfig) -> float | list[float]:
+    """Train into the run's folder; return the objective to a sweeper that optimises."""
+    own = ("resume", "trust")
+    typed = HydraConfig.get().overrides.task
+    others = [item for item in typed if item.split("=")[0] not in own]
     if cfg.resume is not None and others:
         raise ConfigError(
             f"resume goes on with the settings the run was started with; remove {' '.join(others)}"
         )
     folder = Path(cfg.resume) if cfg.resume is not None else run_folder()
-    run(cfg, folder)
+    episodes = complete(cfg, folder) if is_sweep() else run(cfg, folder)
     log.info("results in %s", folder)
+    return objective(cfg, episodes)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.factory import build_env
 
-VARIANTS = ("alcc", "reference", "idm", "direct")
+PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
+VARIANTS = ("alcc", "reference", "idm", "direct", *PLATOON)
 POPULATION = bootstrap()
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import lcc_rl.conf
 import pytest
-from helpers import POPULATION, VARIANTS, compose, wavy_profiles
+from helpers import PLATOON, POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import OmegaConf
 
 from lcc_rl.config import build, config_hash, find_target, load
@@ -49,15 +49,19 @@ def test_every_experiment_composes(entry, experiment) -> None:
 @pytest.mark.parametrize("group", ["split", "drivers", "agent"])
 def test_every_option_of_a_group_builds(group) -> None:
     for option in options(group):
-        node = OmegaConf.create({"x": OmegaConf.load(CONF / group / f"{option}.yaml")}).x
-        node.pop("defaults", None)
+        gains = OmegaConf.load(CONF / "gains" / "tuned.yaml")
+        node = OmegaConf.create(
+            {"gains": gains, "x": OmegaConf.load(CONF / group / f"{option}.yaml")}
+        ).x
         if OmegaConf.missing_keys(node):
             continue
+        node.pop("defaults", None)  # Hydra's business, not the constructor's
         built = build(
             node,
             group,
             population=POPULATION,
             max_acceleration=3.0,
+            time_step=0.2,
             observation_size=7,
             action_size=1,
             seed=0,
@@ -74,8 +78,10 @@ def test_every_recipe_serves_every_variant(experiment, variant) -> None:
 
 
 def test_paper_recipe_is_what_the_defaults_are() -> None:
-    # The recipe exists to be read; it must not drift from the defaults it repeats.
+    # The recipes exist to be read; they must not drift from the defaults they repeat.
     assert config_hash(load("train", ["experiment=paper_alcc"])) == config_hash(load("train"))
+    plain, recipe = ["variant=ddpg"], ["variant=ddpg", "experiment=paper_hcfs"]
+    assert config_hash(load("train", recipe)) == config_hash(load("train", plain))
 
 
 def test_constructor_arguments_and_yaml_are_in_parity() -> None:
@@ -90,10 +96,19 @@ def test_constructor_arguments_and_yaml_are_in_parity() -> None:
         "acceleration",
         "power",
         "reads",
+        "platoon",
+        "leader",
     }
     for variant in VARIANTS:
         cfg = compose(variant)
         nodes = {**cfg.scenario.pieces, **cfg.reward.terms}
+        if variant in PLATOON:
+            own = ("agent", "observation", "leader")
+            nodes |= {f"{group} of {variant}": cfg[group] for group in own}
+            offered |= {"max_acceleration", "learned", "path", "observation_size", "action_size"}
+            offered |= {"seed", "device"}
+        if cfg.controller is not None:
+            nodes["controller"] = cfg.controller
         for name, node in nodes.items():
             signature = set(inspect.signature(find_target(node["_target_"], name)).parameters)
             given = {key for key in node if not key.startswith("_")}

@@ -3,6 +3,7 @@
   python tools/reproduce.py alcc                            # embedded stream, 8 seeds, Table III
   python tools/reproduce.py alcc data=ngsim data.path=...   # real trajectories; any override
   python tools/reproduce.py alcc --recipe smoke --seeds 1   # everything once, in seconds
+  python tools/reproduce.py hcfs                            # the platoon: 8 DDPG parents, hybrids
   python tools/reproduce.py report outputs/alcc             # tables, figures and page, from parquet
 
 The same command goes on where it stopped: what is finished is skipped, a training that was
@@ -15,17 +16,19 @@ import argparse
 import logging
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from lcc_rl.cli import main_guard
 from lcc_rl.errors import ConfigError
-from lcc_rl.studies import alcc, alcc_report
-from lcc_rl.studies.runner import FINISHED, note, read_notes
+from lcc_rl.studies import alcc, alcc_report, hcfs, hcfs_report
+from lcc_rl.studies.runner import FINISHED, Outcome, note, read_notes
 
 log = logging.getLogger("lcc_rl")
 
 # What turns a study's folder into its page.
-REPORTS = {"alcc": alcc_report.write_results}
+REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 
 def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
@@ -42,7 +45,26 @@ def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
     )
     note(study.folder, "alcc", command)
     outcomes = alcc.run(study, arguments.parts)
-    page = alcc_report.write_results(study.folder)
+    return concluded(outcomes, alcc_report.write_results(study.folder))
+
+
+def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
+    """Run the HCFS study and write its page; 1 if a training failed."""
+    study = hcfs.Study(
+        folder=arguments.out,
+        recipe=arguments.recipe,
+        seeds=arguments.seeds,
+        overrides=tuple(arguments.overrides),
+        jobs=arguments.jobs,
+        accept=tuple(arguments.accept),
+    )
+    note(study.folder, "hcfs", command)
+    outcomes = hcfs.run(study)
+    return concluded(outcomes, hcfs_report.write_results(study.folder))
+
+
+def concluded(outcomes: Sequence[Outcome], page: Path) -> int:
+    """Say what became of the trainings; 1 if one failed."""
     wrong = [outcome for outcome in outcomes if outcome.status != FINISHED]
     for outcome in wrong:
         log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
@@ -62,20 +84,30 @@ def parser() -> argparse.ArgumentParser:
     form = argparse.RawDescriptionHelpFormatter
     top = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     commands = top.add_subparsers(required=True)
-    one = commands.add_parser("alcc", help="Adaptive Leading Cruise Control (arXiv 2210.02147)")
+    one = study_parser(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
     one.set_defaults(run=reproduce_alcc)
-    one.add_argument("--out", type=Path, default=Path("outputs/alcc"), help="the study's folder")
-    one.add_argument("--seeds", type=int, default=8, help="trainings of every variant")
-    one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
-    one.add_argument("--recipe", default="paper_alcc", help="experiment: paper_alcc, quickstart …")
     listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
     listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(alcc.ABLATIONS))
     one.add_argument("--profiles", type=int, default=4, help="profiles of the part single")
-    listing(one, "--accept", (), "settings in which runs found in the folder may differ: data,…")
+    two = study_parser(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
+    two.set_defaults(run=reproduce_hcfs)
     again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
     again.set_defaults(run=rewrite, overrides=[])
     again.add_argument("folder", type=Path)
     return top
+
+
+def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add the subcommand of a study, with the options that every study has."""
+    one: argparse.ArgumentParser = commands.add_parser(name, help=text)
+    folder = Path("outputs") / name
+    one.add_argument("--out", type=Path, default=folder, help="the study's folder")
+    one.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
+    one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
+    recipe = f"paper_{name}"
+    one.add_argument("--recipe", default=recipe, help=f"experiment: {recipe}, quickstart …")
+    listing(one, "--accept", (), "settings in which runs found in the folder may differ: data,…")
+    return one
 
 
 def listing(

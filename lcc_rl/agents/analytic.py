@@ -228,7 +228,7 @@ class GradientTrainer(TrainingLoop):
     def _source(self) -> Unrolled:
         compiled = self.agent.compiled
         if compiled is None:
-            compiled = self.iterations - self.iteration >= WORTH_COMPILING
+            compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
         return Unrolled(
             self.env,
             wanted=[key for term, _ in self.objective for key in term.in_keys],

@@ -12,7 +12,7 @@ import math
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -87,6 +87,8 @@ class TrainingLoop(ABC):
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
         self.times: list[dict[str, float]] = []
+        # Told every row as it appears; see lcc_rl.results.loggers.
+        self.on_row: Callable[[dict[str, float]], None] = lambda row: None
 
     @abstractmethod
     def _source(self) -> Any:
@@ -111,6 +113,7 @@ class TrainingLoop(ABC):
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
                 row = self._iterate(source)
+                self.on_row(row)
                 progress.update(
                     self.iteration, {"reward": row["episode_reward"], "loss": row[self.watched]}
                 )
@@ -133,9 +136,11 @@ class TrainingLoop(ABC):
         """
         for name, value in row.items():
             if not math.isfinite(value):
+                good = self.folder / "checkpoint.pt"
+                state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
                 raise Diverged(
                     f"{name} became {value} in iteration {self.iteration} of {self.iterations}; "
-                    f"the last good state is in {self.folder / 'checkpoint.pt'}. {self.advice}"
+                    f"{state}. {self.advice}"
                 )
         self.rows.append(row)
         times = {"iteration": row["iteration"], "collect_s": collect_s, "learn_s": learn_s}
@@ -193,7 +198,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     """Summarise the first episode of every slot of a batch ``[environments, steps]``.
 
     A collision ends an episode early; what the collector appends after it belongs to another
-    episode and is left out.
+    episode and is left out. The followers of a platoon are added up.
 
     Returns:
         Mean sums per episode of the reward and of every term, and the number of collisions.
@@ -202,6 +207,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     alive = (done.cumsum(1) - done == 0).unsqueeze(-1)
 
     def per_episode(entry: Tensor) -> float:
+        entry = entry.flatten(2).sum(-1, keepdim=True)
         return float((entry * alive).sum(1).double().mean())
 
     terms = batch["next", "reward_terms"]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 
@@ -16,6 +16,7 @@ from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.config import TrainingConfig
+from lcc_rl.envs.stepping import Segments
 from lcc_rl.policies import GaussianExploration
 
 LEARNED_FROM = (
@@ -26,6 +27,9 @@ LEARNED_FROM = (
     ("next", "done"),
     ("next", "terminated"),
 )
+
+# Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
+WORTH_COMPILING = 40_000
 
 
 class Trainer(TrainingLoop):
@@ -52,17 +56,21 @@ class Trainer(TrainingLoop):
             generator=self.sampler,
         )
 
-    def _source(self) -> Collector:
+    def _source(self) -> Segments:
         policy = TensorDictSequential(self.agent.policy, self.exploration)
-        return Collector(
-            self.env,
-            policy,
-            frames_per_batch=self.env.batch_size[0] * self.settings.segment,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
-        )
+        keys = (*LEARNED_FROM, *REPORTED)
+        return Segments(self.env, policy, self.settings.segment, keys, self._compiled())
 
-    def _iterate(self, collector: Collector) -> dict[str, float]:
+    def _compiled(self) -> bool:
+        """Whether to compile the environment: if left open, where the whole training pays for it.
+
+        The whole, not what remains, so that a resumed training computes what it would have.
+        """
+        if self.settings.compiled is not None:
+            return self.settings.compiled
+        return self.iterations * self.horizon >= WORTH_COMPILING
+
+    def _iterate(self, collector: Segments) -> dict[str, float]:
         """Play one batch of episodes, learning after every segment of them."""
         sigma = self.agent.exploration.sigma(self.iteration / self.iterations)
         self.exploration.sigma.fill_(sigma)
@@ -74,19 +82,21 @@ class Trainer(TrainingLoop):
         for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             batch = next(segments)
-            self.buffer.extend(batch.select(*LEARNED_FROM).reshape(-1))
+            new = transitions(batch)
+            self.buffer.extend(new)
             played.append(batch.select(*REPORTED))
             collected = time.perf_counter()
-            before = (self.iteration * self.horizon + part * batch.shape[1]) * batch.shape[0]
-            losses.append(self._learn(before, batch.numel()))
+            before = self.iteration * (self.horizon // self.settings.segment) + part
+            losses.append(self._learn(before * len(new), len(new)))
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         episodes = torch.cat(played, dim=1)
+        learned = len(new) * len(played)
         self.iteration += 1
         row = {
             "iteration": float(self.iteration),
             "episodes": float(self.iteration * self.env.batch_size[0]),
-            "transitions": float(self.iteration * episodes.numel()),
+            "transitions": float(self.iteration * learned),
             "updates": float(self.updates),
             "exploration_sigma": sigma,
             **episode_statistics(episodes),
@@ -112,3 +122,19 @@ class Trainer(TrainingLoop):
     def _remember(self, memory: dict[str, Any]) -> None:
         self.buffer.load_state_dict(memory["buffer"])
         self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
+
+
+def transitions(batch: TensorDictBase) -> TensorDictBase:
+    """Return what is learned from a batch ``[environments, steps]``, one transition a row.
+
+    In a platoon every follower's is a transition of its own, ``[environments × steps ×
+    followers]``; all of them end when the episode does.
+    """
+    batch = batch.select(*LEARNED_FROM)
+    reward = batch["next", "reward"]
+    shape = reward.shape[:-1]
+    if len(shape) == batch.ndim:
+        return batch.reshape(-1)
+    for key in (("next", "done"), ("next", "terminated")):
+        batch.set(key, batch[key].unsqueeze(-2).expand(reward.shape))
+    return batch.auto_batch_size_(len(shape)).reshape(-1)

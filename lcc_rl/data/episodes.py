@@ -92,7 +92,8 @@ def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
         raise _at(source, frame["recording"].isna(), "recording", "is blank; expected a name")
     for name in SPEEDS:
         _check_speed(frame[name], source)
-    _check_positive(frame["leader_length_m"] >= 0, "leader_length_m", source)
+    for name in ("leader_length_m", "gap_m"):
+        _check_positive(frame[name] >= 0, name, source)
     _check_episodes(frame, source)
     return frame.astype({**SCHEMA, "recording": str})
 

@@ -68,15 +68,17 @@ class Profiles:
         ]
         if not cuts:
             raise DataError(self._too_short(horizon))
-        if limit is not None and limit < len(cuts):
-            keep = np.linspace(0, len(cuts) - 1, limit).round().astype(int)
-            cuts = [cuts[i] for i in keep]
+        cuts = [cuts[i] for i in evenly(len(cuts), limit)]
         return from_records(
             [self.record(i)[start : start + horizon + 1] for i, start in cuts],
             [f"{self.names[i]}+{start * self.time_step:g}s" for i, start in cuts],
             [self.recordings[i] for i, _ in cuts],
             self.time_step,
         )
+
+    def spread(self, limit: int | None) -> Profiles:
+        """Return at most ``limit`` of the records, spread evenly; None for all."""
+        return self.select(evenly(len(self), limit))
 
     def at_least(self, horizon: int) -> Profiles:
         """Return the records that hold at least ``horizon`` steps.
@@ -96,6 +98,13 @@ class Profiles:
             f"{longest} steps ({longest * self.time_step:g} s), an episode needs {horizon} "
             f"({horizon * self.time_step:g} s); lower scenario.horizon or give longer data"
         )
+
+
+def evenly(count: int, limit: int | None) -> list[int]:
+    """Return at most ``limit`` of the indices below ``count``, spread evenly; None for all."""
+    if limit is None or limit >= count:
+        return list(range(count))
+    return [int(i) for i in np.linspace(0, count - 1, limit).round()]
 
 
 def from_records(

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import TARGET, build, find_target, load, plain
+from lcc_rl.data.cycles import Case
 from lcc_rl.data.profiles import Profiles, leader_profiles
-from lcc_rl.envs.clock import Clock
+from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Piece, TotalReward
-from lcc_rl.pieces.base import SEED, STEP, Transition, arrived
+from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
 from lcc_rl.pieces.vehicles import Population
 
 
@@ -29,12 +30,16 @@ class Inputs:
         evaluation: speed profiles held out, as windows of one horizon.
         population: the human drivers.
         report: what was read and dropped, as plain lines.
+        cases: runs of a platoon that are looked at closely.
+        full_length: a whole record for a platoon; None for none.
     """
 
     training: Profiles
     evaluation: Profiles
     population: Population
     report: tuple[str, ...] = ()
+    cases: tuple[Case, ...] = ()
+    full_length: Case | None = None
 
 
 def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
@@ -47,6 +52,8 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     Raises:
         DataError, ConfigError: naming the file, row or option at fault.
     """
+    if cfg.get("leader") is not None:
+        return _platoon_inputs(cfg)
     report: Sequence[str] = ()
     if episodes is None:
         loaded = build(cfg.data, "data").load()
@@ -54,11 +61,34 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     scenario = cfg.scenario
     profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
     training, evaluation = build(cfg.split, "split")(profiles)
+    windows = evaluation.windows(scenario.horizon, cfg.evaluation.profiles)
+    population = build(cfg.drivers, "drivers")
+    available = {"profiles": len(windows), "drivers": len(population.time_gap)}
+    return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
+
+
+def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
+    """Return a line for everything that an evaluation asks more of than there is."""
+    return [
+        f"evaluation.{name}={cfg.evaluation[name]}: only {count} are available; taking all"
+        for name, count in available.items()
+        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count
+    ]
+
+
+def _platoon_inputs(cfg: DictConfig) -> Inputs:
+    """Read the records that a platoon's leader drives."""
+    scenario = cfg.scenario
+    leaders = build(cfg.leader, "leader").load(
+        scenario.time_step, scenario.horizon, scenario.followers
+    )
     return Inputs(
-        training,
-        evaluation.windows(scenario.horizon, cfg.evaluation.profiles),
+        leaders.training.at_least(scenario.horizon),
+        leaders.windows.spread(cfg.evaluation.profiles),
         build(cfg.drivers, "drivers"),
-        tuple(report),
+        leaders.report,
+        leaders.cases,
+        leaders.full_length,
     )
 
 
@@ -102,10 +132,13 @@ def build_env(
         build(node, f"reward.terms.{name}", name=name, **resources)
         for name, node in cfg.reward.terms.items()
     ]
-    pieces.append(TotalReward(list(cfg.reward.terms)))
+    moved = [piece.event_shape for piece in pieces if ("action",) in map(arrived, piece.in_keys)]
+    action_shape = moved[0] if moved else (1,)
+    # What is rewarded is what acts: one car, or every follower of a platoon.
+    pieces.append(TotalReward(list(cfg.reward.terms), action_shape))
     _check_wiring(pieces)
-    clock = Clock(scenario.horizon, batch_size, seed=seed, device=device)
-    env = TransformedEnv(clock, Compose(*pieces))
+    clock = Clock(scenario.horizon, batch_size, action_shape, seed, device)
+    env = Traffic(clock, Pieces(*pieces))
     return env.to(device) if device is not None else env
 
 
@@ -144,18 +177,39 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         # A recipe's learning settings mean nothing to those that do not learn.
         known = inspect.signature(find_target(node[TARGET], "agent")).parameters
         node = {key: value for key, value in node.items() if key in known or key == TARGET}
-    cav = cfg.scenario.pieces.get("cav")
+    vehicle = cfg.scenario.pieces.get("cav") or cfg.scenario.pieces.get("platoon")
     observation: Piece = build(cfg.observation, "observation")
     return build(
         node,
         "agent",
         population=population,
-        observation_size=observation.event_shape[0],
+        observation_size=observation.event_shape[-1],
         action_size=1,
-        max_acceleration=cav.max_acceleration if cav is not None else 1.0,
+        max_acceleration=vehicle.max_acceleration if vehicle is not None else 1.0,
         seed=cfg.seed,
         time_step=cfg.scenario.time_step,
         device=device,
+    )
+
+
+def build_policy(cfg: DictConfig, learned: Any) -> Any:
+    """Build what drives: the agent's policy, or the controller composed with it.
+
+    Args:
+        cfg: configuration of a study; its node ``controller`` may be null.
+        learned: the policy of the agent.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    if cfg.get("controller") is None:
+        return learned
+    return build(
+        cfg.controller,
+        "controller",
+        learned=learned,
+        time_step=cfg.scenario.time_step,
+        max_acceleration=cfg.scenario.pieces.platoon.max_acceleration,
     )
 
 

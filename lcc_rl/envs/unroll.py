@@ -54,11 +54,11 @@ class Unrolled:
         pieces: list[Piece] = list(env.transform)
         graded = {as_tuple(key) for key in wanted} | {OBSERVATION}
         every = graded | {as_tuple(key) for key in observed} | {TERMINATED}
-        needed, self.graded = _closure(pieces, every), _closure(pieces, graded)
+        needed, self.graded = closure(pieces, every), closure(pieces, graded)
         recurrent = [piece for piece in needed if _is_recurrent(piece)]
-        inside = _closure(needed, {OBSERVATION}, recurrent)
+        inside = closure(needed, {OBSERVATION}, recurrent)
         self.after = [piece for piece in needed if piece not in inside]
-        self.steps = [_as_function(piece, piece in self.graded) for piece in inside]
+        self.steps = [as_function(piece, piece in self.graded) for piece in inside]
         self.carried = {SEED, STEP, *_written(inside)}
         entries = {arrived(key) for piece in needed for key in piece.in_keys} | every
         self.recorded = sorted(entries & {*self.carried, ACTION})
@@ -143,9 +143,7 @@ def _is_recurrent(piece: Piece) -> bool:
     return bool(past & _written([piece]))
 
 
-def _closure(
-    pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()
-) -> list[Piece]:
+def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
     """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
     kept = list(chosen)
     keys = set(wanted) | {arrived(key) for piece in kept for key in piece.in_keys}
@@ -157,7 +155,7 @@ def _closure(
     return [piece for piece in pieces if piece in kept]
 
 
-def _as_function(piece: Piece, graded: bool) -> Callable[[State, State], None]:
+def as_function(piece: Piece, graded: bool) -> Callable[[State, State], None]:
     """Return a piece as a function that reads two moments and writes into the second."""
     transition = isinstance(piece, Transition)
     sources = [(not transition or as_tuple(k)[0] == NEXT, arrived(k)) for k in piece.in_keys]

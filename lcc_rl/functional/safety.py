@@ -22,10 +22,8 @@ def time_to_collision(
     """
     closing = approach_rate > 0.0
     # where() on both sides of the division keeps the gradient free of 0·inf.
-    rate = torch.where(closing, approach_rate, torch.ones_like(approach_rate))
-    time = (gap / rate).clamp(floor, ceiling)
-    time = torch.where(closing, time, torch.full_like(time, ceiling))
-    return torch.where(gap <= 0.0, torch.full_like(time, floor), time)
+    time = (gap / torch.where(closing, approach_rate, 1.0)).clamp(floor, ceiling)
+    return torch.where(gap <= 0.0, floor, torch.where(closing, time, ceiling))
 
 
 def time_gap(gap: Tensor, speed: Tensor, speed_floor: float = 1.0, ceiling: float = 1e3) -> Tensor:

@@ -4,14 +4,17 @@ from lcc_rl.pieces.base import Feature, Piece, RewardPiece, Transition
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, Observation, TimeGap, TimeToCollision
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
-from lcc_rl.pieces.leader import NGSIMLeader
+from lcc_rl.pieces.leader import NGSIMLeader, PlatoonLeader
+from lcc_rl.pieces.platoon import PlatoonErrors, PlatoonMotion, PlatoonObservation
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
     EnergyReward,
+    JerkReward,
     RewardTerm,
     SafetyReward,
     TotalReward,
+    VelocityReward,
 )
 from lcc_rl.pieces.surrogates import SmoothEfficiency, Smoothness, SmoothSafety
 from lcc_rl.pieces.termination import Collision
@@ -26,12 +29,17 @@ __all__ = [
     "EnergyReward",
     "Feature",
     "IDMFollower",
+    "JerkReward",
     "LeaderPreview",
     "MotorPower",
     "NGSIMLeader",
     "Observation",
     "ObservationMemory",
     "Piece",
+    "PlatoonErrors",
+    "PlatoonLeader",
+    "PlatoonMotion",
+    "PlatoonObservation",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
@@ -42,4 +50,5 @@ __all__ = [
     "TimeToCollision",
     "TotalReward",
     "Transition",
+    "VelocityReward",
 ]

@@ -15,11 +15,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.base import NO_DEFAULT
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform
 
 NEXT = "next"
 # Written by the clock: the seed from which everything random in an episode follows, and its step.
@@ -45,6 +46,23 @@ def arrived(key: NestedKey) -> tuple[str, ...]:
     return key[1:] if key[0] == NEXT else key
 
 
+def as_sequence(values: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
+    """Return what :meth:`Piece.compute` returned as a sequence, also where it is one tensor."""
+    return (values,) if isinstance(values, Tensor) else values
+
+
+def peek(source: Any, key: tuple[str, ...]) -> Tensor:
+    """Return an entry, past TensorDict's checks of the key, which cost as much as the physics."""
+    for part in key:
+        source = source._get_str(part, NO_DEFAULT)
+    return source
+
+
+def put(target: TensorDictBase, key: tuple[str, ...], value: Tensor) -> None:
+    """Set an entry of an environment's own TensorDict, past the checks of shape and device."""
+    target._set_tuple(key, value, inplace=False, validated=True, non_blocking=False)
+
+
 class Piece(TensorDictModuleBase, Transform):
     """Base of all pieces; see the module's description.
 
@@ -66,6 +84,7 @@ class Piece(TensorDictModuleBase, Transform):
         super().__init__(
             in_keys=[as_tuple(key) for key in reads], out_keys=[as_tuple(key) for key in writes]
         )
+        self._entries, self._results = list(map(as_tuple, reads)), list(map(as_tuple, writes))
         self.event_shape = tuple(event_shape)
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
@@ -76,18 +95,10 @@ class Piece(TensorDictModuleBase, Transform):
     @dispatch(auto_batch_size=False)  # entries of followers have one dimension more
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
-        entries = [tensordict.get(key) for key in self.in_keys]
-        self._write(tensordict, self.compute(*entries))
+        values = self.compute(*(tensordict.get(key) for key in self.in_keys))
+        for key, value in zip(self.out_keys, as_sequence(values), strict=True):
+            tensordict.set(key, value)
         return tensordict
-
-    def _write(
-        self, target: TensorDictBase, values: Any, keys: Sequence[Any] | None = None
-    ) -> None:
-        keys = self.out_keys if keys is None else keys
-        if isinstance(values, Tensor):
-            values = (values,)
-        for key, value in zip(keys, values, strict=True):
-            target.set(key, value)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         # TorchRL's own version insists on finding the out_keys literally in the specs, which
@@ -116,7 +127,10 @@ class Feature(Piece):
     """A piece that looks at one moment, at reset as well as after every step."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return Piece.forward(self, next_tensordict)
+        values = self.compute(*[peek(next_tensordict, key) for key in self._entries])
+        for key, value in zip(self._results, as_sequence(values), strict=True):
+            put(next_tensordict, key, value)
+        return next_tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -168,11 +182,13 @@ class Transition(Piece):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = [
-            (next_tensordict if late else tensordict).get(key) for late, key in self._sources
+            peek(next_tensordict if late else tensordict, key) for late, key in self._sources
         ]
-        self._write(next_tensordict, self.compute(*entries), self._arrival_keys)
+        values = as_sequence(self.compute(*entries))
+        for key, value in zip(self._arrival_keys, values, strict=True):
+            put(next_tensordict, key, value)
         for key in self.constants:
-            next_tensordict.set(key, tensordict.get(key))
+            put(next_tensordict, key, peek(tensordict, key))
         return next_tensordict
 
     def _reset(
@@ -193,6 +209,44 @@ class Transition(Piece):
         for key in self.choices:
             state_spec[key] = constants[key]
         return state_spec
+
+
+class Pieces(Compose):
+    """The pieces of an environment in the order in which they act.
+
+    No piece has an inverse, changes the device or the size of the batch, or looks at what a step
+    leaves behind. TorchRL asks for all this at every step; here only other transforms, which a
+    user may append, are asked.
+    """
+
+    def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Apply the inverse of what is not a piece, last first."""
+        tensordict = tensordict.copy()
+        for transform in reversed(self._others()):
+            tensordict = transform._inv_call(tensordict)
+        return tensordict
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        for transform in self._others():
+            tensordict, tensordict_ = transform._post_step_mdp_hooks(tensordict, tensordict_)
+        return tensordict, tensordict_
+
+    def transform_env_device(self, device: torch.device) -> torch.device:
+        """Return the device of the environment."""
+        for transform in self._others():
+            device = transform.transform_env_device(device)
+        return device
+
+    def transform_env_batch_size(self, batch_size: torch.Size) -> torch.Size:
+        """Return the size of the environment's batch."""
+        for transform in self._others():
+            batch_size = transform.transform_env_batch_size(batch_size)
+        return batch_size
+
+    def _others(self) -> list[Transform]:
+        return [transform for transform in self.transforms if not isinstance(transform, Piece)]
 
 
 class RewardPiece(Feature):

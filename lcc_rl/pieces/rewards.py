@@ -33,6 +33,9 @@ class RewardTerm(RewardPiece):
     Args:
         name: name of the term; the key under ``reward.terms`` in the configuration.
         weight: factor of the term; 0 takes it out.
+        reads: entries read, where they depend on settings.
+        event_shape: shape of the term after the batch dimensions; ``(followers, 1)`` where every
+            follower of a platoon earns its own.
 
     Raises:
         ConfigError: if the weight is not a finite number.
@@ -43,11 +46,15 @@ class RewardTerm(RewardPiece):
     reward: Callable[..., Tensor]
 
     def __init__(
-        self, name: str, weight: float = 1.0, reads: Sequence[NestedKey] | None = None
+        self,
+        name: str,
+        weight: float = 1.0,
+        reads: Sequence[NestedKey] | None = None,
+        event_shape: Sequence[int] = (1,),
     ) -> None:
         if not math.isfinite(weight):
             raise ConfigError(f"reward.terms.{name}.weight must be finite, got {weight}")
-        super().__init__(self.reads if reads is None else reads, [(TERMS, name)])
+        super().__init__(self.reads if reads is None else reads, [(TERMS, name)], event_shape)
         self.name, self.weight = name, weight
 
     def compute(self, *entries: Tensor) -> Tensor:
@@ -172,21 +179,82 @@ class CollisionPenalty(RewardTerm):
         return -terminated.to(torch.float32)
 
 
+class VelocityReward(RewardTerm):
+    """−|e_v(i,0)|/v_max of every follower of a platoon, at the state reached (HCFS H4–H5).
+
+    Args:
+        name, weight: see :class:`RewardTerm`; ω1.
+        speed_scale: v_max [m/s].
+        followers: followers of the platoon.
+        platoon: its namespace.
+    """
+
+    def __init__(
+        self,
+        name: str = "velocity",
+        weight: float = 10.0,
+        speed_scale: float = 27.1,
+        followers: int = 1,
+        platoon: str = "platoon",
+    ) -> None:
+        if not speed_scale > 0:
+            raise ConfigError(
+                f"reward.terms.{name}.speed_scale must be positive, got {speed_scale}"
+            )
+        super().__init__(name, weight, [(platoon, "leader_speed_error")], (followers, 1))
+        self.speed_scale = speed_scale
+
+    def reward(self, speed_error: Tensor) -> Tensor:
+        """Return the unweighted term, ``[*batch, followers, 1]``."""
+        return -speed_error.abs() / self.speed_scale
+
+
+class JerkReward(RewardTerm):
+    """−|jerk|/(2 a_max/T) of every follower of a platoon (HCFS H6).
+
+    Args:
+        name, weight: see :class:`RewardTerm`; ω2.
+        jerk_scale: 2 a_max/T [m/s³].
+        followers: followers of the platoon.
+        platoon: its namespace.
+    """
+
+    def __init__(
+        self,
+        name: str = "jerk",
+        weight: float = 0.036,
+        jerk_scale: float = 30.0,
+        followers: int = 1,
+        platoon: str = "platoon",
+    ) -> None:
+        if not jerk_scale > 0:
+            raise ConfigError(f"reward.terms.{name}.jerk_scale must be positive, got {jerk_scale}")
+        super().__init__(name, weight, [(platoon, "jerk")], (followers, 1))
+        self.jerk_scale = jerk_scale
+
+    def reward(self, jerk: Tensor) -> Tensor:
+        """Return the unweighted term, ``[*batch, followers, 1]``."""
+        return -jerk.abs() / self.jerk_scale
+
+
 class TotalReward(RewardPiece):
     """Writes ``"reward"``: the sum of all terms (A17, A19).
 
     Args:
         terms: the terms, by name.
+        event_shape: shape of the reward after the batch dimensions; that of the terms.
 
     Raises:
         ConfigError: if there is no term.
     """
 
-    def __init__(self, terms: Sequence[str] | Mapping[str, object]) -> None:
+    def __init__(
+        self, terms: Sequence[str] | Mapping[str, object], event_shape: Sequence[int] = (1,)
+    ) -> None:
         names = list(terms)
         if not names:
             raise ConfigError("reward.terms is empty: an environment needs at least one term")
-        super().__init__([(TERMS, name) for name in names], [REWARD])
+        super().__init__([(TERMS, name) for name in names], [REWARD], event_shape)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -59,6 +60,9 @@ class GaussianExploration(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the noisy action."""
         action, seed, step = (tensordict.get(key) for key in self.in_keys)
-        columns = torch.arange(action.shape[-1], device=action.device)
-        noise = normal(seed, step, self.stream + columns)
+        # One action per episode, [*batch, n], or one per follower of a platoon, [*batch, N, n].
+        event = action.shape[tensordict.ndim :]
+        seed, step = (x.view(*x.shape[:-1], *(1 for _ in event)) for x in (seed, step))
+        entries = torch.arange(math.prod(event), device=action.device).view(event)
+        noise = normal(seed, step, self.stream + entries)
         return tensordict.set("action", (action + self.sigma * noise).clamp(-1.0, 1.0))

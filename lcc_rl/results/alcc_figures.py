@@ -18,7 +18,7 @@ from lcc_rl.results.alcc_tables import (
 )
 from lcc_rl.results.drawing import new_figure
 from lcc_rl.results.study_figures import colour, draw_curve, style
-from lcc_rl.results.tables import HUMANS, paired, per_seed
+from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
 
 INK, SOFT = "#222222", "#8a8a8a"
 TERMS = {
@@ -62,13 +62,15 @@ def reward_terms(training: pd.DataFrame) -> Figure:
     axes = np.atleast_1d(figure.subplots(lines, columns, sharex=True)).ravel()
     labels: dict[str, str] = {}
     for axis, (name, label) in zip(axes, shown.items(), strict=False):
-        floor = 0.0
+        floor, top = 0.0, 0.0
         for variant, rows in training.groupby("variant", sort=False):
             if rows[name].isna().all():
                 continue
             line, labels[str(variant)] = draw_curve(axis, rows, name, str(variant))
             floor = min(floor, float(line.iloc[len(line) // 5 :].min()))
-        axis.set_ylim(1.6 * floor - 0.2, None)
+            top = max(top, float(line.max()))
+        # As in the learning curve: the first, random episodes would set the scale.
+        axis.set_ylim(1.5 * floor - 0.2, top + 0.05 * (top - floor) + 0.05)
         style(axis, "", "")
         axis.set_title(label, fontsize=10)
     for axis in axes[len(shown) :]:
@@ -115,7 +117,7 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
     axis.annotate(
         f"{values.mean():.1f}",
         (values.mean(), place),
-        xytext=(0, 11),
+        xytext=(0, 13),
         textcoords="offset points",
         ha="center",
         fontsize=8,
@@ -127,24 +129,18 @@ def generalization_figure(
 ) -> Figure:
     """Saving of total energy on every held-out profile, beside the paper's four (Fig. 12)."""
     table = generalization(episodes, strategy, baseline).sort_values("saving_pct")
+    values, places = table["saving_pct"].to_numpy(float), np.arange(len(table))
     figure = new_figure(9.0, 4.0)
     axis = figure.subplots()
-    places = np.arange(len(table))
-    values = table["saving_pct"].to_numpy(float)
     _whiskers(axis, places, table, "saving_pct", colour(strategy), upright=True)
     axis.plot(places, values, "o", color=colour(strategy), label=_label(episodes, strategy))
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
     axis.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label="paper, 4 profiles")
     axis.axhline(0.0, color=INK, lw=0.8)
-    axis.axhline(values.mean(), color=colour(strategy), lw=0.8, ls="--")
-    axis.annotate(
-        f"mean {values.mean():+.1f} %",
-        (0.01, values.mean()),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        color=colour(strategy),
-    )
+    together = 100 * savings(episodes, "total_energy_kj", strategy, baseline).value
+    line = f"all profiles together {together:+.1f} %"
+    axis.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
+    _cut_outliers(axis, places, values)
     axis.set_xticks([])
     style(
         axis,
@@ -153,6 +149,24 @@ def generalization_figure(
     )
     axis.legend(frameon=False, loc="upper left")
     return figure
+
+
+def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
+    """Scale an axis by the bulk of its values, and write those beyond it at its border."""
+    limit = 2.0 * max(float(np.percentile(np.abs(values), 85)), max(PAPER_GENERALIZATION))
+    axis.set_ylim(-limit, limit)
+    for place, value in zip(places, values, strict=True):
+        if abs(value) > limit:
+            up = value > 0
+            axis.annotate(
+                f"{value:+.0f} % {'▲' if up else '▼'}",
+                (place, limit if up else -limit),
+                xytext=(-4, 0),
+                textcoords="offset points",
+                ha="right",
+                va="top" if up else "bottom",
+                fontsize=8,
+            )
 
 
 def _label(episodes: pd.DataFrame, strategy: str) -> str:
@@ -224,7 +238,7 @@ def single_profile_figure(episodes: pd.DataFrame) -> Figure:
         episodes: rows of the evaluations, with the column ``study_profile``.
     """
     groups = dict(iter(episodes.groupby("study_profile", sort=True)))
-    figure = new_figure(max(6.0, 1.8 + 1.4 * len(groups)), 4.0)
+    figure = new_figure(max(7.5, 1.8 + 1.9 * len(groups)), 4.2)
     axis = figure.subplots()
     seen: set[str] = set()
     for place, part in enumerate(groups.values()):
@@ -240,11 +254,21 @@ def single_profile_figure(episodes: pd.DataFrame) -> Figure:
             axis.plot(jitter, values, "o", color=colour(strategy), ms=5, alpha=0.6, mew=0)
             axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=colour(strategy), lw=2)
             _once(axis, seen, strategy, f"{strategy}: seeds and mean", "o")
-    axis.set_xticks(range(len(groups)), [f"profile {name!s}" for name in groups])
-    axis.set_ylim(bottom=0.0)
+    labels = [f"profile {name!s}\n{_gain(part)}" for name, part in groups.items()]
+    axis.set_xticks(range(len(groups)), labels, fontsize=9)
+    axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
     style(axis, "profile used for training and evaluation", "total energy [kJ per episode]")
     figure.legend(loc="outside upper center", frameon=False, ncols=3)
     return figure
+
+
+def _gain(episodes: pd.DataFrame) -> str:
+    """Write what regard for the driver behind brings on one profile."""
+    energy = per_seed(episodes, "total_energy_kj")
+    if not {"alcc", "reference"} <= set(energy):
+        return ""
+    # Not a percentage: in a jam a profile's energy can be near zero.
+    return f"alcc {energy['alcc'].mean() - energy['reference'].mean():+.1f} kJ\nagainst reference"
 
 
 def _once(axis: Axes, seen: set[str], strategy: str, label: str, mark: str) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,17 @@ import torch
 from lcc_rl.errors import ResultsError
 
 SCHEMA_VERSION = "1"
+# From a version to the next: whoever raises SCHEMA_VERSION adds what older tables need.
+MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
+def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that replaces it only when the block succeeds.
 
     Args:
         path: the final path; its folder is made where it does not exist.
+        durable: survive a power cut, too; False for what is cheap to lose.
 
     Raises:
         ResultsError: if the file cannot be written (disk full, folder read-only …); what stood
@@ -34,14 +38,34 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
+        if durable:
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
+        if durable:
+            _sync_folder(path.parent)
     except OSError as error:
         raise ResultsError(f"{path}: cannot be written: {error}") from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in a folder survive a power cut, where the system lets folders be synced."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of writers that were killed; none may be writing now."""
+    for path in folder.glob(".*.tmp"):
+        with suppress(OSError):
+            path.unlink()
 
 
 def write_parquet(
@@ -65,7 +89,7 @@ def write_parquet(
         {**(table.schema.metadata or {}), **own, **(metadata or {})}
     )
     with atomic_path(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
 def read_parquet(path: str | Path) -> pd.DataFrame:
@@ -78,13 +102,21 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
     if not path.is_file():
         raise ResultsError(f"{path}: no such file")
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(path, page_checksum_verification=True)
     except (pa.ArrowException, OSError) as error:
         raise ResultsError(f"{path}: not a readable parquet file: {error}") from error
+    # Tables from elsewhere say nothing of a schema: they are read as they are.
     version = (table.schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
     if not version.isdigit() or int(version) > int(SCHEMA_VERSION):
         raise ResultsError(f"{path}: schema version {version}; this package reads {SCHEMA_VERSION}")
-    return table.to_pandas()
+    return migrated(table.to_pandas(), int(version))
+
+
+def migrated(frame: pd.DataFrame, version: int) -> pd.DataFrame:
+    """Bring a table of an older schema up to the present one, a version at a time."""
+    for old in range(version, int(SCHEMA_VERSION)):
+        frame = MIGRATIONS[old](frame)
+    return frame
 
 
 def parquet_metadata(path: str | Path) -> dict[str, str]:
@@ -110,6 +142,17 @@ def read_torch(path: str | Path) -> Any:
     if not path.is_file():
         raise ResultsError(f"{path}: no such file")
     try:
+        _check_sums(path)
         return torch.load(path, weights_only=True, map_location="cpu")
     except Exception as error:  # torch raises many kinds for damaged or malicious files
         raise ResultsError(f"{path}: not a readable weights file: {error}") from error
+
+
+def _check_sums(path: Path) -> None:
+    """Compare every part of a weights file with its checksum, which torch itself leaves out."""
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ResultsError(f"{damaged} does not match its checksum")

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pandas as pd
+import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import config_hash, plain
+from lcc_rl.config import TARGET, config_hash, find_target, plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.results.files import atomic_path, read_parquet, read_torch, write_torch
 
 CONFIG = "config.yaml"
 PRETRAINED = "pretrained"
+# The rooms whose classes a stored configuration may name.
+REGISTRY = tuple(
+    f"lcc_rl.{room}"
+    for room in (
+        "agents",
+        "calibration",
+        "data",
+        "evaluation",
+        "functional",
+        "pieces",
+        "policies",
+        "results.loggers",
+    )
+)
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # Settings that say where and how to run, not what: they do not change any row.
-NOT_IDENTITY = ("resume", "compare", "policy", "jobs")
+NOT_IDENTITY = ("resume", "compare", "policy", "jobs", "sweep", "objective", "logger", "trust")
 
 
 def identity(cfg: DictConfig) -> str:
@@ -32,8 +47,12 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
         temporary.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
 
 
-def load_config(folder: str | Path) -> DictConfig:
+def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:
     """Read the configuration of a run.
+
+    Args:
+        folder: the run's folder.
+        trust: modules outside this package that it may name, see :func:`check_targets`.
 
     Raises:
         ConfigError: if the folder holds no run.
@@ -42,13 +61,28 @@ def load_config(folder: str | Path) -> DictConfig:
     path = Path(folder) / CONFIG
     if not path.is_file():
         raise ConfigError(f"{folder}: not a run folder: it has no {CONFIG}")
-    try:
-        cfg = OmegaConf.load(path)
-    except Exception as error:  # yaml and OmegaConf raise many kinds
-        raise ResultsError(f"{path}: damaged: {error}") from error
-    if not isinstance(cfg, DictConfig) or "variant" not in cfg:
+    cfg = OmegaConf.create(read_settings(path))
+    if "variant" not in cfg:
         raise ResultsError(f"{path}: not the configuration of a run")
+    check_targets(cfg, str(path), trust)
     return cfg
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Read a stored configuration as plain containers.
+
+    Raises:
+        ResultsError: if it is damaged.
+    """
+    # The C loader reads a hundred runs in a second, OmegaConf's own in five.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        content = yaml.load(path.read_text(), Loader=loader)  # safe: plain values only
+    except (yaml.YAMLError, OSError, ValueError) as error:
+        raise ResultsError(f"{path}: damaged: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ResultsError(f"{path}: damaged: expected settings, got {type(content).__name__}")
+    return content
 
 
 def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None:
@@ -73,13 +107,16 @@ def pretrained_path(variant: str) -> Path:
     return path
 
 
-def load_policy(path: str | Path, variant: str = "") -> tuple[dict[str, Any], DictConfig]:
+def load_policy(
+    path: str | Path, variant: str = "", trust: Sequence[str] = ()
+) -> tuple[dict[str, Any], DictConfig]:
     """Read a policy file, or that of a run folder; code in it is never run.
 
     Args:
         path: the file or the folder; ``"pretrained"`` for the policy that ships for ``variant``,
             ``"pretrained/reference"`` for that of another one.
         variant: variant of the study at hand.
+        trust: modules outside this package that it may name, see :func:`check_targets`.
 
     Returns:
         The weights and the configuration.
@@ -96,10 +133,51 @@ def load_policy(path: str | Path, variant: str = "") -> tuple[dict[str, Any], Di
     content = read_torch(path)
     if not isinstance(content, dict) or not {"weights", "config"} <= set(content):
         raise ResultsError(f"{path}: not a policy: expected the entries weights and config")
-    cfg = OmegaConf.create(str(content["config"]))
-    if not isinstance(cfg, DictConfig):
+    try:
+        cfg = OmegaConf.create(str(content["config"]))
+    except Exception as error:  # yaml and OmegaConf raise many kinds
+        raise ResultsError(f"{path}: its configuration is damaged: {error}") from error
+    if not isinstance(cfg, DictConfig) or "variant" not in cfg:
         raise ResultsError(f"{path}: its configuration is damaged")
+    check_targets(cfg, str(path), trust)
     return content["weights"], cfg
+
+
+def check_targets(cfg: DictConfig, where: str, trust: Sequence[str] = ()) -> None:
+    """Refuse a configuration from a file that names code outside this package's registry.
+
+    Building such a node would import and call whatever it names.
+
+    Args:
+        cfg: the configuration.
+        where: the file it comes from, for the message.
+        trust: modules of the user's own that may be named, e.g. ``["mine"]``.
+
+    Raises:
+        ResultsError: naming the target, or the reference that has no place in a stored file.
+    """
+    content = cast(Mapping[str, Any], OmegaConf.to_container(cfg, resolve=False))
+    for key, value in flatten(content):
+        if "${" in str(value):
+            raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
+        if key.rpartition(".")[2] == TARGET and not is_registered(str(value), trust):
+            module = str(value).rpartition(".")[0]
+            raise ResultsError(
+                f"{where}: {key} names {value!r}, which is not part of lcc_rl; if you trust it, "
+                f"say trust=[{module}]"
+            )
+
+
+def is_registered(target: str, trust: Sequence[str] = ()) -> bool:
+    """Whether a target is defined in a room of this package, or in a trusted module."""
+    module = target.rpartition(".")[0]
+    if module in trust:
+        return True
+    if not module.startswith(REGISTRY):
+        return False
+    # A room also holds what it imports, which is not its own: import_module, for one.
+    found = find_target(target, "configuration")
+    return str(getattr(found, "__module__", "")).startswith(REGISTRY)
 
 
 def load(root: str | Path = "outputs", table: str = "episodes") -> pd.DataFrame:
@@ -125,17 +203,14 @@ def load(root: str | Path = "outputs", table: str = "episodes") -> pd.DataFrame:
     for path in sorted(root.rglob(f"{table}.parquet")):
         frame = read_parquet(path)
         folder = path.parent
-        settings = dict(flatten(plain(load_config(folder)))) if _is_run(folder) else {}
+        config = folder / CONFIG
+        settings = dict(flatten(read_settings(config))) if config.is_file() else {}
         extra = {"run": str(folder.relative_to(root)), **settings}
         new = {k: [v] * len(frame) for k, v in extra.items() if k not in frame.columns}
         frames.append(pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1))
     if not frames:
         raise ResultsError(f"{root}: no {table}.parquet in it or below it")
     return pd.concat(frames, ignore_index=True)
-
-
-def _is_run(folder: Path) -> bool:
-    return (folder / CONFIG).is_file()
 
 
 def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

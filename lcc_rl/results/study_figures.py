@@ -185,7 +185,7 @@ def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> 
     saving = 1.0 - by_driver[strategy] / by_driver[baseline]
     figure = new_figure(7.0, 3.8)
     axis = figure.subplots()
-    label = f"total energy saved by {strategy} against {baseline} [%]"
+    label = f"total energy saved by {strategy}\nagainst {baseline} [%]"
     _paired_bars(axis, saving, label, colour(strategy))
     found = savings(episodes, "total_energy_kj", strategy, baseline)
     figure.suptitle(
@@ -212,11 +212,12 @@ def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
     axis.axhline(0.0, color="#222222", lw=0.8)
     axis.axhline(ordered.mean(), color="#222222", lw=0.8, ls="--")
     axis.annotate(
-        f"mean {ordered.mean():+.1f} %",
+        f"mean of drivers {ordered.mean():+.1f} %",
         (0.02, ordered.mean()),
         xycoords=("axes fraction", "data"),
         xytext=(0, 3),
         textcoords="offset points",
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
     )
     style(axis, "drivers, sorted", label)
 

@@ -23,6 +23,7 @@ log = logging.getLogger("lcc_rl")
 
 VARIANTS = ("alcc", "reference")
 PARTS = ("main", "ablations", "single")
+DRIVERS = Path("calibration/drivers.parquet")
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
 # What the calibration takes in place of the trainings.
 OF_CALIBRATION = ("data", "calibration")
@@ -88,7 +89,7 @@ class Study:
         """Return the overrides of a part: recipe, the study's inputs, the user's, its own."""
         given = {root_key(item) for item in self.overrides}
         data = f"data.path={quoted(self.folder / TRAJECTORIES)}"
-        drivers = f"drivers.path={quoted(self.folder / 'calibration' / 'drivers.parquet')}"
+        drivers = f"drivers.path={quoted(self.folder / DRIVERS)}"
         shared = [item for item in self.overrides if root_key(item) not in OF_CALIBRATION]
         return [
             f"experiment=[{','.join([self.recipe, *recipes])}]",
@@ -157,6 +158,8 @@ def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
 
 def calibrate(study: Study) -> None:
     """Read the trajectories and calibrate drivers, both modes for the paper's Fig. 4; once."""
+    if (study.folder / DRIVERS).exists() and (study.folder / TRAJECTORIES).exists():
+        return
     skipped = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
     own = [item for item in study.overrides if root_key(item) not in skipped]
     calibrate_once(load("pipeline", ["calibration=both", *own]), study.folder)

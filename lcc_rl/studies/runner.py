@@ -90,7 +90,7 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
 
 
 def _settings(cfg: DictConfig) -> dict[str, Any]:
-    return {k: v for k, v in flatten(plain(cfg)) if k not in NOT_IDENTITY}
+    return {k: v for k, v in flatten(plain(cfg)) if k.split(".")[0] not in NOT_IDENTITY}
 
 
 def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:
@@ -108,12 +108,14 @@ def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[
         known = (run.folder / CONFIG).is_file()
         other = differences(run, wanted, accept) if known else []
         if other:
+            log.error("%s: left out, it has other settings: %s", run.folder, "; ".join(other))
             outcomes.append(Outcome(run, FOREIGN, "; ".join(other)))
         elif known and (run.folder / "episodes.parquet").exists():
             outcomes.append(Outcome(run, FINISHED))
         else:
             todo.append(run)
-    log.info("%d runs: %d to do, %d finished before", len(runs), len(todo), len(runs) - len(todo))
+    finished = sum(outcome.status == FINISHED for outcome in outcomes)
+    log.info("%d runs: %d to do, %d finished before", len(runs), len(todo), finished)
     return outcomes + _start(todo, jobs)
 
 

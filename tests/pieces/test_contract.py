@@ -23,12 +23,17 @@ from lcc_rl.pieces import (
     EfficiencyReward,
     EnergyReward,
     IDMFollower,
+    JerkReward,
     LeaderPreview,
     MotorPower,
     NGSIMLeader,
     Observation,
     ObservationMemory,
     Piece,
+    PlatoonErrors,
+    PlatoonLeader,
+    PlatoonMotion,
+    PlatoonObservation,
     SafetyReward,
     SmoothEfficiency,
     Smoothness,
@@ -37,14 +42,15 @@ from lcc_rl.pieces import (
     TimeToCollision,
     TotalReward,
     Transition,
+    VelocityReward,
 )
 
 HORIZON = 20
 TERMS = ["safety", "efficiency", "cav_energy", "hdv_energy", "collision"]
 SCALES = {"leader": {"speed": 0.1}, "cav": {"gap": 0.1}, "hdv": {"gap": 0.1}}
 
-# Every piece, in the order in which the scenario needs them.
-MAKERS: dict[str, Callable[[], Piece]] = {
+# Every piece, in the order in which its scenario needs them.
+LEADING_CRUISE: dict[str, Callable[[], Piece]] = {
     "NGSIMLeader": lambda: NGSIMLeader(wavy_profiles(), HORIZON, 0.1),
     "CAVMotion": lambda: CAVMotion(0.1),
     "IDMFollower": lambda: IDMFollower(POPULATION, 0.1, followers=2),
@@ -74,19 +80,33 @@ MAKERS: dict[str, Callable[[], Piece]] = {
     "Smoothness": Smoothness,
     "TotalReward": lambda: TotalReward(TERMS),
 }
+N = 4
+STATE = {"gap_error": 0.1, "speed_error": 0.5, "leader_gap_error": 0.1, "acceleration": 0.3}
+PLATOON: dict[str, Callable[[], Piece]] = {
+    "PlatoonLeader": lambda: PlatoonLeader(wavy_profiles(), HORIZON, 0.1, perturbation=0.5),
+    "PlatoonMotion": lambda: PlatoonMotion(0.1, N, gap_spread=2.0, speed_spread=1.0),
+    "PlatoonErrors": lambda: PlatoonErrors(N),
+    "PlatoonObservation": lambda: PlatoonObservation(STATE, N),
+    "VelocityReward": lambda: VelocityReward(followers=N),
+    "JerkReward": lambda: JerkReward(followers=N),
+    "TotalReward, platoon": lambda: TotalReward(["velocity", "jerk"], (N, 1)),
+}
+MAKERS = LEADING_CRUISE | PLATOON
 EACH = pytest.mark.parametrize("name", list(MAKERS))
 
 
-def full_env(batch_size: int | tuple[int, ...] = 3) -> TransformedEnv:
-    return TransformedEnv(
-        Clock(HORIZON, batch_size, seed=4), Compose(*(make() for make in MAKERS.values()))
-    )
+def full_env(batch_size: int | tuple[int, ...] = 3, name: str = "NGSIMLeader") -> TransformedEnv:
+    """The environment of all pieces of the scenario that the named one belongs to."""
+    platoon = name in PLATOON
+    makers, action = (PLATOON, (N, 1)) if platoon else (LEADING_CRUISE, (1,))
+    clock = Clock(HORIZON, batch_size, action, seed=4)
+    return TransformedEnv(clock, Compose(*(make() for make in makers.values())))
 
 
-def rollout(batch_size: int | tuple[int, ...] = 3) -> TensorDictBase:
+def rollout(batch_size: int | tuple[int, ...] = 3, name: str = "NGSIMLeader") -> TensorDictBase:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return full_env(batch_size).rollout(HORIZON, break_when_any_done=False)
+        return full_env(batch_size, name).rollout(HORIZON, break_when_any_done=False)
 
 
 def moment(piece: Piece, data: TensorDictBase) -> TensorDictBase:
@@ -118,20 +138,21 @@ def test_every_piece_is_under_contract() -> None:
 
 
 @pytest.mark.parametrize("batch_size", [(), 3, (2, 2)])
-def test_environment_of_all_pieces_passes_torchrl_check(batch_size) -> None:
-    check_env_specs(full_env(batch_size), break_when_any_done="both")
+@pytest.mark.parametrize("name", ["NGSIMLeader", "PlatoonLeader"])
+def test_environment_of_all_pieces_passes_torchrl_check(batch_size, name) -> None:
+    check_env_specs(full_env(batch_size, name), break_when_any_done="both")
 
 
 @EACH
 def test_offline_on_a_stored_rollout_equals_online(name: str) -> None:
-    piece, data = MAKERS[name](), rollout()
+    piece, data = MAKERS[name](), rollout(name=name)
     part = moment(piece, data)
     assert_results_equal(piece, piece(without_results(piece, part).clone()), part)
 
 
 @EACH
 def test_inside_a_sequential(name: str) -> None:
-    piece, data = MAKERS[name](), rollout()
+    piece, data = MAKERS[name](), rollout(name=name)
     part = moment(piece, data)
     assert_results_equal(piece, TensorDictSequential(piece)(without_results(piece, part)), part)
 
@@ -139,7 +160,7 @@ def test_inside_a_sequential(name: str) -> None:
 @EACH
 def test_without_batch(name: str) -> None:
     piece = MAKERS[name]()
-    part = moment(piece, rollout(()))
+    part = moment(piece, rollout((), name))
     assert part.batch_size == (HORIZON,)
     single = part[7]
     assert_results_equal(piece, piece(without_results(piece, single).clone()), single)
@@ -147,7 +168,7 @@ def test_without_batch(name: str) -> None:
 
 @EACH
 def test_by_keyword(name: str) -> None:
-    piece, data = MAKERS[name](), rollout()
+    piece, data = MAKERS[name](), rollout(name=name)
     part = moment(piece, data)
     named = {"_".join(k) if isinstance(k, tuple) else k: part[k] for k in piece.in_keys}
     got = piece(**named)
@@ -158,7 +179,7 @@ def test_by_keyword(name: str) -> None:
 
 @EACH
 def test_in_a_replay_buffer(name: str) -> None:
-    piece, data = MAKERS[name](), rollout()
+    piece, data = MAKERS[name](), rollout(name=name)
     part = moment(piece, data).reshape(-1)
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(part.numel()),
@@ -174,7 +195,7 @@ def test_in_a_replay_buffer(name: str) -> None:
 
 @EACH
 def test_keeps_no_state(name: str) -> None:
-    piece, data = MAKERS[name](), rollout()
+    piece, data = MAKERS[name](), rollout(name=name)
     part = moment(piece, data)
     before = {key: value.clone() for key, value in piece.state_dict().items()}
     first = piece(without_results(piece, part).clone())
@@ -185,7 +206,7 @@ def test_keeps_no_state(name: str) -> None:
 
 @EACH
 def test_written_specs_match_what_is_written(name: str) -> None:
-    env = full_env(3)
+    env = full_env(3, name)
     td = env.rand_step(env.reset())["next"]
     specs = {
         **dict(env.observation_spec.items(True, True)),

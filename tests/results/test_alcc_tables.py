@@ -119,9 +119,12 @@ def test_generalization_has_every_profile_and_the_papers_four() -> None:
     assert table.loc[1, "saving_pct"] == pytest.approx(
         100 * (1 - (86.0 + 50.0 + human) / (85.0 + 60.0 + 2.0))
     )
-    row = alcc_tables.generalization_row(table).iloc[-1]
-    assert row["profiles"] == 4
-    assert row["mean_saving_pct"] == pytest.approx(7.2525)
+    assert table.loc[0, "reference_energy_kj"] == pytest.approx(85.0 + 52.0)
+    row = alcc_tables.generalization_row(episodes())
+    assert row["profiles"].tolist() == [2, 2, 4]
+    assert row.loc[2, "median_pct"] == pytest.approx((7.00 + 8.04) / 2)
+    headline = alcc_tables.headline(episodes()).set_index(["strategy", "against"])
+    assert row.loc[0, "together_pct"] == headline.loc[("alcc", "reference"), "saving_pct"]
 
 
 def test_human_energy_by_hand() -> None:

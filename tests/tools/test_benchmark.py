@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
+import importlib
 from types import ModuleType
 
 import pandas as pd
@@ -13,8 +12,18 @@ import torch
 from lcc_rl.data.stream import StreamSource
 from lcc_rl.results.files import read_parquet
 
-SCRIPT = Path(__file__).resolve().parents[2] / "tools" / "benchmark.py"
-NAMES = ("read", "env", "estimator", "calibrate", "evaluate", "update")
+NAMES = (
+    "read",
+    "env",
+    "estimator",
+    "collect",
+    "update",
+    "train",
+    "calibrate",
+    "evaluate",
+    "scale",
+    "infer",
+)
 COLUMNS = [
     "benchmark",
     "case",
@@ -25,6 +34,7 @@ COLUMNS = [
     "spread_high",
     "alternative",
     "ratio",
+    "device",
     "threads",
     "machine",
     "torch",
@@ -33,11 +43,7 @@ COLUMNS = [
 
 @pytest.fixture(scope="module")
 def benchmark() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("benchmark", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = importlib.import_module("benchmark")
     assert set(module.BENCHMARKS) == set(NAMES)
     return module
 
@@ -100,10 +106,31 @@ def test_bad_input_ends_in_one_clear_error(benchmark, tmp_path, capsys, argument
 
 
 def test_a_wrong_plain_loop_is_not_timed(benchmark, monkeypatch) -> None:
-    monkeypatch.setattr(benchmark, "motor_power", lambda speed, acceleration: speed)
-    options = benchmark.parse(["env", "--quick"])
+    monkeypatch.setattr("benchmarks.plain.motor_power", lambda speed, acceleration: speed)
+    options = benchmark.parse(["env", "--quick", "--device", "cpu"])
     with pytest.raises(RuntimeError, match="plain loop is off"):
         benchmark.env(options)
+
+
+def test_a_wrong_plain_python_loop_is_not_timed(benchmark, monkeypatch) -> None:
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.setattr("benchmarks.scalar.power", lambda speed, acceleration: speed)
+    options = benchmark.parse(["collect", "--quick", "--device", "cpu"])
+    with pytest.raises(RuntimeError, match="plain Python loop is off"):
+        benchmark.collect(options)
+
+
+def test_without_the_extra_it_says_what_is_left_out(benchmark, monkeypatch, tmp_path, capsys):
+    for module in ("benchmark", *(f"benchmarks.{x}" for x in ("collect", "update", "calibrate"))):
+        monkeypatch.setattr(f"{module}.installed", lambda *names: False)
+    out = tmp_path / "rows.parquet"
+    names = ["collect", "update", "calibrate"]
+    assert benchmark.main([*names, "--quick", "--out", str(out)]) == 0
+    rows = read_parquet(out)
+    assert set(rows["benchmark"]) == set(names)
+    assert not rows["case"].isin(["stable-baselines3", "scipy and numba"]).any()
+    assert "left out: stable_baselines3, gymnasium, numba" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -1,0 +1,95 @@
+"""What Hydra says about a wrong option, said again with the nearest option that exists."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from hydra.errors import MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+
+from lcc_rl.errors import ConfigError, unknown_name
+
+REFUSED = re.compile(r"Could not (?:override|delete from config\.|append to config\.?) '([^']+)'")
+# Launchers and sweepers that come with other packages: which extra brings them.
+EXTRAS = {
+    "joblib": "sweeps",
+    "submitit_local": "sweeps",
+    "submitit_slurm": "sweeps",
+    "optuna": "sweeps",
+    "ray": "ray",
+}
+
+
+def refused_key(error: Exception) -> str | None:
+    """Return the dotted key that Hydra could not override, where that is what went wrong."""
+    found = REFUSED.search(str(error))
+    return found.group(1).partition("@")[0] if found else None
+
+
+def explain(error: Exception, valid: Any) -> Exception:
+    """Return a clearer error for what Hydra says about an option, or the error itself.
+
+    Args:
+        error: what Hydra or OmegaConf raised.
+        valid: the configuration without the option at fault, for the names that exist.
+    """
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _missing_choice(error)
+    key = refused_key(error)
+    if key is None:
+        cause = error.__cause__
+        if cause is not None and str(error).startswith("Error merging override"):
+            return ConfigError(f"{error}: {str(cause).splitlines()[0]}")
+        return error
+    parent, _, name = key.rpartition(".")
+    try:
+        node = OmegaConf.select(valid, parent) if parent else valid
+    except Exception:  # an interpolation of Hydra's own that exists only inside a run
+        return error
+    if not OmegaConf.is_dict(node):
+        return unknown_at(parent, valid) or error
+    names = {*map(str, node), *(() if parent else ("experiment",))}
+    return unknown_name(_what(parent), name, names)
+
+
+def unknown_at(path: str, valid: Any) -> ConfigError | None:
+    """Return the error for the first part of a dotted path that does not exist."""
+    node = valid
+    for place, name in enumerate(parts := path.split(".")):
+        if not OmegaConf.is_dict(node) or name not in node:
+            names = map(str, node) if OmegaConf.is_dict(node) else ()
+            return unknown_name(_what(".".join(parts[:place])), name, names)
+        node = node[name]
+    return None
+
+
+def check_keys(cfg: DictConfig, where: str = "") -> None:
+    """Refuse keys that were added with ``+`` where the schema knows none.
+
+    Raises:
+        ConfigError: naming the key and the nearest one that exists.
+    """
+    schema = OmegaConf.get_type(cfg)
+    known = [item.name for item in fields(schema)] if is_dataclass(schema) else []
+    for key in map(str, cfg):
+        if known and key not in known:
+            raise unknown_name(_what(where), key, known)
+        # Values that are missing or refer to others have no keys of their own to check.
+        if OmegaConf.is_missing(cfg, key) or OmegaConf.is_interpolation(cfg, key):
+            continue
+        if isinstance(cfg[key], DictConfig):
+            check_keys(cfg[key], f"{where}.{key}" if where else key)
+
+
+def _missing_choice(error: MissingConfigException) -> ConfigError:
+    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
+        extra = EXTRAS[name]
+        return ConfigError(f"{group}/{name} is not installed: pip install 'lcc_rl[{extra}]'")
+    return unknown_name(f"choice of {group}" if group else "option", name, error.options or ())
+
+
+def _what(parent: str) -> str:
+    return f"setting of {parent}" if parent else "option"

@@ -1,0 +1,125 @@
+"""Shared by the platoon tests: leaders, actors of every quality, and a short way to play."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import torch
+from helpers import POPULATION
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from lcc_rl.config import load
+from lcc_rl.data.cycles import RecordLeaders, join, stretch
+from lcc_rl.data.profiles import Profiles, from_records
+from lcc_rl.envs.factory import build_env
+from lcc_rl.evaluation.platoon_cases import named_gains, nominal, roll
+from lcc_rl.functional.random import uniform
+from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.policies import CACCPolicy, DeadBeatPolicy, HCFSPolicy
+
+T, A_MAX = 0.2, 3.0
+ACTORS = ("good", "bad", "random")
+
+
+def leader(*speeds: Sequence[float] | Tensor) -> Profiles:
+    """Records of given speeds, 0.2 s apart."""
+    records = [torch.as_tensor(record, dtype=torch.float32) for record in speeds]
+    names = [f"leader{i}" for i in range(len(records))]
+    return from_records(records, names, names, T)
+
+
+def ramps() -> Profiles:
+    """Three leaders within ±2 m/s²: ramping up, wavering, braking to standstill and on."""
+    time = T * torch.arange(101)
+    up = (0.37 + 1.2 * (time - 4.0).clamp(min=0.0)).clamp(max=10.76)
+    waver = 8.0 + 2.0 * torch.sin(time / 1.5)
+    stop = (10.0 - 1.8 * time).clamp(min=0.0) + 1.5 * (time - 12.0).clamp(min=0.0)
+    return leader(up, waver, stop)
+
+
+@cache
+def windows(limit: int | None = None) -> Profiles:
+    """The held-out windows of the shipped default."""
+    cfg = load("train", ["variant=cacc"])
+    held = {k: dict(v) for k, v in cfg.leader.held_out.items()}
+    found = RecordLeaders({"x": {"path": "udds"}}, held).load(T, 100, 6)
+    return found.windows.spread(limit)
+
+
+def whole(*records: tuple[str, float]) -> Profiles:
+    """Whole records at a scale, side by side; a record that is over keeps its last speed."""
+    profiles = join([stretch(path, T, scale) for path, scale in records])
+    longest = int(profiles.lengths.max())
+    padded = []
+    for index in range(len(profiles)):
+        record = profiles.record(index)
+        padded.append(torch.cat([record, record[-1:].expand(longest - len(record))]))
+    return from_records(padded, profiles.names, profiles.recordings, T)
+
+
+def repeated(profiles: Profiles, times: int) -> Profiles:
+    """Every record so many times, one copy after another."""
+    return profiles.select([i for _ in range(times) for i in range(len(profiles))])
+
+
+def env_of(profiles: Profiles, followers: int = 6, *overrides: str, horizon: int | None = None):
+    """The platoon's environment, a slot for every record, as in an evaluation."""
+    cfg = load("train", ["variant=cacc", *overrides])
+    horizon = int(profiles.lengths.min()) - 1 if horizon is None else horizon
+    cfg = nominal(cfg, followers, horizon)
+    return build_env(cfg, profiles, POPULATION, len(profiles))
+
+
+def play(profiles: Profiles, policy: Any, followers: int = 6, *overrides: str) -> dict[str, Tensor]:
+    """Drive behind every record from its start to its end."""
+    return roll(env_of(profiles, followers, *overrides), policy)
+
+
+gains = cache(named_gains)
+
+
+def cacc(name: str = "tuned") -> CACCPolicy:
+    return CACCPolicy(T, A_MAX, **gains(name))
+
+
+class Actor(TensorDictModuleBase):
+    """Stands in for a learned policy, good to dangerous.
+
+    ``good`` is dead-beat, ``bad`` always accelerates, ``random`` draws from ±a_max, ``hasty``
+    is dead-beat but 10 cm/s too fast, ``mixed`` gives every third of the batch another of the
+    first three.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.beat = None
+        self.in_keys = [("platoon", "speed"), SEED, STEP]
+        self.out_keys = ["action"]
+        super().__init__()
+        self.kind, self.beat = kind, DeadBeatPolicy(T, A_MAX)
+
+    def action(self, kind: str, td: TensorDictBase) -> Tensor:
+        speed = td["platoon", "speed"]
+        if kind in ("good", "hasty"):
+            own = self.beat(td.copy())["action"]
+            return own + (0.1 / T / A_MAX if kind == "hasty" else 0.0)
+        if kind == "bad":
+            return torch.ones_like(speed)
+        index = torch.arange(speed.shape[-2]).unsqueeze(-1)
+        return 2.0 * uniform(td[SEED].unsqueeze(-2), td[STEP].unsqueeze(-2), 77 + index) - 1.0
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        if self.kind != "mixed":
+            return td.set("action", self.action(self.kind, td))
+        third = td.shape[0] // 3
+        parts = [self.action(kind, td)[i * third :][:third] for i, kind in enumerate(ACTORS)]
+        return td.set("action", torch.cat(parts))
+
+
+def hcfs(learned: Any = "good", rule: str = "tuned", **settings: Any) -> HCFSPolicy:
+    """The hybrid of CACC and an actor."""
+    actor = Actor(learned) if isinstance(learned, str) else learned
+    return HCFSPolicy(cacc(rule), actor, T, A_MAX, **settings)

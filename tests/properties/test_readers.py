@@ -1,0 +1,181 @@
+"""Readers and configurations against anything hypothesis can think of.
+
+A longer search: ``FUZZ_EXAMPLES=20000 python -m pytest tests/properties/test_readers.py``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from lcc_rl.config import config_hash, load, plain
+from lcc_rl.data.episodes import COLUMNS, read_episodes, validate_episodes
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.errors import DataError, LccError
+from lcc_rl.results.files import read_parquet, read_torch, write_parquet
+from lcc_rl.results.runs import identity, load_config, save_config
+
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
+FUZZ = settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize=EXAMPLES == 60,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+NATIVE = (
+    "1 {frame} 3 {time} 10.0 {y} 6042.0 2133.0 14.0 6.0 2 {speed} 0.0 1 0 0 0.0 0.0",
+    "2 {frame} 3 {time} 10.0 {y} 6042.0 2133.0 14.0 6.0 2 {speed} 0.0 1 1 0 60.0 2.0",
+)
+
+
+def native_file() -> list[str]:
+    """Return the lines of a small native NGSIM file."""
+    return [
+        line.format(frame=f, time=1113433135300 + 100 * f, y=200 - 60 * k + 3 * f, speed=30.0)
+        for k, line in enumerate(NATIVE)
+        for f in range(30)
+    ]
+
+
+def test_the_file_that_is_mutated_is_valid(tmp_path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(native_file()) + "\n")
+    assert read_ngsim([str(path)]).report.lines()
+
+
+def refused(read: Callable[[], object]) -> str | None:
+    """Return why a reader refuses its input, None where it accepts it; a bug stays a bug."""
+    try:
+        read()
+    except DataError as error:
+        return str(error)
+    return None
+
+
+words = st.one_of(
+    st.text(max_size=8), st.floats().map(str), st.integers().map(str), st.just(""), st.just("NaN")
+)
+mutations = st.lists(
+    st.tuples(st.integers(0, 59), st.integers(0, 17), words), min_size=1, max_size=6
+)
+
+
+@FUZZ
+@given(mutations)
+def test_a_mutated_trajectory_file_is_read_or_refused_by_name(tmp_path, changes) -> None:
+    lines = [line.split(" ") for line in native_file()]
+    for row, column, word in changes:
+        lines[row][column] = word
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(" ".join(line) for line in lines), errors="surrogatepass")
+    error = refused(lambda: read_ngsim([str(path)]))
+    assert error is None or "a.txt" in error
+
+
+@FUZZ
+@given(st.binary(max_size=400), st.sampled_from(["a.txt", "a.csv", "a.csv.gz"]))
+def test_any_bytes_are_read_or_refused(tmp_path, content, name) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(DataError, match=r"a\."):
+        read_ngsim([str(tmp_path / name)])
+
+
+@FUZZ
+@given(st.binary(max_size=400))
+def test_any_bytes_are_no_table_and_no_policy(tmp_path, content) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(content)
+    for read in (read_parquet, read_torch, read_episodes):
+        with pytest.raises(LccError, match="x: "):
+            read(path)
+
+
+def pair_table() -> pd.DataFrame:
+    """Return a valid episode table of one pair."""
+    steps = range(5)
+    frame = pd.DataFrame({name: [1.0 + 0.1 * i for i in steps] for name in COLUMNS})
+    whole = dict.fromkeys(("episode", "follower_id", "leader_id"), 1)
+    return frame.assign(recording="a", **whole)
+
+
+@FUZZ
+@given(
+    st.sampled_from(COLUMNS),
+    st.integers(0, 4),
+    st.one_of(st.floats(), st.text(max_size=5), st.none(), st.integers(), st.booleans()),
+)
+def test_a_mutated_episode_table_is_accepted_or_refused_by_name(column, row, value) -> None:
+    frame = pair_table()
+    values = frame[column].astype(object)
+    values[row] = value
+    changed = frame.assign(**{column: values})
+    error = refused(lambda: validate_episodes(changed, "table"))
+    if error is not None:
+        assert error.startswith("table: ")
+        return
+    checked = validate_episodes(changed, "table")
+    assert (checked["gap_m"] >= 0).all()
+    assert checked["time_s"].diff().dropna().gt(0).all()
+
+
+def test_a_negative_gap_is_refused() -> None:
+    frame = pair_table()
+    frame.loc[3, "gap_m"] = -0.5
+    with pytest.raises(DataError, match="row 3, column 'gap_m' is negative"):
+        validate_episodes(frame, "table")
+
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(codec="ascii", exclude_characters="${}\\"), max_size=12),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.text("abcxyz_", min_size=1, max_size=6), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@FUZZ
+@given(st.dictionaries(st.text("abcxyz", min_size=1, max_size=6), values, max_size=4))
+def test_a_configuration_survives_its_file(tmp_path, content) -> None:
+    cfg = OmegaConf.create({**content, "variant": "alcc"})
+    save_config(cfg, tmp_path)
+    again = load_config(tmp_path)
+    assert plain(again) == plain(cfg)
+    assert config_hash(again) == config_hash(cfg)
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(
+    st.integers(0, 2**31),
+    st.floats(0.01, 0.99),
+    st.floats(1e-8, 1e-1),
+    st.sampled_from(["alcc", "reference"]),
+)
+def test_a_run_is_itself_after_its_file(tmp_path_factory, seed, gamma, rate, variant) -> None:
+    folder = tmp_path_factory.mktemp("run")
+    words = [f"seed={seed}", f"agent.gamma={gamma}", f"agent.actor_lr={rate}"]
+    cfg = load("train", [f"variant={variant}", *words])
+    save_config(cfg, folder)
+    assert identity(load_config(folder)) == identity(cfg)
+
+
+@pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
+def test_one_wrong_byte_in_a_table_is_noticed(tmp_path, place) -> None:
+    path = tmp_path / "a.parquet"
+    write_parquet(pd.DataFrame({"x": [float(i) ** 1.5 for i in range(5000)]}), path)
+    content = bytearray(path.read_bytes())
+    content[int(place * len(content))] ^= 0x10
+    path.write_bytes(content)
+    with pytest.raises(LccError, match=r"a\.parquet"):
+        read_parquet(path)

@@ -1,0 +1,52 @@
+"""The policies that ship with the package, and the tool that puts them there."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch
+
+from lcc_rl import evaluate
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
+from lcc_rl.results.files import read_torch, write_torch
+from lcc_rl.results.runs import load_policy, pretrained_path
+
+TOOL = Path(__file__).resolve().parents[2] / "tools" / "export_pretrained.py"
+TINY = ("experiment=smoke", "data.platoons=4", "data.recordings=2", "scenario.horizon=40")
+
+
+@pytest.mark.parametrize("variant", ["alcc", "reference"])
+def test_a_shipped_policy_says_where_it_comes_from_and_names_no_path(variant) -> None:
+    weights, cfg = load_policy("pretrained", variant)
+    assert cfg.variant == variant
+    assert all(torch.isfinite(value).all() for value in weights.values())
+    assert not {"data", "drivers", "split"} & set(cfg)
+    assert "seed" in read_torch(pretrained_path(variant))["provenance"]
+
+
+def test_evaluate_the_shipped_policies(tmp_path) -> None:
+    how = ["variant=alcc", "policy=pretrained", "compare=[pretrained/reference]"]
+    rows = evaluate.run(load("evaluate", [*TINY, *how]), tmp_path, quiet=True)
+    assert {"alcc", "reference", "idm", "direct"} == set(rows["strategy"])
+
+
+def test_a_variant_without_a_shipped_policy_says_which_have_one() -> None:
+    with pytest.raises(ConfigError, match="alcc"):
+        load_policy("pretrained", "direct")
+
+
+def test_export_leaves_out_what_belongs_to_one_machine(tmp_path) -> None:
+    spec = importlib.util.spec_from_file_location("export_pretrained", TOOL)
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    source = {"weights": {"w": torch.ones(1)}, "config": "variant: mine\ndata: {path: /home/me}\n"}
+    write_torch(source, tmp_path / "policy.pt")
+    content = read_torch(tool.export(tmp_path / "policy.pt", "a trial", tmp_path / "out"))
+    assert content["config"] == "variant: mine\n"
+    assert content["provenance"].startswith("a trial")
+    assert tool.main([str(tmp_path / "missing.pt"), "nothing"]) == 1

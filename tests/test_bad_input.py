@@ -1,0 +1,200 @@
+"""Bad input that would otherwise pass unnoticed, fail late, or run someone else's code."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pandas as pd
+import pytest
+import torch
+from omegaconf import OmegaConf
+from test_entry_points import tiny
+
+from lcc_rl import calibrate, evaluate, results, train
+from lcc_rl.config import load, plain
+from lcc_rl.config_errors import check_keys
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.results import files
+from lcc_rl.results.files import read_parquet, read_torch, write_parquet, write_torch
+from lcc_rl.results.runs import check_targets, load_config, load_policy, save_policy
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("sead=3", r"unknown option 'sead'.*Did you mean 'seed'"),
+        ("+sead=3", r"unknown option 'sead'.*Did you mean 'seed'"),
+        ("++sead=3", r"unknown option 'sead'.*Did you mean 'seed'"),
+        ("agent=dddpg", r"unknown choice of agent 'dddpg'.*Did you mean 'ddpg'"),
+        ("agnet=ddpg", r"unknown option 'agnet'.*Did you mean 'agent'"),
+        ("experimnt=smoke", r"Did you mean 'experiment'"),
+        ("reward.terms.safety.wieght=1", r"setting of reward.terms.safety.*'weight'"),
+        ("reward.termz.safety.weight=1", r"setting of reward 'termz'.*'terms'"),
+        ("~reward.terms.safty", r"Did you mean 'safety'"),
+        ("+training.epsodes=3", r"setting of training 'epsodes'.*'episodes'"),
+        ("+evaluation.driver=3", r"Did you mean 'drivers'"),
+        ("seed=abc", r"seed=abc: Value 'abc' .* Integer"),
+        ("hydra.swep.dir=x", r"Did you mean 'sweep'"),
+        ("hydra/launcher=cluster", r"unknown choice of hydra/launcher 'cluster'"),
+    ],
+)
+def test_a_wrong_option_names_the_nearest_one(override, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load("train", [override])
+
+
+def test_names_that_exist_only_with_the_other_overrides_are_known() -> None:
+    with pytest.raises(ConfigError, match=r"setting of agent 'desired_sped'.*'desired_speed'"):
+        load("train", ["variant=idm", "agent.desired_sped=3"])
+
+
+def test_what_the_schema_knows_passes() -> None:
+    check_keys(load("train", ["+reward.terms.x={_target_: mine.X}", "experiment=smoke"]))
+
+
+@pytest.mark.parametrize("agent", ["idm", "none"])
+def test_an_agent_that_learns_nothing_is_no_learned_variant(tmp_path, agent) -> None:
+    cfg = tiny("train", "variant=alcc", f"agent={agent}", agent=False)
+    with pytest.raises(ConfigError, match="variant=alcc is a learned controller"):
+        train.run(cfg, tmp_path)
+    assert "learned controller" in (tmp_path / "error.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["agent.gamma=1.5", "training.episodes=25", "reward.terms.safety.weight=heavy"],
+)
+def test_settings_are_checked_before_the_data_are_read(tmp_path, override) -> None:
+    # The data do not exist: whoever reads them first says so instead.
+    cfg = tiny("train", override)
+    OmegaConf.set_struct(cfg, False)
+    cfg.data = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": "nowhere.parquet"}
+    with pytest.raises(ConfigError, match=override.split("=")[0].split(".")[-1]):
+        train.run(cfg, tmp_path)
+
+
+def test_asking_for_more_than_there_is_is_said(caplog, tmp_path) -> None:
+    cfg = tiny("train", "variant=idm", "evaluation.profiles=5000", agent=False)
+    with caplog.at_level("INFO", logger="lcc_rl"):
+        train.run(cfg, tmp_path, quiet=True)
+    assert "evaluation.profiles=5000: only " in caplog.text
+
+
+def test_calibration_says_what_it_was_made_with(tmp_path) -> None:
+    words = ["data.platoons=3", "data.recordings=1", "calibration.local_genetic.generations=2"]
+    calibrate.run(load("calibrate", words), tmp_path)
+    assert results.load(tmp_path, "drivers")["data.platoons"].eq(3).all()
+
+
+# -- what comes with results ----------------------------------------------------------------------
+
+
+def policy_file(path, **changes) -> None:
+    cfg = OmegaConf.create(plain(tiny("train", "variant=alcc")))
+    for key, value in changes.items():
+        OmegaConf.update(cfg, key.replace("__", "."), value)
+    save_policy({"w": torch.ones(1)}, cfg, path)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "subprocess.Popen",
+        "lcc_rl.config.import_module",
+        "lcc_rl.data.sources.Path",
+        "lcc_rl.results.files.write_parquet",
+        "mine.Comfort",
+    ],
+)
+def test_a_policy_that_names_foreign_code_is_refused(tmp_path, target) -> None:
+    path = tmp_path / "policy.pt"
+    policy_file(path, agent___target_=target)
+    with pytest.raises(ResultsError, match=rf"policy\.pt: agent\._target_ names '{target}'"):
+        load_policy(path)
+
+
+def test_ones_own_module_can_be_trusted_by_name(tmp_path) -> None:
+    path = tmp_path / "policy.pt"
+    policy_file(path, reward__terms__safety___target_="mine.Comfort")
+    assert load_policy(path, trust=["mine"])[1].variant == "alcc"
+    with pytest.raises(ResultsError, match=r"say trust=\[mine\]"):
+        load_policy(path, trust=["other"])
+
+
+def test_every_shipped_configuration_is_trusted() -> None:
+    for variant in ("alcc", "reference", "idm", "direct"):
+        check_targets(OmegaConf.create(plain(load("train", [f"variant={variant}"]))), "shipped")
+
+
+def test_references_in_a_stored_configuration_are_refused(tmp_path) -> None:
+    (tmp_path / "config.yaml").write_text("variant: alcc\nseed: ${oc.env:HOME}\n")
+    with pytest.raises(ResultsError, match="seed refers to"):
+        load_config(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["- 1", "variant: [", "!!python/object:os.system {}", "x: 1"])
+def test_damaged_or_malicious_configurations(tmp_path, text) -> None:
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(ResultsError, match=r"config\.yaml"):
+        load_config(tmp_path)
+
+
+def test_two_policies_that_rows_cannot_tell_apart(tmp_path) -> None:
+    folder = tmp_path / "one"
+    train.run(tiny("train", "variant=alcc"), folder, quiet=True)
+    cfg = tiny("evaluate", "variant=alcc", f"policy={folder}", f"compare=[{folder}]")
+    with pytest.raises(ConfigError, match="two policies of variant alcc with training seed 0"):
+        evaluate.run(cfg, tmp_path / "b")
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def test_a_disk_that_fills_up_during_training_is_one_clear_error(tmp_path, monkeypatch) -> None:
+    cfg = tiny("train", "variant=alcc", "training.episodes=32")
+    written = files.os.replace
+    count = 0
+
+    def fills_up(source, target):
+        nonlocal count
+        count += 1
+        if count > 9:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(source, target)
+
+    monkeypatch.setattr(files.os, "replace", fills_up)
+    with pytest.raises(ResultsError, match=r"cannot be written: .*No space left"):
+        train.run(cfg, tmp_path, quiet=True)
+    monkeypatch.undo()
+    assert not [path for path in tmp_path.iterdir() if path.suffix == ".tmp"]
+    read_torch(tmp_path / "checkpoint.pt")
+    train.complete(cfg, tmp_path)  # goes on once there is space
+    assert len(read_parquet(tmp_path / "training.parquet")) == 4
+
+
+def test_an_older_table_is_migrated(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "a.parquet"
+    write_parquet(pd.DataFrame({"energy": [1.0]}), path)
+    monkeypatch.setattr(files, "SCHEMA_VERSION", "3")
+    rename = {"energy": "energy_kj"}
+    steps = {1: lambda f: f.rename(columns=rename), 2: lambda f: f.assign(unit="kJ")}
+    monkeypatch.setattr(files, "MIGRATIONS", steps)
+    assert read_parquet(path).to_dict("list") == {"energy_kj": [1.0], "unit": ["kJ"]}
+
+
+def test_one_wrong_byte_in_weights_is_noticed(tmp_path) -> None:
+    path = tmp_path / "policy.pt"
+    write_torch({"w": torch.randn(5000)}, path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+    with pytest.raises(ResultsError, match=r"policy\.pt"):
+        read_torch(path)
+
+
+def test_a_killed_writer_leaves_nothing_that_is_read(tmp_path) -> None:
+    (tmp_path / f".episodes.parquet.{os.getpid()}.tmp").write_bytes(b"PAR1 half")
+    with pytest.raises(ResultsError, match=r"no episodes\.parquet"):
+        results.load(tmp_path)

@@ -1,0 +1,190 @@
+"""The platoon's commands as a user types them, shrunk to seconds."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION
+
+from lcc_rl import evaluate, results, train
+from lcc_rl.agents.training import Trainer, transitions
+from lcc_rl.config import load
+from lcc_rl.envs.factory import build_agent, build_env, load_inputs
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.results.files import read_parquet
+from lcc_rl.results.runs import identity, load_policy
+from lcc_rl.studies import hcfs, hcfs_report
+
+TINY = ("experiment=smoke", "scenario.horizon=40", "evaluation.profiles=3")
+AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")
+
+
+def tiny(entry: str, variant: str, *overrides: str):
+    learned = AGENT if variant in ("ddpg", "hcfs") else ()
+    return load(entry, [*TINY, f"variant={variant}", *learned, *overrides])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("trained") / "hcfs"
+    train.run(tiny("train", "hcfs"), folder, quiet=True)
+    return folder
+
+
+def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:
+    rows = read_parquet(trained / "training.parquet")
+    assert {"reward_velocity", "reward_jerk", "loss_value"} <= set(rows)
+    assert rows["transitions"].iloc[-1] == 24 * 40 * 6  # episodes × steps × followers
+    # The same settings train the same parent, whatever drives afterwards.
+    train.run(tiny("train", "ddpg"), tmp_path / "ddpg", quiet=True)
+    one, two = (load_policy(folder)[0] for folder in (trained, tmp_path / "ddpg"))
+    assert all(torch.equal(one[key], two[key]) for key in one)
+    episodes = read_parquet(trained / "episodes.parquet")
+    assert set(episodes["case"]) == {"case 1", "case 2", "case 3", "windows"}
+    assert episodes["learned_share"].between(0.0, 1.0).all()
+
+
+def test_hcfs_builds_on_a_given_policy(trained, tmp_path) -> None:
+    rows = train.run(tiny("train", "hcfs", f"policy={trained}"), tmp_path, quiet=True)
+    assert not (tmp_path / "training.parquet").exists()
+    pd.testing.assert_frame_equal(rows, read_parquet(trained / "episodes.parquet"))
+    with pytest.raises(ConfigError, match="builds on no trained policy"):
+        train.run(tiny("train", "ddpg", f"policy={trained}"), tmp_path / "b", quiet=True)
+
+
+def test_evaluate_every_variant(trained, tmp_path) -> None:
+    yardsticks = {"cacc path", "cacc paper_like", "cacc tuned", "deadbeat", "deadbeat oracle"}
+    expected = {
+        "cacc": yardsticks,
+        "ddpg": yardsticks | {"ddpg"},
+        "hcfs": yardsticks | {"ddpg", "hcfs", "hcfs oracle"},
+    }
+    for variant, names in expected.items():
+        given = () if variant == "cacc" else (f"policy={trained}",)
+        rows = evaluate.run(tiny("evaluate", variant, *given), tmp_path / variant, quiet=True)
+        assert set(rows["strategy"]) == names
+        figures = {path.name for path in (tmp_path / variant / "figures").iterdir()}
+        assert {"case_1_velocities.png", "case_3_jerk.png"} <= figures
+        assert ("case_2_switching_hcfs.png" in figures) == (variant == "hcfs")
+    # Rows do not depend on what else is evaluated, and the oracle bounds the rest.
+    rows = [read_parquet(tmp_path / v / "episodes.parquet") for v in ("ddpg", "hcfs")]
+    one, two = (r[r["strategy"] == "ddpg"].reset_index(drop=True) for r in rows)
+    pd.testing.assert_frame_equal(one[one.columns.intersection(two.columns)], two[one.columns])
+    reward = rows[1].groupby("strategy")["reward"].sum()
+    assert reward.idxmax() == "deadbeat oracle"
+
+
+def test_other_gains_stand_beside_the_named_ones(tmp_path) -> None:
+    cfg = tiny("evaluate", "cacc", "gains.k4=1.1")
+    rows = evaluate.run(cfg, tmp_path, quiet=True)
+    assert {"cacc", "cacc tuned"} <= set(rows["strategy"])
+
+
+@pytest.mark.parametrize("variant", ["cacc", "ddpg", "hcfs"])
+def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
+    cfg = load("evaluate", [*TINY, f"variant={variant}", "policy=pretrained"])
+    rows = evaluate.run(cfg, tmp_path, quiet=True)
+    assert not rows["collided"].any()
+    reward = rows[rows["case"] == "windows"].groupby("strategy")["reward"].sum()
+    if variant == "hcfs":
+        assert reward["hcfs"] > 1.1 * max(reward["cacc tuned"], reward["ddpg"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ((), "give policy="),
+        (("policy=nowhere",), "no such file"),
+        (("policy={trained}", "observation.scales.speed=0.2"), "another observation"),
+        (("policy=pretrained/reference",), "pretrained policy|not for a platoon"),
+    ],
+)
+def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
+    given = [item.format(trained=trained) for item in overrides]
+    with pytest.raises((ConfigError, ResultsError), match=words):
+        evaluate.run(tiny("evaluate", "ddpg", *given), tmp_path, quiet=True)
+
+
+def test_sweep_as_typed(tmp_path) -> None:
+    words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "hydra.sweep.dir=sweep"]
+    command = [sys.executable, "-m", "lcc_rl.train", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    frame = results.load(tmp_path / "sweep")
+    assert frame.groupby(["variant", "seed"]).ngroups == 6
+    assert {"agent.gamma", "gains.k3", "controller.jerk_bound"} <= set(frame)
+
+
+# -- training --------------------------------------------------------------------------------------
+
+
+def trainer(folder: Path, *overrides: str) -> Trainer:
+    cfg = tiny("train", "ddpg", "training.episodes=48", "training.checkpoint_every=2", *overrides)
+    inputs = load_inputs(cfg)
+    env = build_env(cfg, inputs.training, POPULATION, cfg.training.environments)
+    return Trainer(build_agent(cfg, POPULATION), env, cfg.training, cfg.seed, folder, identity(cfg))
+
+
+def test_transitions_are_those_of_every_follower(tmp_path) -> None:
+    with torch.no_grad():
+        batch = next(iter(trainer(tmp_path)._source()))
+    flat = transitions(batch)
+    envs, steps = batch.shape
+    assert flat.shape == (envs * steps * 6,)
+    row = (3 * steps + 7) * 6 + 2  # environment 3, step 7, follower 2
+    for key in ("observation", "action", ("next", "reward"), ("next", "observation")):
+        assert torch.equal(flat[key][row], batch[key][3, 7, 2]), key
+    assert torch.equal(flat["next", "done"][row], batch["next", "done"][3, 7])
+
+
+def test_followers_explore_each_on_their_own(tmp_path) -> None:
+    made = trainer(tmp_path)
+    made.exploration.sigma.fill_(0.3)
+    with torch.no_grad():
+        batch = next(iter(made._source()))
+        mean = made.agent.policy(batch.copy())["action"]
+    noise = (batch["action"] - mean).flatten(0, 1).squeeze(-1)
+    correlation = torch.corrcoef(noise.T)
+    assert (correlation - torch.eye(6)).abs().max() < 0.35
+    assert 0.2 < noise.std() < 0.4
+
+
+def test_resuming_equals_never_having_stopped(tmp_path) -> None:
+    expected = trainer(tmp_path / "whole").run()
+    first = trainer(tmp_path / "parts")
+    iterate = first._iterate
+
+    def dies(collector):
+        if first.iteration == 3:
+            raise MemoryError
+        return iterate(collector)
+
+    first._iterate = dies
+    with pytest.raises(MemoryError):
+        first.run()
+    second = trainer(tmp_path / "parts")
+    second.load()
+    assert second.iteration == 2
+    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
+
+
+# -- the study -------------------------------------------------------------------------------------
+
+
+def test_study_from_cycles_to_page_and_on_from_where_it_stopped(tmp_path) -> None:
+    overrides = ("scenario.horizon=40", "evaluation.profiles=3", *AGENT)
+    study = hcfs.Study(tmp_path, recipe="smoke", seeds=1, overrides=overrides, jobs=1)
+    outcomes = hcfs.run(study)
+    assert [outcome.status for outcome in outcomes] == ["finished"], outcomes
+    page = hcfs_report.write_results(tmp_path).read_text()
+    for words in ("Table IV", "Table VI", "who drives, hcfs oracle", "hcfs literal"):
+        assert words in page, words
+    table = tmp_path / "evaluation" / "seed_0" / "episodes.parquet"
+    before = table.stat().st_mtime_ns
+    hcfs.run(study)
+    assert table.stat().st_mtime_ns == before

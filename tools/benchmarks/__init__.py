@@ -1,0 +1,1 @@
+"""Benchmarks: one module each, run by tools/benchmark.py; see docs/benchmarks.md."""

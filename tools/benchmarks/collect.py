@@ -1,0 +1,128 @@
+"""Benchmark of collection: environment steps with the policy in the loop."""
+
+from __future__ import annotations
+
+import logging
+from argparse import Namespace
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+
+from benchmarks.harness import Row, Run, alternate, endings, installed, rows_of
+from benchmarks.plain import PlainLoop, alcc
+from benchmarks.scalar import check_scalar, gymnasium_env
+from lcc_rl.agents import DDPG
+from lcc_rl.agents.training import LEARNED_FROM, REPORTED
+from lcc_rl.envs.stepping import Segments
+
+OTHER = "stable-baselines3"
+SIDE_BY_SIDE = 8  # environments of stable-baselines3's DummyVecEnv
+
+
+def collect(options: Namespace) -> list[Row]:
+    """Transitions per second, collected by the actor without exploration, kept for learning.
+
+    "Segments" is the training's own way, "Collector" TorchRL's, which keeps every entry. The
+    plain loop runs the same network and stacks what a learner needs. stable-baselines3 calls
+    ``predict`` and steps a DummyVecEnv of 8 plain Gymnasium environments; its network has the
+    same layers.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    batch, steps = (16, 10) if options.quick else (1024, 60)
+    policy = DDPG(observation_size=7, action_size=1, seed=0, device=options.device).policy
+    runs: dict[str, Run] = {}
+    for ending in endings(options):
+        env = alcc(options, batch, 30)
+        runs[f"plain loop{ending}"] = loop(env, policy.module, steps, bool(ending))
+        runs[f"Segments{ending}"] = collector(env, policy, steps, bool(ending))
+    runs["Collector"] = torchrl_collector(alcc(options, batch, 30), policy, steps)
+    counts, other = dict.fromkeys(runs, batch * steps), stable_baselines(options)
+    if other is not None:
+        runs[OTHER], counts[OTHER] = other
+    with torch.no_grad():
+        spent = alternate(runs, options.repeats)
+    rates = {name: counts[name] / seconds for name, seconds in spent.items()}
+    rows: list[Row] = []
+    for ending in endings(options):
+        plain = f"plain loop{ending}"
+        pair = {name: rates[name] for name in (f"Segments{ending}", plain)}
+        rows += rows_of("collect", pair, "steps/s", plain, batch)
+    if other is not None:
+        rates = {name: rate for name, rate in rates.items() if not name.startswith("plain")}
+        rows += rows_of("collect", rates, "steps/s", OTHER, batch)
+    return rows
+
+
+def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
+    """The training's collection; one call collects so many steps of every environment."""
+    segments = Segments(env, policy, steps, (*LEARNED_FROM, *REPORTED), compiled)
+    return lambda: next(segments)
+
+
+def torchrl_collector(env: TransformedEnv, policy: Any, steps: int) -> Run:
+    """TorchRL's collector, which keeps every entry."""
+    count = env.batch_size.numel() * steps
+    how = {"track_traj_ids": False, "auto_register_policy_transforms": False}
+    batches = iter(Collector(env, policy, frames_per_batch=count, total_frames=-1, **how))
+    return lambda: next(batches)
+
+
+def loop(
+    env: TransformedEnv, network: Callable[[Tensor], Tensor], steps: int, compiled: bool
+) -> Run:
+    """The same as a plain loop over tensors."""
+    plain, start = PlainLoop(env), env.reset()
+    first, state = start["observation"], plain.start(start)
+
+    def act(seen: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor], Any]:
+        action = network(seen)
+        after, written = plain.step(state, action)
+        return action, after, written
+
+    advance = torch.compile(act, dynamic=False) if compiled else act
+
+    def run() -> None:
+        now, seen, kept = state, first, []
+        for _ in range(steps):
+            action, now, written = advance(seen, now)
+            kept.append((seen, action, written["reward"], written["observation"]))
+            seen = written["observation"]
+        for entries in zip(*kept, strict=True):
+            torch.stack(entries, dim=1)
+
+    return run
+
+
+def stable_baselines(options: Namespace) -> tuple[Run, int] | None:
+    """``predict`` and DummyVecEnv(8), and how many transitions one call makes; None without it."""
+    if not installed("stable_baselines3", "gymnasium"):
+        return None
+    steps = 10 if options.quick else 300
+    vector, model = stable_baselines_model(options)
+    state = {"seen": vector.reset()}
+
+    def run() -> None:
+        for _ in range(steps):
+            action, _ = model.predict(state["seen"], deterministic=True)
+            state["seen"], *_ = vector.step(action)
+
+    return run, steps * SIDE_BY_SIDE
+
+
+def stable_baselines_model(options: Namespace, environments: int = SIDE_BY_SIDE, **how: Any) -> Any:
+    """Build SB3's DDPG with the paper's layers on so many Gymnasium environments."""
+    from stable_baselines3 import DDPG as Theirs
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    env = alcc(options, 1)
+    check_scalar(env, PlainLoop(env), 20 if options.quick else 250)
+    plain, horizon = PlainLoop(env), env.base_env.horizon
+    makers = [lambda i=i: gymnasium_env(plain, horizon, i) for i in range(environments)]
+    vector = DummyVecEnv(makers)
+    layers = {"net_arch": [200, 100, 50]}
+    settings = {"policy_kwargs": layers, "gamma": 0.9, "device": options.device, **how}
+    return vector, Theirs("MlpPolicy", vector, **settings)

@@ -1,0 +1,76 @@
+"""Benchmark of the NGSIM reader: rows per second and memory."""
+
+from __future__ import annotations
+
+import gzip
+import subprocess
+import sys
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.harness import Row, alternate, rows_of, stream
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.errors import DataError
+
+# The kernel's mark of this very process: ru_maxrss may begin at that of the one that started it.
+PEAK = """
+import resource, sys
+from pathlib import Path
+from lcc_rl.data.ngsim import read_ngsim
+def peak():
+    if not Path("/proc/self/status").exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # bytes where no /proc
+    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 2**10
+before = peak()
+read_ngsim(sys.argv[1], sys.argv[2] or None)
+print(peak() - before)
+"""
+
+
+def read(options: Namespace) -> list[Row]:
+    """Rows per second of the NGSIM reader, and by how much reading raises the peak of memory.
+
+    Memory is the largest resident size of a process of its own, less that before reading. The
+    file of four times the rows holds one copy under each of four Locations.
+    """
+    with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder:
+        path, fourfold = Path(folder, "stream.csv.gz"), Path(folder, "fourfold.csv.gz")
+        if options.ngsim is None:
+            stream(options.quick).write(path)
+        path = Path(options.ngsim or path)
+        runs = {"read_ngsim": lambda: read_ngsim(path), "pandas": lambda: pd.read_csv(path)}
+        count = read_ngsim(path).report.rows_read
+        rates = {name: count / spent for name, spent in alternate(runs, options.repeats).items()}
+        write_copies(path, fourfold, ("a", "b", "c", "d"))
+        memory = {
+            "peak memory": peak_memory(path, ""),
+            "… 4 × the rows, ¼ kept": peak_memory(fourfold, "a"),
+            "… 4 × the rows": peak_memory(fourfold, ""),
+        }
+    speed = rows_of("read", rates, "rows/s", "pandas")
+    return speed + rows_of("read", memory, "MiB", "peak memory")
+
+
+def write_copies(path: Path, target: Path, locations: Sequence[str]) -> None:
+    """Write an 18-column CSV several times below one header, a Location added to each copy."""
+    content = path.read_bytes()
+    content = gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+    header, *lines = content.decode().splitlines()
+    if header.count(",") != 17:
+        raise DataError(f"{path}: expected an 18-column CSV with a header, got {header[:80]!r}")
+    with gzip.open(target, "wt", compresslevel=1) as file:
+        file.write(f"{header},Location\n")
+        for place in locations:
+            file.writelines(f"{line},{place}\n" for line in lines)
+
+
+def peak_memory(path: Path, location: str) -> np.ndarray:
+    """By how much reading raises the peak of a fresh process [MiB]."""
+    command = [sys.executable, "-c", PEAK, str(path), location]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return np.array([float(done.stdout)])

@@ -1,0 +1,66 @@
+"""Benchmark of scale: cost against the size of the batch and the length of the platoon."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+
+from benchmarks.harness import Row, Run, alternate, endings, rows_of
+from benchmarks.plain import alcc
+
+
+def scale(options: Namespace) -> list[Row]:
+    """Nanoseconds per transition by batch, and microseconds per step by number of followers.
+
+    A ratio of 1 to the smallest batch says that cost grows exactly in proportion; below 1, that
+    it grows less. Followers: batch 1,024, cost beside one tenth of the longest string's.
+    """
+    rows: list[Row] = []
+    batches = (16, 32) if options.quick else (1024, 4096, 8192, 32768)
+    for ending in endings(options):
+        runs, steps = {}, 5 if options.quick else 30
+        for batch in batches:
+            runs[f"batch {batch}{ending}"] = stepping(options, batch, 1, steps, bool(ending))
+        with torch.no_grad():
+            spent = alternate(runs, options.repeats)
+        sizes = zip(spent, batches, strict=True)
+        costs = {name: 1e9 * spent[name] / (batch * steps) for name, batch in sizes}
+        rows += rows_of("scale", costs, "ns/transition", f"batch {batches[0]}{ending}")
+        rows += platoons(options, ending)
+    return rows
+
+
+def platoons(options: Namespace, ending: str) -> list[Row]:
+    """Microseconds per step and follower at several lengths of the string."""
+    batch, counts, steps = (16, (1, 3), 5) if options.quick else (1024, (1, 10, 100), 20)
+    runs = {
+        f"{count} followers{ending}": stepping(options, batch, count, steps, bool(ending))
+        for count in counts
+    }
+    with torch.no_grad():
+        spent = alternate(runs, options.repeats)
+    pairs = zip(spent, counts, strict=True)
+    costs: dict[str, np.ndarray] = {name: 1e6 * spent[name] / (steps * n) for name, n in pairs}
+    return rows_of("scale", costs, "µs/(step·follower)", f"{counts[0]} followers{ending}", batch)
+
+
+def stepping(options: Namespace, batch: int, followers: int, steps: int, compiled: bool) -> Run:
+    """So many steps of an environment with zero actions, from its first moment."""
+    env = alcc(options, batch, 30, followers)
+    start, zero = env.reset(), torch.zeros(batch, 1, device=options.device)
+    if compiled:
+        # One graph per size; each environment is an object of its own, so none is tried in vain.
+        torch._dynamo.config.recompile_limit = 64
+        env.compile(warmup=3, dynamic=False)
+    return lambda: advance(env, start, zero, steps)
+
+
+def advance(env: TransformedEnv, start: TensorDictBase, action: torch.Tensor, steps: int) -> None:
+    """Step and keep nothing."""
+    td = start.copy()
+    for _ in range(steps):
+        _, td = env.step_and_maybe_reset(td.set("action", action))
