@@ -49,6 +49,7 @@ class Analytic:
         surrogates: nodes of reward terms that take the place of those of the same name in the
             objective; their weights multiply the terms' own. Those of terms that the reward
             lacks are ignored.
+        regularizers: nodes of reward terms that belong to the objective only.
         bootstrap: learn a value and add it at the end of every segment.
         value_lr: learning rate of the value network.
         td_lambda: weight of longer returns in the value's targets.
@@ -75,6 +76,7 @@ class Analytic:
         clip_norm: float = 1.0,
         gamma: float = 1.0,
         surrogates: dict[str, Any] | None = None,
+        regularizers: dict[str, Any] | None = None,
         bootstrap: bool = False,
         value_lr: float = 1e-3,
         td_lambda: float = 0.95,
@@ -93,24 +95,25 @@ class Analytic:
         self.learning_rate, self.final_share, self.clip_norm = learning_rate, final_share, clip_norm
         self.gamma, self.td_lambda, self.tau = gamma, td_lambda, tau
         self.bootstrap, self.compiled = bootstrap, compiled
-        self.surrogates: dict[str, RewardTerm] = {
-            name: build(node, f"agent.surrogates.{name}", name=name, time_step=time_step).to(device)
-            for name, node in (surrogates or {}).items()
-        }
+        self.surrogates = _terms("surrogates", surrogates, time_step, device)
+        self.regularizers = _terms("regularizers", regularizers, time_step, device)
         self.policy: TensorDictModuleBase = make_actor(
             observation_size, action_size, hidden, seed
         ).to(device)
         self.value = seeded_mlp(observation_size, 1, hidden, seed + 1).to(device)
         self.target = seeded_mlp(observation_size, 1, hidden, seed + 1).to(device)
-        self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=learning_rate)
+        self.optimizer = torch.optim.Adam(
+            self.policy.parameters(), lr=learning_rate, betas=(0.9, 0.99)
+        )
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=value_lr)
 
     def objective(self, terms: Sequence[RewardTerm]) -> list[tuple[RewardTerm, float]]:
         """Return what is maximised in place of the reward's terms, and each one's factor."""
         own = self.surrogates
-        return [
+        chosen = [
             (own[term.name], term.weight) if term.name in own else (term, 1.0) for term in terms
         ]
+        return chosen + [(term, 1.0) for term in self.regularizers.values()]
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""
@@ -188,6 +191,15 @@ class Analytic:
             learned = (self.value, self.target, self.value_optimizer)
             own |= dict(zip(("value", "target", "value_optimizer"), learned, strict=True))
         return own
+
+
+def _terms(
+    where: str, nodes: dict[str, Any] | None, time_step: float, device: str
+) -> dict[str, RewardTerm]:
+    return {
+        name: build(node, f"agent.{where}.{name}", name=name, time_step=time_step).to(device)
+        for name, node in (nodes or {}).items()
+    }
 
 
 class GradientTrainer(TrainingLoop):

@@ -17,6 +17,8 @@ from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.policies.actor import seeded_mlp
 
+ONE = 1.0 - 1e-6  # the largest action whose inverse tanh exists in single precision
+
 
 class Head(nn.Module):
     """Mean and standard deviation of the action before the tanh.
@@ -60,13 +62,9 @@ class SampledAction(TensorDictModuleBase):
         mean, spread = self.head(observation)
         columns = torch.arange(mean.shape[-1], device=mean.device)
         noise = normal(seed, step, self.stream + columns)
-        # TorchRL computes the density of a stored action from its inverse tanh, which must exist.
         return tensordict.set(
             "action", (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE)
         )
-
-
-ONE = 1.0 - 1e-6
 
 
 class SAC(OffPolicy):

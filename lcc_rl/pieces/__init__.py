@@ -3,6 +3,7 @@
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, Transition
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, Observation, TimeGap, TimeToCollision
+from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader, PlatoonLeader
 from lcc_rl.pieces.platoon import PlatoonErrors, PlatoonMotion, PlatoonObservation
 from lcc_rl.pieces.rewards import (
@@ -15,7 +16,7 @@ from lcc_rl.pieces.rewards import (
     TotalReward,
     VelocityReward,
 )
-from lcc_rl.pieces.surrogates import SmoothEfficiency, SmoothSafety
+from lcc_rl.pieces.surrogates import SmoothEfficiency, Smoothness, SmoothSafety
 from lcc_rl.pieces.termination import Collision
 from lcc_rl.pieces.vehicles import CAVMotion, IDMFollower
 
@@ -29,9 +30,11 @@ __all__ = [
     "Feature",
     "IDMFollower",
     "JerkReward",
+    "LeaderPreview",
     "MotorPower",
     "NGSIMLeader",
     "Observation",
+    "ObservationMemory",
     "Piece",
     "PlatoonErrors",
     "PlatoonLeader",
@@ -42,6 +45,7 @@ __all__ = [
     "SafetyReward",
     "SmoothEfficiency",
     "SmoothSafety",
+    "Smoothness",
     "TimeGap",
     "TimeToCollision",
     "TotalReward",

@@ -94,6 +94,8 @@ class Observation(Feature):
             ``{"cav": {"speed": 0.05}}``.
         visible: how many of a string of followers are seen, the nearest first.
         strings: namespaces of strings of followers.
+        widths: for namespaces whose entries are wider than one number their width, or a list as
+            long as they are wide, e.g. the horizons of a preview.
         name: entry written.
 
     Raises:
@@ -107,6 +109,7 @@ class Observation(Feature):
         scales: Mapping[str, Mapping[str, float]],
         visible: int = 1,
         strings: Sequence[str] = ("hdv",),
+        widths: Mapping[str, int | Sequence[float]] | None = None,
         name: str = "observation",
     ) -> None:
         flat = {(space, key): x for space, keys in scales.items() for key, x in keys.items()}
@@ -114,7 +117,11 @@ class Observation(Feature):
             raise ConfigError("observation.scales must name at least one entry, none with scale 0")
         if visible < 1:
             raise ConfigError(f"observation.visible must be at least 1, got {visible}")
-        counts = [visible if space in strings else 1 for space, _ in flat]
+        wide = {
+            space: width if isinstance(width, int) else len(width)
+            for space, width in (widths or {}).items()
+        }
+        counts = [visible if space in strings else wide.get(space, 1) for space, _ in flat]
         super().__init__(list(flat), [name], (sum(counts),))
         self.name, self.visible = name, visible
         self.strings = [space in strings for space, _ in flat]

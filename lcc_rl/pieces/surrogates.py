@@ -104,6 +104,25 @@ class SmoothEfficiency(RewardTerm):
         return -excess((gap / longest).clamp(min=1e-3).log(), self.width)
 
 
+class Smoothness(RewardTerm):
+    """Minus the square of the jerk: draws a policy that still learns away from limit cycles.
+
+    With a high gain on the gap a controlled car oscillates, and gradients through an oscillating
+    car are long and say little.
+
+    Args:
+        name, weight: see :class:`lcc_rl.pieces.rewards.RewardTerm`; the price of 1 (m/s³)².
+        vehicle: namespace of the vehicle.
+    """
+
+    def __init__(self, name: str = "smoothness", weight: float = 1.0, vehicle: str = "cav") -> None:
+        super().__init__(name, weight, [(vehicle, "jerk")])
+
+    def reward(self, jerk: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        return -jerk.square()
+
+
 def _log_softplus(value: Tensor) -> Tensor:
     """log(log(1 + eˣ)), which is x far below zero, where softplus itself is rounded to zero."""
     return softplus(value.clamp(min=-15.0)).log() + (value + 15.0).clamp(max=0.0)

@@ -24,15 +24,20 @@ from lcc_rl.pieces import (
     EnergyReward,
     IDMFollower,
     JerkReward,
+    LeaderPreview,
     MotorPower,
     NGSIMLeader,
     Observation,
+    ObservationMemory,
     Piece,
     PlatoonErrors,
     PlatoonLeader,
     PlatoonMotion,
     PlatoonObservation,
     SafetyReward,
+    SmoothEfficiency,
+    Smoothness,
+    SmoothSafety,
     TimeGap,
     TimeToCollision,
     TotalReward,
@@ -57,6 +62,11 @@ LEADING_CRUISE: dict[str, Callable[[], Piece]] = {
         "hdv", "predicted_acceleration", "predicted_power", event_shape=(2, 1)
     ),
     "Collision": lambda: Collision(["cav", "hdv"], followers=["hdv"]),
+    "LeaderPreview": lambda: LeaderPreview(wavy_profiles(), 0.1, [0.5, 3.0], noise=0.2, delay=0.1),
+    "ObservationMemory": lambda: ObservationMemory(0.1, ["leader.speed", "cav.gap"], [0.5, 1.0]),
+    "ObservationMemory, stacked": lambda: ObservationMemory(
+        0.1, ["leader.speed", "cav.gap"], [0.5, 1.0], "stacked", "stack"
+    ),
     "Observation": lambda: Observation(SCALES, visible=2),
     "SafetyReward": SafetyReward,
     "EfficiencyReward": EfficiencyReward,
@@ -65,6 +75,9 @@ LEADING_CRUISE: dict[str, Callable[[], Piece]] = {
         0.1, "hdv_energy", vehicle="hdv", power="predicted_power", followers=True
     ),
     "CollisionPenalty": CollisionPenalty,
+    "SmoothSafety": lambda: SmoothSafety("smooth_safety"),
+    "SmoothEfficiency": lambda: SmoothEfficiency("smooth_efficiency"),
+    "Smoothness": Smoothness,
     "TotalReward": lambda: TotalReward(TERMS),
 }
 N = 4

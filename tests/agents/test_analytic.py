@@ -1,0 +1,151 @@
+"""Analytic policy gradient: deterministic, resumable, honest record, and it learns."""
+
+from __future__ import annotations
+
+import math
+import signal
+
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION, compose, wavy_profiles
+
+from lcc_rl.agents.analytic import GradientTrainer
+from lcc_rl.agents.loop import derived_seed
+from lcc_rl.config import load
+from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.errors import ConfigError, Diverged, Interrupted
+from lcc_rl.results.files import read_parquet
+from lcc_rl.results.runs import identity
+
+SMALL = (
+    "agent=analytic",
+    "agent.hidden=[16,16]",
+    "training.episodes=40",
+    "training.environments=8",
+    "training.checkpoint_every=2",
+)
+BOOTSTRAP = ("training.segment=10", "agent.bootstrap=true", "agent.gamma=0.95")
+
+
+def make(folder, *overrides: str, variant: str = "alcc") -> GradientTrainer:
+    cfg = compose(variant, *SMALL, *overrides)
+    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
+    agent = build_agent(cfg, POPULATION)
+    return GradientTrainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+
+
+def weights(trainer: GradientTrainer) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
+
+
+@pytest.mark.parametrize("followers", [1, 5])
+@pytest.mark.parametrize("variant", ["alcc", "reference"])
+def test_same_seed_same_rows_and_weights(tmp_path, variant, followers) -> None:
+    settings = (f"scenario.followers={followers}", "training.episodes=16")
+    one, two = (make(tmp_path / name, *settings, variant=variant) for name in "ab")
+    pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
+    assert torch.equal(weights(one), weights(two))
+    other = make(tmp_path / "c", *settings, "seed=1", variant=variant)
+    other.run()
+    assert not torch.equal(weights(one), weights(other))
+
+
+@pytest.mark.parametrize("overrides", [(), BOOTSTRAP])
+def test_resuming_equals_never_having_stopped(tmp_path, overrides) -> None:
+    whole = make(tmp_path / "whole", *overrides)
+    expected = whole.run()
+    stopped = make(tmp_path / "parts", *overrides)
+    iterate = stopped._iterate
+
+    def interrupted(source):
+        if stopped.iteration == 2:
+            signal.raise_signal(signal.SIGTERM)
+        return iterate(source)
+
+    stopped._iterate = interrupted
+    with pytest.raises(Interrupted, match=r"after iteration 3 of 5; .*resume="):
+        stopped.run()
+    again = make(tmp_path / "parts", *overrides)
+    again.load()
+    assert again.iteration == 3
+    pd.testing.assert_frame_equal(again.run(), expected, check_exact=True)
+    assert torch.equal(weights(again), weights(whole))
+    stored = read_parquet(tmp_path / "parts" / "training.parquet")
+    pd.testing.assert_frame_equal(stored, expected, check_exact=True)
+
+
+def test_the_record_is_that_of_the_literal_reward(tmp_path) -> None:
+    trainer = make(tmp_path, "training.episodes=8")
+    row = trainer.run().iloc[0]
+    fresh = make(tmp_path / "again", "training.episodes=8")
+    fresh.env.set_seed(derived_seed(0, 0, "episodes"))
+    with torch.no_grad():
+        played = fresh.env.rollout(20, fresh.agent.policy, break_when_any_done=False)
+    terms = played["next", "reward_terms"].sum(1).mean(0)
+    for name in ("safety", "efficiency", "cav_energy", "hdv_energy"):
+        assert row[f"reward_{name}"] == pytest.approx(float(terms[name]), rel=1e-5), name
+    assert row["episode_reward"] == pytest.approx(float(played["next", "reward"].sum(1).mean()))
+
+
+def test_a_removed_term_is_not_optimised(tmp_path) -> None:
+    names = {term.name for term, _ in make(tmp_path).objective}
+    assert names == {
+        "safety",
+        "efficiency",
+        "cav_energy",
+        "hdv_energy",
+        "collision",
+        "smoothness",
+    }
+    trainer = make(tmp_path, "~reward.terms.efficiency", "reward.terms.safety.weight=3")
+    factors = {term.name: factor for term, factor in trainer.objective}
+    assert "efficiency" not in factors
+    assert factors["safety"] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["agent.gamma=0"], "gamma"),
+        (["agent.bootstrap=true"], r"bootstrap needs agent\.gamma below 1"),
+        (["agent.learning_rate=-1"], "learning_rate"),
+        (["agent.clip_norm=0"], "clip_norm"),
+        (["agent.final_share=2"], "final_share"),
+        (["agent.surrogates.safety.threshold=0"], r"surrogates\.safety\.threshold"),
+        (["agent.surrogates.safety.width=thin"], r"surrogates\.safety\.width must be"),
+        (["training.segment=7"], "segment"),
+    ],
+)
+def test_impossible_settings(tmp_path, overrides, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make(tmp_path, *overrides)
+
+
+def test_divergence_is_named(tmp_path) -> None:
+    trainer = make(tmp_path)
+    with torch.no_grad():
+        next(trainer.agent.policy.parameters()).fill_(math.nan)
+    with pytest.raises(Diverged, match=r"became nan in iteration 1 of 5; .*learning_rate"):
+        trainer.run()
+
+
+def test_its_length_comes_with_it_and_can_be_overridden() -> None:
+    assert load("train", ["agent=analytic"]).training.environments == 128
+    assert load("train", ["agent=analytic", "training.episodes=512"]).training.episodes == 512
+    assert load("train").training.environments == 20
+
+
+@pytest.mark.parametrize("overrides", [(), BOOTSTRAP])
+def test_learns_to_keep_going(tmp_path, overrides) -> None:
+    rows = make(
+        tmp_path,
+        *overrides,
+        "scenario.horizon=100",
+        "training.episodes=480",
+        "training.environments=16",
+        "agent.learning_rate=0.01",
+        "scenario.pieces.cav.initial_gap_range=[0.8,1.2]",
+    ).run()
+    # The objective, not the literal reward, is what a handful of steps is sure to improve.
+    assert rows["loss_actor"].tail(3).mean() < 0.6 * rows["loss_actor"].head(3).mean()

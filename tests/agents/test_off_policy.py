@@ -1,0 +1,140 @@
+"""TD3 and SAC: trained by DDPG's loop, deterministic and resumable like it."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION, compose, wavy_profiles
+from tensordict import TensorDict
+
+from lcc_rl.agents.training import Trainer
+from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.errors import ConfigError
+from lcc_rl.results.runs import identity
+
+SMALL = (
+    "training.episodes=16",
+    "training.environments=4",
+    "training.checkpoint_every=2",
+    "training.segment=10",
+    "agent.batch_size=32",
+    "agent.buffer_size=200",
+    "agent.hidden=[16,16]",
+)
+EACH = pytest.mark.parametrize("agent", ["td3", "sac"])
+
+
+def make(folder, agent: str, *overrides: str, variant: str = "alcc") -> Trainer:
+    cfg = compose(variant, f"agent={agent}", *SMALL, *overrides)
+    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
+    return Trainer(build_agent(cfg, POPULATION), env, cfg.training, cfg.seed, folder, identity(cfg))
+
+
+def weights(trainer: Trainer) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
+
+
+@EACH
+@pytest.mark.parametrize("variant", ["alcc", "reference"])
+def test_same_seed_same_rows_and_weights(tmp_path, agent, variant) -> None:
+    one, two = (make(tmp_path / name, agent, variant=variant) for name in "ab")
+    first = weights(one)
+    pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
+    assert torch.equal(weights(one), weights(two))
+    assert not torch.equal(weights(one), first)
+
+
+@EACH
+def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
+    whole = make(tmp_path / "whole", agent)
+    expected = whole.run()
+    first = make(tmp_path / "parts", agent)
+    iterate = first._iterate
+
+    def dies(source):
+        if first.iteration == 3:
+            raise MemoryError
+        return iterate(source)
+
+    first._iterate = dies
+    with pytest.raises(MemoryError):
+        first.run()
+    second = make(tmp_path / "parts", agent)
+    second.load()
+    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
+    assert torch.equal(weights(second), weights(whole))
+
+
+def batch(size: int = 64) -> TensorDict:
+    draw = torch.Generator().manual_seed(0)
+    flag = torch.zeros(size, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": torch.randn(size, 7, generator=draw),
+            "action": torch.rand(size, 1, generator=draw) * 1.8 - 0.9,
+            "next": {
+                "observation": torch.randn(size, 7, generator=draw),
+                "reward": torch.randn(size, 1, generator=draw),
+                "done": flag,
+                "terminated": flag.clone(),
+            },
+        },
+        [size],
+    )
+
+
+@EACH
+def test_an_update_leaves_the_global_generator_alone(agent) -> None:
+    made = build_agent(compose("alcc", f"agent={agent}", *SMALL), POPULATION)
+    before = torch.random.get_rng_state()
+    made.update(batch())
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@EACH
+def test_the_value_learns_a_constant_reward(agent) -> None:
+    overrides = ("agent.gamma=0", "agent.critic_lr=0.01")
+    made = build_agent(compose("alcc", f"agent={agent}", *SMALL, *overrides), POPULATION)
+    data = batch()
+    data["next", "reward"].fill_(2.0)
+    losses = [float(made.update(data)["loss_value"]) for _ in range(60)]
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_td3_moves_its_policy_every_second_update() -> None:
+    made = build_agent(compose("alcc", "agent=td3", *SMALL), POPULATION)
+    policy = next(made.policy.parameters())
+    moved = []
+    for _ in range(4):
+        before = policy.detach().clone()
+        made.update(batch())
+        moved.append(not torch.equal(before, policy))
+    assert moved == [False, True, False, True]
+
+
+def test_sac_explores_around_the_policy_that_is_kept() -> None:
+    cfg = compose("alcc", "agent=sac", *SMALL)
+    made = build_agent(cfg, POPULATION)
+    env = build_env(cfg, wavy_profiles(), POPULATION, 512)
+    td = made.policy(env.reset())
+    kept = td["action"].clone()
+    spread = (made.noise(td)["action"] - kept).std()
+    assert spread > 0.02
+    made.noise.sigma.fill_(0.0)
+    assert torch.allclose(made.noise(td)["action"], kept, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("agent", "override", "words"),
+    [
+        ("td3", "agent.policy_delay=0", "policy_delay"),
+        ("td3", "agent.policy_noise=-1", "policy_noise"),
+        ("td3", "agent.gamma=1", "gamma"),
+        ("sac", "agent.alpha_init=0", "alpha_init"),
+        ("sac", "agent.batch_size=5000000", "buffer_size"),
+    ],
+)
+def test_impossible_settings(agent, override, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        build_agent(compose("alcc", f"agent={agent}", override), POPULATION)

@@ -1,0 +1,96 @@
+"""Memory and preview: the right values, at the right time, for every agent that asks for them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers import POPULATION, compose, small_env, wavy_profiles
+
+from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.errors import ConfigError
+from lcc_rl.pieces import LeaderPreview, ObservationMemory
+
+FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1")
+
+
+def played(*overrides: str):
+    env = small_env("alcc", 2, [*FIRST, *overrides])
+    return env.rollout(20, lambda td: td.set("action", torch.zeros(2, 1)))
+
+
+def test_preview_is_what_the_leader_will_do() -> None:
+    data = played("+knowledge=preview", "scenario.pieces.preview.horizons=[0,0.5]")
+    seen, leader = data["preview", "speed"][0], data["leader", "speed"][0, :, 0]
+    assert torch.equal(seen[:, 0], leader)
+    assert torch.equal(seen[:-5, 1], leader[5:])
+    # It is part of the observation, scaled.
+    assert torch.allclose(data["observation"][0, :, -2:], 0.1 * seen)
+
+
+def test_a_delayed_preview_is_an_older_one() -> None:
+    late = ["scenario.pieces.preview.horizons=[0.5]", "scenario.pieces.preview.delay=0.2"]
+    data = played("+knowledge=preview", *late)
+    leader = data["leader", "speed"][0, :, 0]
+    assert torch.equal(data["preview", "speed"][0, :-3, 0], leader[3:])
+
+
+def test_beyond_the_record_its_last_speed_stands() -> None:
+    profiles = wavy_profiles(samples=30)
+    piece = LeaderPreview(profiles, 0.1, [60.0])
+    zero = torch.zeros(1, dtype=torch.int64)
+    assert piece.compute(zero, zero, zero, zero)[0] == profiles.record(0)[-1]
+
+
+def test_noise_is_as_large_as_stated_and_repeats_with_the_seed() -> None:
+    profiles, zero = wavy_profiles(), torch.zeros(20000, 1, dtype=torch.int64)
+    seeds = torch.arange(20000).unsqueeze(-1)
+    exact, noisy = (LeaderPreview(profiles, 0.1, [1.0], noise=n) for n in (0.0, 0.3))
+    error = noisy.compute(zero, zero, seeds, zero) - exact.compute(zero, zero, seeds, zero)
+    assert error.std().item() == pytest.approx(0.3, rel=0.03)
+    again = noisy.compute(zero, zero, seeds, zero) - exact.compute(zero, zero, seeds, zero)
+    assert torch.equal(error, again)
+
+
+def test_stacked_memory_is_what_was_measured() -> None:
+    settings = ["scenario.pieces.memory.kind=stacked", "scenario.pieces.memory.seconds=[0.5]"]
+    data = played("+knowledge=memory", *settings)
+    past, leader = data["memory", "entries"][0, :, 0], data["leader", "speed"][0, :, 0]
+    assert torch.equal(past[5:], leader[:-5])
+    assert (past[:5] == leader[0]).all()
+
+
+def test_filtered_memory_is_the_exponential_average() -> None:
+    data = played("+knowledge=memory", "scenario.pieces.memory.seconds=[2.0]")
+    average, leader = data["memory", "entries"][0, :, 0], data["leader", "speed"][0, :, 0]
+    share, expected = 1.0 - math.exp(-0.05), [leader[0].item()]
+    for speed in leader[1:].tolist():
+        expected.append(expected[-1] + share * (speed - expected[-1]))
+    assert torch.allclose(average, torch.tensor(expected), atol=1e-4)
+
+
+@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac", "analytic"])
+@pytest.mark.parametrize("knowledge", ["memory", "preview"])
+@pytest.mark.parametrize("variant", ["alcc", "reference"])
+def test_every_agent_can_use_it(agent, knowledge, variant) -> None:
+    cfg = compose(variant, f"agent={agent}", f"+knowledge={knowledge}")
+    env = build_env(cfg, wavy_profiles(), POPULATION, 3)
+    policy = build_agent(cfg, POPULATION).policy
+    assert env.rollout(5, policy)["action"].shape == (3, 5, 1)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: LeaderPreview(wavy_profiles(), 0.1, []), "horizons"),
+        (lambda: LeaderPreview(wavy_profiles(), 0.1, [1.0], noise=-1.0), "noise"),
+        (lambda: LeaderPreview(wavy_profiles(), 0.1, [1.0], delay=-1.0), "delay"),
+        (lambda: ObservationMemory(0.1, kind="remembered"), "remembered"),
+        (lambda: ObservationMemory(0.1, seconds=[0.0]), "shorter than a step"),
+        (lambda: ObservationMemory(0.1, sources=[]), "sources"),
+    ],
+)
+def test_impossible_settings(make, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make()

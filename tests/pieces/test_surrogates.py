@@ -1,0 +1,53 @@
+"""Smooth stand-ins: near the literal terms beyond their bend, with slopes that lead back."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.pieces import SafetyReward, SmoothEfficiency, Smoothness, SmoothSafety
+
+
+def column(*values: float) -> torch.Tensor:
+    return torch.tensor(values).unsqueeze(-1).requires_grad_()
+
+
+def test_safety_is_the_literal_term_where_the_bends_are_far() -> None:
+    gap, relative = column(6.0, 11.0, 4.0), column(-5.0, -4.0, -6.0)  # TTC 1, 2.5 and 0.5 s
+    smooth = SmoothSafety(width=0.001, gap_width=0.01, rate_width=0.001).reward(gap, relative)
+    assert torch.allclose(smooth, SafetyReward().reward(gap, relative), atol=2e-3)
+
+
+def test_safety_costs_nothing_where_it_is_safe() -> None:
+    gap, relative = column(20.0, 10.0, 3.0), column(0.0, 2.0, 0.5)
+    assert not SmoothSafety().reward(gap, relative).any()
+
+
+@pytest.mark.parametrize(("gap", "closing"), [(8.0, 3.0), (1.2, 1.0), (0.5, 1.0), (-3.0, 2.0)])
+def test_safety_always_leads_back(gap: float, closing: float) -> None:
+    distance, relative = column(gap), column(-closing)
+    SmoothSafety().reward(distance, relative).sum().backward()
+    assert 0 < float(distance.grad) < math.inf
+    assert 0 < float(relative.grad) < math.inf
+
+
+def test_efficiency_begins_at_its_threshold_and_leads_back() -> None:
+    gap, speed = column(12.0, 30.0, 3.0, 2.0), column(5.0, 5.0, 0.5, 0.5)  # TG 2.4, 6, 3, 2 s
+    value = SmoothEfficiency(threshold=2.5, width=0.1).reward(gap, speed)
+    assert (value < 0).squeeze(-1).tolist() == [False, True, True, False]
+    value.sum().backward()
+    assert float(gap.grad[1]) < 0 < float(speed.grad[1])
+    assert value[1].item() == pytest.approx(-math.log(6.0 / 2.5), abs=0.11)
+
+
+def test_smoothness_is_the_square_of_the_jerk() -> None:
+    assert Smoothness(weight=0.5).compute(torch.tensor([[2.0]])).item() == -2.0
+
+
+@pytest.mark.parametrize("setting", ["threshold", "width", "speed_floor"])
+def test_settings_must_be_positive(setting) -> None:
+    with pytest.raises(ConfigError, match=setting):
+        SmoothEfficiency(**{setting: 0.0})

@@ -1,0 +1,100 @@
+"""The comparison tool: tables by hand from fabricated runs, figures, and what it would run."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from helpers import compose
+
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.results.files import read_parquet, write_parquet
+from lcc_rl.results.runs import save_config
+
+PATH = Path(__file__).parents[2] / "tools" / "compare_agents.py"
+SPEC = importlib.util.spec_from_file_location("compare_agents", PATH)
+assert SPEC is not None
+assert SPEC.loader is not None
+tool = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(tool)
+
+
+def fabricate(folder: Path, variant: str, energy: float, *overrides: str) -> None:
+    cfg = compose(variant, *overrides)
+    save_config(cfg, folder)
+    episodes = pd.DataFrame(
+        {
+            "strategy": variant,
+            "total_energy_kj": [energy - 1.0, energy + 1.0],
+            "total_net_energy_kj": energy,
+            "share_ttc_unsafe": 0.0,
+            "share_time_gap_long": [0.0, 0.02],
+            "collided": False,
+        }
+    )
+    write_parquet(episodes, folder / "episodes.parquet")
+    training = {
+        "iteration": [1.0, 2.0],
+        "transitions": [40.0, 80.0],
+        "episode_reward": [-9.0, -8.0],
+    }
+    write_parquet(pd.DataFrame(training), folder / "training.parquet")
+    timing = {"iteration": [1.0, 2.0], "collect_s": [1.0, 2.0], "learn_s": [3.0, 4.0]}
+    write_parquet(pd.DataFrame(timing), folder / "timing.parquet")
+
+
+def test_gain_of_followers_is_paired_by_seed(tmp_path) -> None:
+    for seed, (alone, aware) in enumerate([(100.0, 98.0), (110.0, 104.5)]):
+        for variant, energy in (("reference", alone), ("alcc", aware)):
+            settings = ("agent=analytic", "scenario.followers=5", f"seed={seed}")
+            fabricate(tmp_path / f"{variant}{seed}", variant, energy, *settings)
+    fabricate(tmp_path / "lonely", "alcc", 50.0, "agent=analytic", "scenario.followers=2")
+    assert tool.main(["followers", "--draw", "--out", str(tmp_path)]) == 0
+    table = read_parquet(tmp_path / "followers.parquet")
+    assert table[["followers", "gamma", "seeds"]].to_numpy().tolist() == [[5, 1.0, 2]]
+    assert table["gain"][0] == pytest.approx((0.02 + 0.05) / 2)
+    assert table["share_time_gap_long_alcc"][0] == pytest.approx(0.01)
+    assert (tmp_path / "followers.png").stat().st_size > 1000
+
+
+def test_table_of_agents(tmp_path) -> None:
+    fabricate(tmp_path / "a", "alcc", 120.0, "agent=td3", "seed=2")
+    fabricate(tmp_path / "b", "reference", 118.0, "agent=analytic")
+    assert tool.main(["agents", "--draw", "--out", str(tmp_path)]) == 0
+    table = read_parquet(tmp_path / "agents.parquet").set_index("run")
+    assert table.loc["a", ["agent", "seed", "env_steps", "train_s"]].tolist() == ["td3", 2, 80, 10]
+    assert table.loc["b", "total_energy_kj"] == 118.0
+    assert (tmp_path / "agents.png").stat().st_size > 1000
+
+
+def test_what_knowledge_is_worth(tmp_path) -> None:
+    fabricate(tmp_path / "none" / "seed_0", "alcc", 100.0, "agent=analytic")
+    fabricate(tmp_path / "preview_5s" / "seed_0", "alcc", 90.0, "agent=analytic")
+    assert tool.main(["knowledge", "--draw", "--out", str(tmp_path)]) == 0
+    table = read_parquet(tmp_path / "knowledge.parquet").set_index("knowledge")
+    assert table.loc["preview_5s", "saving"] == pytest.approx(0.1)
+    assert (tmp_path / "knowledge.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("part", ["agents", "followers", "knowledge"])
+def test_every_run_it_would_start_composes(part, tmp_path) -> None:
+    words = [part, "--seeds", "1", "--out", str(tmp_path), "experiment=smoke"]
+    options, overrides = tool.parser().parse_known_args(words)
+    options.overrides = overrides
+    runs = tool.PARTS[part][0](options)
+    assert len(runs) == {"agents": 4 * 2 + 1, "followers": 4 * 2, "knowledge": 6}[part]
+    assert len({run.folder for run in runs}) == len(runs)
+    for run in runs:
+        assert run.compose().scenario.horizon == 60
+
+
+def test_nothing_finished(tmp_path) -> None:
+    with pytest.raises(ResultsError, match="no finished training"):
+        tool.main(["followers", "--draw", "--out", str(tmp_path)])
+
+
+def test_a_typing_error_is_no_override(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="--sedes"):
+        tool.main(["followers", "--sedes=3"])
