@@ -65,7 +65,6 @@ def test_every_option_of_a_group_builds(group) -> None:
             observation_size=7,
             action_size=1,
             seed=0,
-            time_step=0.1,
         )
         assert built is not None
 
