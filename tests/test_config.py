@@ -61,6 +61,7 @@ def test_every_option_of_a_group_builds(group) -> None:
             group,
             population=POPULATION,
             max_acceleration=3.0,
+            time_step=0.1,
             observation_size=7,
             action_size=1,
             seed=0,
