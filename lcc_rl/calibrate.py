@@ -51,7 +51,6 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
     calibrator = build(cfg.calibration, "calibration")
     dataset = build(cfg.data, "data").load()
     _say(console, dataset.report)
-    save_config(cfg, Path(folder))
     start = perf_counter()
     with _progress(console) as bar:
         task = bar.add_task("calibration")
@@ -64,6 +63,7 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
             ),
         )
     seconds = perf_counter() - start
+    save_config(cfg, Path(folder))
     _say(console, result.report)
     _write(result, cfg, Path(folder))
     console.print(_summary(result.drivers))

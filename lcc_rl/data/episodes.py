@@ -30,6 +30,7 @@ COLUMNS = tuple(SCHEMA)
 ALIASES = {"event": "episode", "period": "recording"}
 NUMBERS = tuple(name for name, kind in SCHEMA.items() if kind != "str")
 SPEEDS = ("follower_speed_mps", "leader_speed_mps")
+LARGEST = 1e12  # beyond any time or place, and within every type
 PLAUSIBLE_SPEED = 70.0  # m/s; above it a column is in km/h or ft/s rather than driven that fast
 
 
@@ -148,6 +149,9 @@ def _checked_numbers(column: pd.Series, source: str) -> pd.Series:
         if wrong.any():
             shown = column.iloc[int(np.argmax(wrong))]
             raise _at(source, wrong, name, f"holds {shown!r}; expected a whole number")
+    elif (wrong := (numbers.abs() > LARGEST).to_numpy()).any():
+        shown = column.iloc[int(np.argmax(wrong))]
+        raise _at(source, wrong, name, f"holds {shown!r}; expected at most {LARGEST:g}")
     return numbers
 
 

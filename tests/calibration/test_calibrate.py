@@ -71,7 +71,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     out = io.StringIO()
     drivers = calibrate.run(cfg, tmp_path / "run", Console(file=out, width=100))
     names = sorted(path.name for path in (tmp_path / "run").iterdir())
-    assert names == ["calibration.png", "drivers.parquet", "joint_distribution.png"]
+    assert names == ["calibration.png", "config.yaml", "drivers.parquet", "joint_distribution.png"]
     written = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
     pd.testing.assert_frame_equal(written, drivers, check_dtype=False)
     metadata = parquet_metadata(tmp_path / "run" / "drivers.parquet")
@@ -179,7 +179,7 @@ def test_command_writes_into_the_run_folder(source):
 
 @pytest.mark.parametrize(
     ("override", "message"),
-    [("data.path=/no/such", "/no/such: no such file"), ("calibration=locl", "calibration/locl")],
+    [("data.path=/no/such", "/no/such: no such file"), ("calibration=locl", "'locl'")],
 )
 def test_command_ends_bad_input_with_one_line_and_code_two(source, override, message):
     done = command(source, "data=own", override)
