@@ -10,7 +10,6 @@ import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
 from lcc_rl.agents import Analytic
 from lcc_rl.agents.analytic import GradientTrainer
@@ -30,7 +29,7 @@ from lcc_rl.results.loggers import Silent
 from lcc_rl.results.platoon_tables import case_table
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
 from lcc_rl.results.states import working
-from lcc_rl.results.tables import as_rich, summary
+from lcc_rl.results.tables import as_rich, show, summary
 
 log = logging.getLogger("lcc_rl")
 
@@ -277,7 +276,7 @@ def evaluate_and_write(
         f"{episodes['driver_id'].nunique()} drivers, {cfg.scenario.horizon} steps"
     )
     if not quiet:
-        Console().print(as_rich(summary(episodes), title))
+        show(as_rich(summary(episodes), title))
     return episodes
 
 

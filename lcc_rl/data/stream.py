@@ -130,7 +130,7 @@ class StreamSource:
         leader: the stochastic leader; by default the one fitted to I-80.
         drivers: the population; by default the shipped I-80 drivers.
         criteria: what counts as car following; by default that of the real files.
-        path: where the file is kept, ``.gz`` compresses it; by default it is read and forgotten.
+        keep: where the file is written and kept, ``.gz`` compresses it; by default it is read and forgotten.
 
     Raises:
         ConfigError: if an argument is out of range, naming it.
@@ -145,7 +145,7 @@ class StreamSource:
     leader: StopAndGo | None = None
     drivers: DriverPopulation | None = None
     criteria: Criteria | None = None
-    path: str | None = None
+    keep: str | None = None
 
     def __post_init__(self) -> None:
         _at_least("recordings", self.recordings, 1)
@@ -191,7 +191,7 @@ class StreamSource:
             ResultsError: if the file cannot be written.
         """
         with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
-            path = Path(self.path or Path(folder) / "stream.csv").expanduser()
+            path = Path(self.keep or Path(folder) / "stream.csv").expanduser()
             self.write(path)
             loaded = NgsimSource(str(path), criteria=self.criteria).load()
         size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -29,6 +28,7 @@ from lcc_rl.results.files import write_parquet
 from lcc_rl.results.platoon_figures import write_platoon_figures
 from lcc_rl.results.platoon_tables import as_rich, case_table
 from lcc_rl.results.runs import identity, load_policy, save_config
+from lcc_rl.results.tables import show
 
 log = logging.getLogger("lcc_rl")
 
@@ -340,5 +340,5 @@ def evaluate_and_write(
     write_parquet(steps, folder / "steps.parquet", metadata)
     if not quiet:
         for case in dict.fromkeys(episodes["case"]):
-            Console().print(as_rich(case_table(episodes, case), case))
+            show(as_rich(case_table(episodes, case), case))
     return episodes

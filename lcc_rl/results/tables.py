@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -135,3 +136,11 @@ def as_rich(table: pd.DataFrame, title: str) -> Table:
             cells = ("–" if pd.isna(value) else form.format(value) for value in table[key])
             drawn.add_row(escape(label), *cells)
     return drawn
+
+
+def show(table: Table) -> None:
+    """Print a table: as wide as the terminal, or as its content where there is none to fit."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=max(console.measure(table).maximum, console.width))
+    console.print(table)

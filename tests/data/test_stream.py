@@ -75,7 +75,7 @@ def test_followers_are_idm_with_the_stated_parameters(stream: Stream) -> None:
 
 
 def test_calibration_recovers_the_time_gaps(stream: Stream, tmp_path: Path) -> None:
-    source = StreamSource(**SMALL, noise=0.0, seed=5, path=str(tmp_path / "stream.csv"))
+    source = StreamSource(**SMALL, noise=0.0, seed=5, keep=str(tmp_path / "stream.csv"))
     found = fit(source.load().episodes).drivers
     keys = ["recording", "vehicle"]
     both = found.rename(columns={"follower_id": "vehicle"}).merge(
@@ -121,7 +121,7 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
 
 def test_file_and_truth_are_kept_where_asked(tmp_path: Path) -> None:
     path = tmp_path / "new" / "stream.csv.gz"
-    source = StreamSource(**SMALL, seed=5, path=str(path))
+    source = StreamSource(**SMALL, seed=5, keep=str(path))
     loaded = source.load()
     assert sorted(file.name for file in path.parent.iterdir()) == [
         "stream.csv.gz",
