@@ -130,7 +130,8 @@ class StreamSource:
         leader: the stochastic leader; by default the one fitted to I-80.
         drivers: the population; by default the shipped I-80 drivers.
         criteria: what counts as car following; by default that of the real files.
-        keep: where the file is written and kept, ``.gz`` compresses it; by default it is read and forgotten.
+        keep: where the file is written and kept, ``.gz`` compresses it; by default it is read
+            and forgotten.
 
     Raises:
         ConfigError: if an argument is out of range, naming it.
