@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import intervals
+from lcc_rl.results.tables import strategies_side_by_side
 
 COUNTS = ("switches", "clamps", "cap_interventions")
 
@@ -137,12 +137,5 @@ ROWS = (
 
 def as_rich(table: pd.DataFrame, title: str) -> Table:
     """Draw a case's table for the terminal, a column per strategy."""
-    drawn = Table(title=escape(title), caption="sums over followers and frames, means over runs")
-    drawn.add_column("")
-    for strategy in table["strategy"]:
-        drawn.add_column(str(strategy), justify="right")
-    for label, key, form in ROWS:
-        if table[key].notna().any():
-            cells = ("–" if pd.isna(value) else form.format(value) for value in table[key])
-            drawn.add_row(escape(label), *cells)
-    return drawn
+    caption = "sums over followers and frames, means over runs"
+    return strategies_side_by_side(table, ROWS, title, caption)

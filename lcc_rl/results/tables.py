@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import pandas as pd
 from rich.console import Console
@@ -125,13 +127,27 @@ ROWS = (
 
 def as_rich(table: pd.DataFrame, title: str) -> Table:
     """Draw a summary for the terminal, a column per strategy; positive savings are savings."""
-    drawn = Table(
-        title=escape(title), caption="energies: mean per episode; direct: no controlled car"
-    )
+    caption = "energies: mean per episode; direct: no controlled car"
+    return strategies_side_by_side(table, ROWS, title, caption)
+
+
+def strategies_side_by_side(
+    table: pd.DataFrame, rows: Iterable[tuple[str, str, str]], title: str, caption: str
+) -> Table:
+    """Draw a table for the terminal with a column per strategy.
+
+    Args:
+        table: one row per strategy, named in the column ``strategy``.
+        rows: label, column of ``table`` and number format of what is shown, in order; columns
+            without any value are left out.
+        title: above the table.
+        caption: below it.
+    """
+    drawn = Table(title=escape(title), caption=caption)
     drawn.add_column("")
     for strategy in table["strategy"]:
         drawn.add_column(str(strategy), justify="right")
-    for label, key, form in ROWS:
+    for label, key, form in rows:
         if table[key].notna().any():
             cells = ("–" if pd.isna(value) else form.format(value) for value in table[key])
             drawn.add_row(escape(label), *cells)
