@@ -98,7 +98,7 @@ def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
     for key in ("horizon", "time_step", "followers"):
         other.scenario[key] = cfg.scenario[key]
     for name, node in other.scenario.pieces.items():
-        for key, value in cfg.scenario.pieces.get(name, {}).items():
+        for key, value in (cfg.scenario.pieces.get(name) or {}).items():
             if isinstance(value, (int, float)) and (name, key) not in OWN_SETTINGS:
                 node[key] = value
 
