@@ -97,6 +97,16 @@ def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
     assert {"episode_alcc.png", "human_energy_alcc.png", "improvement_alcc_vs_idm.png"} <= figures
 
 
+def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_path) -> None:
+    policy = f"policy={trained}"
+    free = evaluate.run(tiny("evaluate", "variant=alcc", policy), tmp_path / "a")
+    held = evaluate.run(tiny("evaluate", "variant=alcc", policy, "+filter=barrier"), tmp_path / "b")
+    means = [rows.groupby("strategy")["min_ttc_s"].mean() for rows in (free, held)]
+    assert means[0]["idm"] == means[1]["idm"]
+    assert means[0]["alcc"] != means[1]["alcc"]
+    assert (held.loc[held["strategy"] == "alcc", "share_ttc_unsafe"] == 0).all()
+
+
 def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
     # A quieter scenario must reach the baselines as well, without changing what they are.
     quiet = "scenario.pieces.hdv.noise=0"
