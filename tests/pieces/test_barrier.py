@@ -63,7 +63,7 @@ def test_a_limit_leaves_the_state_a_gradient() -> None:
     piece.compute(torch.ones(1, 1), speed, gap, ahead, torch.zeros(1, 1)).sum().backward()
     assert gap.grad is not None
     # More room, more acceleration: by rate / (τ + T/2), as a share of the largest.
-    assert gap.grad.item() == pytest.approx(2.0 / 4.25 / 3.0, rel=1e-5)
+    assert gap.grad.item() == pytest.approx(1.0 / 4.05 / 3.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("setting", ["time_to_collision", "time_gap", "rate", "max_acceleration"])
