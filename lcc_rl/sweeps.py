@@ -5,27 +5,34 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import logging.config
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, read_write
+from rich.console import Console
+from rich.live import Live
 
 from lcc_rl.errors import Interrupted, LccError
+from lcc_rl.overview import live
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.runs import NOT_IDENTITY, identity
 from lcc_rl.results.states import Busy, one_line, record, survey
+from lcc_rl.search import go_on
 
 log = logging.getLogger("lcc_rl")
 
 PLAN = "sweep.json"
 LONGEST_NAME = 100  # characters of a folder's name that say what is in it
+SILENT = logging.CRITICAL + 1
 WAITING = math.nan  # what a run returns to a sweeper that has no result of it
 
 
@@ -84,10 +91,12 @@ register_resolvers()
 
 
 class SweepCallback(Callback):
-    """Says at the start where a sweep's runs go, and keeps their number for onlookers."""
+    """Says at the start where a sweep's runs go, keeps their number for onlookers, draws them."""
 
     # Of the sweep of this process; Hydra tells nobody else where it is.
     folder: Path | None = None
+    table: Live | None = None
+    lines: ClassVar[Any] = None  # how log lines are shown where there is no table
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the plan and announce the folder."""
@@ -99,6 +108,36 @@ class SweepCallback(Callback):
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
         log.info(words, plan.runs, folder, folder)
+        go_on(config, alone=not any(state.state == "running" for state in survey(folder)))
+        if sys.stdout.isatty():
+            self._draw(config, plan.runs)
+
+    @classmethod
+    def _draw(cls, config: DictConfig, planned: int) -> None:
+        """Show one table instead of lines; Hydra sets its lines up anew after every run."""
+        hydra = config.hydra
+        cls.lines = OmegaConf.to_container(hydra.hydra_logging, resolve=True)
+        with read_write(config):
+            hydra.hydra_logging.root.handlers = []
+        mute()
+        cls.table = live(Path(hydra.sweep.dir), lambda: planned, Console(highlight=False))
+        cls.table.start(refresh=True)
+
+    @classmethod
+    def end(cls) -> Path | None:
+        """Finish the table and forget the sweep; return its folder, if there was one."""
+        if cls.table is not None:
+            cls.table.stop()
+            logging.config.dictConfig(cls.lines)
+        folder, cls.folder, cls.table = cls.folder, None, None
+        return folder
+
+
+def mute() -> None:
+    """Keep log lines from the terminal, where they would cut the table up; files keep them."""
+    for handler in logging.getLogger().handlers:
+        if type(handler) is logging.StreamHandler:
+            handler.setLevel(SILENT)
 
 
 def limit_batches(config: DictConfig) -> None:
@@ -155,6 +194,8 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
     Raises:
         KeyboardInterrupt: where the user stopped it: that stops the sweep.
     """
+    if sys.stdout.isatty():
+        mute()
     try:
         return function(cfg)
     except Interrupted as error:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
+from lcc_rl.overview import counts, headline, remaining
 from lcc_rl.results.states import (
     ERROR,
     LOCK,
@@ -23,7 +24,7 @@ from lcc_rl.results.states import (
     survey,
     working,
 )
-from lcc_rl.status import counts, headline, main, remaining
+from lcc_rl.status import main
 
 
 def test_a_claimed_folder_is_refused_to_others_and_free_afterwards(tmp_path) -> None:
