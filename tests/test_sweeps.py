@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
+import pty
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
+import compare_launchers
 import pandas as pd
 import pytest
 from omegaconf import OmegaConf
@@ -173,26 +176,45 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     assert second.returncode == 2
 
 
+def on_terminal(cwd: Path, *words: str) -> str:
+    """Do a sweep on a terminal and return what that showed."""
+    ours, its = pty.openpty()
+    typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
+    env = {**os.environ, "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
+    child = subprocess.Popen(typed, cwd=cwd, stdin=its, stdout=its, stderr=its, env=env)
+    os.close(its)
+    shown = b""
+    with suppress(OSError), open(ours, "rb", buffering=0) as screen:
+        while part := screen.read(65536):
+            shown += part
+    assert child.wait(60) == 2, shown.decode()
+    return shown.decode()
+
+
+def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
+    words = ["experiment=smoke", "variant=idm", "data.platoons=4", "data.recordings=2"]
+    words += ["agent.time_gap=1.2,1.3,-1", "scenario.horizon=40", "sweep=mine"]
+    shown = on_terminal(tmp_path, *words)
+    table, _, end = shown.rpartition("┘")
+    assert "waiting" in table
+    assert "3 runs: 2 finished, 1 failed" in end
+    assert "2 of 3 runs finished" in end
+    assert "failed: agent.time_gap=-1_" in end
+    # Log lines stay in the files, also Hydra's own between two runs.
+    assert "[lcc_rl][INFO]" not in shown
+    assert "#2 :" not in shown
+    (log,) = (tmp_path / "outputs/train/mine").glob("agent.time_gap=1.3_*/train.log")
+    assert "synthetic stream" in log.read_text()
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("launcher", "package"),
-    [("lcc_joblib", "hydra_joblib_launcher"), ("lcc_submitit_local", "hydra_submitit_launcher")],
-)
-def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, package) -> None:
-    pytest.importorskip(f"hydra_plugins.{package}", reason="extra sweeps")
-    words = ["experiment=smoke", "variant=alcc", "data.platoons=4", "data.recordings=2"]
-    words += ["scenario.horizon=40", "agent.batch_size=64", "agent.hidden=[16,16]", "seed=0,1"]
-    done = sweep(tmp_path, *words, "sweep=x", f"hydra/launcher={launcher}")
-    assert done.returncode == 0, done.stderr
-    for seed in (0, 1):
-        cfg = tiny("train", "variant=alcc", f"seed={seed}")
-        train.run(cfg, tmp_path / str(seed), quiet=True)
-        (folder,) = (tmp_path / "outputs" / "train" / "x").glob(f"seed={seed}_*")
-        for table in ("training", "episodes", "steps"):
-            one, two = (
-                read_parquet(f / f"{table}.parquet") for f in (tmp_path / str(seed), folder)
-            )
-            pd.testing.assert_frame_equal(one, two, check_exact=True)
+@pytest.mark.parametrize("launcher", ["joblib", "submitit", "ray"])
+def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, capsys) -> None:
+    if not compare_launchers.installed(compare_launchers.LAUNCHERS[launcher][1]):
+        pytest.skip("extras sweeps, ray")
+    arguments = ["serial", launcher, "--seeds=1", f"--out={tmp_path}"]
+    assert compare_launchers.main(arguments) == 0
+    assert capsys.readouterr().out.count("those of serial") == 2
 
 
 def test_random_kills_lose_nothing() -> None:

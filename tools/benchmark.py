@@ -24,6 +24,7 @@ from benchmarks.harness import EXTRA, Row, drawn, installed, machine
 from benchmarks.infer import infer
 from benchmarks.read import read
 from benchmarks.scale import scale
+from benchmarks.sweep import sweep
 from benchmarks.train import train
 from benchmarks.update import update
 from rich.console import Console
@@ -31,7 +32,7 @@ from rich.console import Console
 from lcc_rl.errors import LccError, unknown_name
 from lcc_rl.results.files import write_parquet
 
-LISTED = (read, env, estimator, collect, update, train, calibrate, evaluate, scale, infer)
+LISTED = (read, env, estimator, collect, update, train, calibrate, evaluate, scale, infer, sweep)
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
 }
@@ -64,8 +65,8 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
 
 
 def devices(options: Namespace, name: str) -> list[str]:
-    """Return where to run a benchmark: the reader knows no device."""
-    if name == "read":
+    """Return where to run a benchmark: the reader knows no device, short runs need none."""
+    if name in ("read", "sweep"):
         return ["cpu"]
     if options.device is not None:
         return [options.device]

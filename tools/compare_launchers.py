@@ -17,11 +17,11 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, getrusage
 
 import pandas as pd
+from benchmarks.harness import installed
 
 from lcc_rl import results
 
@@ -57,14 +57,6 @@ class Spent:
             f"{self.wall_s:.0f} s, {self.cpu_s / whole:.0%} of {cores} cores; others took "
             f"{self.others_s / whole:.0%}, of the rest {self.cpu_s / (whole - self.others_s):.0%}"
         )
-
-
-def installed(launcher: str) -> bool:
-    """Whether a launcher's package is at hand."""
-    try:
-        return find_spec(LAUNCHERS[launcher][1]) is not None
-    except ModuleNotFoundError:
-        return False
 
 
 def busy() -> float:
@@ -109,7 +101,7 @@ def run(launchers: Sequence[str], words: Sequence[str], folder: Path) -> bool:
     """Do the sweep with every launcher and say what it took; False where rows differ."""
     same = True
     for launcher in launchers:
-        if not installed(launcher):
+        if not installed(LAUNCHERS[launcher][1]):
             print(f"{launcher:<9} left out: not installed here")
             continue
         print(f"{launcher:<9} {sweep(launcher, words, folder)}", flush=True)

@@ -23,6 +23,7 @@ NAMES = (
     "evaluate",
     "scale",
     "infer",
+    "sweep",
 )
 COLUMNS = [
     "benchmark",
