@@ -7,6 +7,7 @@ import sys
 import time
 from argparse import Namespace
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, getrusage
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -21,7 +22,7 @@ SHORT = ("experiment=smoke", "variant=alcc")
 
 
 def sweep(options: Namespace) -> list[Row]:
-    """Seconds of a core a run takes, all but its training, by launcher; seconds to read all.
+    """Seconds of a core that a run takes besides its training, by launcher; seconds to read all.
 
     Everything counts: imports, composing, the data, checkpoints, the evaluation, the files.
     """
@@ -34,26 +35,30 @@ def sweep(options: Namespace) -> list[Row]:
         for case, (launcher, cores) in jobs.items():
             words = [*SHORT, f"seed=range({runs})", f"threads={options.threads}", launcher]
             place = Path(folder) / case.replace(" ", "-")
-            wall = seconds_of([*words, f"hydra.sweep.dir={place}"])
+            wall, used = seconds_of([*words, f"hydra.sweep.dir={place}"])
             timing = results.load(place, "timing")
             training = float(timing[["collect_s", "learn_s"]].sum().sum())
-            value = {f"a run, {case}": np.array([(wall * cores - training) / runs])}
-            rows += rows_of("sweep", value, "s", batch=runs)
+            # A busy machine lengthens everything alike: the shares of the clock are those of work.
+            besides = 1.0 - training / (wall * cores)
+            for unit, spent in (("s", wall * cores), ("s of processor", used)):
+                value = {f"a run, {case}": np.array([spent * besides / runs])}
+                rows += rows_of("sweep", value, unit, batch=runs)
         begun = time.perf_counter()
         assert results.load(place)["run"].nunique() == runs
         reading = {"reading all results": np.array([time.perf_counter() - begun])}
     return rows + rows_of("sweep", reading, "s", batch=runs)
 
 
-def seconds_of(words: list[str]) -> float:
-    """Do a sweep in a process of its own and return how long that took [s].
+def seconds_of(words: list[str]) -> tuple[float, float]:
+    """Do a sweep in a process of its own; return its seconds on the clock and of processors.
 
     Raises:
         ResultsError: if it fails, with what it said.
     """
     command = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
-    begun = time.perf_counter()
+    begun, before = time.perf_counter(), getrusage(RUSAGE_CHILDREN)
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
         raise ResultsError(f"the sweep failed: {done.stderr[-1000:]}")
-    return time.perf_counter() - begun
+    wall, after = time.perf_counter() - begun, getrusage(RUSAGE_CHILDREN)
+    return wall, after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
