@@ -64,6 +64,8 @@ def start(words: Sequence[str], log: Path) -> int:
     os.dup2(output, 1)
     os.dup2(output, 2)
     faulthandler.register(signal.SIGUSR1)
+    # A shell that starts this in the background makes it, and all below it, deaf to SIGINT.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.argv = ["train", "-m", *words]
     code = 0
     try:
