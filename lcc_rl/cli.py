@@ -29,6 +29,7 @@ from lcc_rl.sweeps import SweepCallback, conclude, run_job
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 BAD_INPUT = 2
+NO_BEST = "No trials are completed"  # says Optuna
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
@@ -85,6 +86,10 @@ def sweep(command: Callable[[], Any]) -> None:
         if folder is None:
             raise
         raise Interrupted(f"stopped; the same command goes on in {folder}") from None
+    except ValueError as error:
+        # Hydra's plugin wants the best trial also where every one failed: conclude names those.
+        if NO_BEST not in str(error):
+            raise
     finally:
         folder = SweepCallback.end()
     if folder is not None:

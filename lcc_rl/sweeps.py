@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import logging.config
 import math
 import os
 import re
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import configure_log
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, read_write
 from rich.console import Console
@@ -33,7 +33,7 @@ log = logging.getLogger("lcc_rl")
 PLAN = "sweep.json"
 LONGEST_NAME = 100  # characters of a folder's name that say what is in it
 SILENT = logging.CRITICAL + 1
-WAITING = math.nan  # what a run returns to a sweeper that has no result of it
+WAITING = None  # what a run returns to a sweeper that has no result of it; Optuna refuses NaN
 
 
 def register_resolvers() -> None:
@@ -116,9 +116,9 @@ class SweepCallback(Callback):
     def _draw(cls, config: DictConfig, planned: int) -> None:
         """Show one table instead of lines; Hydra sets its lines up anew after every run."""
         hydra = config.hydra
-        cls.lines = OmegaConf.to_container(hydra.hydra_logging, resolve=True)
+        cls.lines = hydra.hydra_logging.copy()
         with read_write(config):
-            hydra.hydra_logging.root.handlers = []
+            OmegaConf.update(hydra.hydra_logging, "root.handlers", [], force_add=True)
         mute()
         cls.table = live(Path(hydra.sweep.dir), lambda: planned, Console(highlight=False))
         cls.table.start(refresh=True)
@@ -128,7 +128,7 @@ class SweepCallback(Callback):
         """Finish the table and forget the sweep; return its folder, if there was one."""
         if cls.table is not None:
             cls.table.stop()
-            logging.config.dictConfig(cls.lines)
+            configure_log(cls.lines)
         folder, cls.folder, cls.table = cls.folder, None, None
         return folder
 
@@ -168,7 +168,7 @@ def make_plan(config: DictConfig) -> Plan:
     sweeper = config.hydra.sweeper
     typed = [str(item) for item in config.hydra.overrides.task]
     typed += [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
-    parsed = OverridesParser.create().parse_overrides(typed)
+    parsed = OverridesParser.create().parse_overrides(that_matter(typed))
     swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
     if "n_trials" in sweeper:
@@ -189,7 +189,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
     """Do one run of a sweep; a failure is recorded in its folder and does not stop the others.
 
     Returns:
-        What the function returns; NaN where it failed.
+        What the function returns; None where it failed.
 
     Raises:
         KeyboardInterrupt: where the user stopped it: that stops the sweep.

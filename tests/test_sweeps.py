@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import pty
 import subprocess
@@ -17,7 +16,7 @@ import pytest
 from omegaconf import OmegaConf
 from test_entry_points import tiny
 
-from lcc_rl import results, train
+from lcc_rl import cli, results, train
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.results.files import read_parquet
@@ -25,6 +24,7 @@ from lcc_rl.results.runs import identity
 from lcc_rl.results.states import ERROR, Busy, claim
 from lcc_rl.sweeps import (
     Plan,
+    SweepCallback,
     conclude,
     make_plan,
     parallel_jobs,
@@ -70,6 +70,9 @@ def test_plans_know_grids_and_searches(tmp_path) -> None:
     cfg = hydra_like(tmp_path, "seed=4")
     cfg.hydra.overrides.task = ["seed=range(8)", "variant=alcc,reference", "agent.gamma=0.9"]
     assert make_plan(cfg) == Plan(16, ["seed", "variant"])
+    # Where its rows are sent to does not make another run.
+    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,tensorboard"]
+    assert make_plan(cfg) == Plan(8, ["seed"])
     cfg.hydra.sweeper = {"n_trials": 40, "params": {"agent.tau": "interval(0.001,0.01)"}}
     cfg.hydra.overrides.task = []
     assert make_plan(cfg) == Plan(40, ["agent.tau"])
@@ -85,7 +88,7 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
     def breaks(cfg):
         raise ConfigError("too much")
 
-    assert math.isnan(run_job(breaks, tiny("train"), tmp_path / "a"))
+    assert run_job(breaks, tiny("train"), tmp_path / "a") is None
     assert (tmp_path / "a" / ERROR).read_text() == "too much\n"
     with pytest.raises(LccError, match="1 of 1 runs failed"):
         conclude(tmp_path)
@@ -93,7 +96,7 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
     def busy(cfg):
         raise Busy("another process")
 
-    assert math.isnan(run_job(busy, tiny("train"), tmp_path / "b"))
+    assert run_job(busy, tiny("train"), tmp_path / "b") is None
     assert not (tmp_path / "b").exists()
 
     def stopped(cfg):
@@ -102,6 +105,17 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
     # Not an Exception: a launcher would take that for one run's failure and begin the next.
     with pytest.raises(KeyboardInterrupt):
         run_job(stopped, tiny("train"), tmp_path / "c")
+
+
+def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) -> None:
+    def command() -> None:
+        monkeypatch.setattr(SweepCallback, "folder", tmp_path)
+        assert run_job(lambda cfg: 1 / 0, tiny("train"), tmp_path / "a") is None
+        raise ValueError("No trials are completed yet.")
+
+    with pytest.raises(LccError, match="1 of 1 runs failed"):
+        cli.sweep(command)
+    assert SweepCallback.folder is None
 
 
 def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, monkeypatch) -> None:
