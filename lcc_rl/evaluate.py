@@ -51,6 +51,11 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     if cfg.scenario.name == platoon_cases.SCENARIO:
         return platoon_cases.run(cfg, folder, quiet)
+    for path in (cfg.policy, *cfg.compare):
+        if (
+            path is not None
+        ):  # a file that is missing should not be noticed after minutes of reading
+            load_policy(path, cfg.variant, tuple(cfg.trust))
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
@@ -98,7 +103,7 @@ def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
     for key in ("horizon", "time_step", "followers"):
         other.scenario[key] = cfg.scenario[key]
     for name, node in other.scenario.pieces.items():
-        for key, value in cfg.scenario.pieces.get(name, {}).items():
+        for key, value in (cfg.scenario.pieces.get(name) or {}).items():
             if isinstance(value, (int, float)) and (name, key) not in OWN_SETTINGS:
                 node[key] = value
 

@@ -24,6 +24,7 @@ from benchmarks.harness import EXTRA, Row, drawn, installed, machine
 from benchmarks.infer import infer
 from benchmarks.read import read
 from benchmarks.scale import scale
+from benchmarks.seeds import seeds
 from benchmarks.sweep import sweep
 from benchmarks.train import train
 from benchmarks.update import update
@@ -32,7 +33,20 @@ from rich.console import Console
 from lcc_rl.errors import LccError, unknown_name
 from lcc_rl.results.files import write_parquet
 
-LISTED = (read, env, estimator, collect, update, train, calibrate, evaluate, scale, infer, sweep)
+LISTED = (
+    read,
+    env,
+    estimator,
+    collect,
+    update,
+    seeds,
+    train,
+    calibrate,
+    evaluate,
+    scale,
+    infer,
+    sweep,
+)
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
 }

@@ -159,6 +159,7 @@ def build_env(
     pieces: list[Piece] = [
         build(node, f"scenario.pieces.{name}", **resources)
         for name, node in scenario.pieces.items()
+        if node is not None
     ]
     pieces.append(build(cfg.observation, "observation", **resources))
     pieces += [

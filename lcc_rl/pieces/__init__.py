@@ -1,5 +1,6 @@
 """Piece room: everything that an environment is made of, one TensorDict transform each."""
 
+from lcc_rl.pieces.barrier import Barrier
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, Transition
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, Observation, TimeGap, TimeToCollision
@@ -21,6 +22,7 @@ from lcc_rl.pieces.termination import Collision
 from lcc_rl.pieces.vehicles import CAVMotion, IDMFollower
 
 __all__ = [
+    "Barrier",
     "CAVMotion",
     "Collision",
     "CollisionPenalty",

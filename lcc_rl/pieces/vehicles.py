@@ -46,6 +46,8 @@ class CAVMotion(Transition):
         initial_gap_range: the gap at the start is that times a factor drawn evenly from this
             range by the episode's seed, so that training meets what good driving never does;
             ``(name, "gap_factor")`` given to ``env.reset`` replaces the draw (evaluation gives 1).
+        obeys: the entry that is its action, dotted; ``"next.barrier.action"`` where a
+            :class:`lcc_rl.pieces.Barrier` acts before it.
         name: namespace of the car.
         predecessor: namespace of the vehicle ahead.
 
@@ -60,6 +62,7 @@ class CAVMotion(Transition):
         standstill_gap: float = 2.0,
         initial_time_gap: float = 1.5,
         initial_gap_range: Sequence[float] = (1.0, 1.0),
+        obeys: str = "action",
         name: str = "cav",
         predecessor: str = "leader",
     ) -> None:
@@ -81,7 +84,7 @@ class CAVMotion(Transition):
                 (name, "speed"),
                 (name, "gap"),
                 (name, "acceleration"),
-                "action",
+                obeys,
                 (predecessor, "speed"),
                 following((predecessor, "speed")),
             ],

@@ -131,12 +131,19 @@ def test_divergence_is_named(tmp_path) -> None:
 
 
 def test_its_length_comes_with_it_and_can_be_overridden() -> None:
-    assert load("train", ["agent=analytic"]).training.environments == 128
+    assert load("train", ["agent=analytic"]).training.environments == 256
     assert load("train", ["agent=analytic", "training.episodes=512"]).training.episodes == 512
     assert load("train").training.environments == 20
 
 
-@pytest.mark.parametrize("overrides", [(), BOOTSTRAP])
+# Through a second at a time only a price that begins early can be felt.
+EARLY = [
+    f"agent.surrogates.efficiency.{setting}"
+    for setting in ("weight=3.0", "threshold=2.25", "width=0.3")
+]
+
+
+@pytest.mark.parametrize("overrides", [(), (*BOOTSTRAP, *EARLY)])
 def test_learns_to_keep_going(tmp_path, overrides) -> None:
     rows = make(
         tmp_path,

@@ -20,10 +20,12 @@ WANTED = [("cav", "gap"), ("cav", "power"), ("hdv", "power"), ("cav", "relative_
 OBSERVED = [("reward",), ("reward_terms", "hdv_energy"), ("reward_terms", "safety")]
 
 
-@pytest.mark.parametrize("followers", [1, 3])
+@pytest.mark.parametrize(
+    "more", ["scenario.followers=1", "scenario.followers=3", "+filter=barrier"]
+)
 @pytest.mark.parametrize("variant", ["alcc", "reference"])
-def test_entries_equal_those_of_a_rollout(variant, followers) -> None:
-    overrides = [f"scenario.followers={followers}"]
+def test_entries_equal_those_of_a_rollout(variant, more) -> None:
+    overrides = [more]
     observed = OBSERVED if variant == "alcc" else [("reward",), ("reward_terms", "safety")]
     policy = build_agent(compose(variant, *overrides), POPULATION).policy
     with torch.no_grad():

@@ -16,6 +16,7 @@ from torchrl.envs import Compose, TransformedEnv, check_env_specs
 import lcc_rl.pieces as room
 from lcc_rl.envs.clock import Clock
 from lcc_rl.pieces import (
+    Barrier,
     CAVMotion,
     Collision,
     CollisionPenalty,
@@ -52,6 +53,7 @@ SCALES = {"leader": {"speed": 0.1}, "cav": {"gap": 0.1}, "hdv": {"gap": 0.1}}
 # Every piece, in the order in which its scenario needs them.
 LEADING_CRUISE: dict[str, Callable[[], Piece]] = {
     "NGSIMLeader": lambda: NGSIMLeader(wavy_profiles(), HORIZON, 0.1),
+    "Barrier": lambda: Barrier(0.1),
     "CAVMotion": lambda: CAVMotion(0.1),
     "IDMFollower": lambda: IDMFollower(POPULATION, 0.1, followers=2),
     "DriverEstimator": lambda: DriverEstimator(POPULATION, 0.1, followers=2, learning_time=0.5),

@@ -18,6 +18,7 @@ NAMES = (
     "estimator",
     "collect",
     "update",
+    "seeds",
     "train",
     "calibrate",
     "evaluate",
