@@ -10,13 +10,16 @@ ARGS ?=
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test lint clean
+.PHONY: run test coverage lint clean
 
 run: $(STAMP)
 	$(BIN)/python -m lcc_rl.pipeline experiment=quickstart $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)
+
+coverage: $(STAMP)
+	$(BIN)/python -m pytest -n 2 -m "not slow" --cov $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -5,8 +5,13 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from lcc_rl import interrupts
+
 __version__ = "0.1.0"
 __all__ = ["__version__", "make_env", "results"]
+
+if interrupts.is_command():
+    interrupts.end_quietly()
 
 
 def __getattr__(name: str) -> Any:

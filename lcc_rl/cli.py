@@ -14,13 +14,13 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config import explained
+from lcc_rl.config import explained, is_sweep
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
+from lcc_rl.interrupts import INTERRUPTED, interruptible
 from lcc_rl.precision import set_precision
 from lcc_rl.results.states import Busy, forget, input_error, record
 from lcc_rl.sweeps import SweepCallback, conclude, run_job
@@ -28,7 +28,8 @@ from lcc_rl.sweeps import SweepCallback, conclude, run_job
 # OSError: Hydra cannot make the run's folder, a disk is full, a file is not ours to read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT = 2
+NO_BEST = "No trials are completed"  # says Optuna
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
@@ -63,8 +64,10 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             wanted = TRACEBACK in os.environ
             # Makes Hydra hand errors over instead of printing them in its own way.
             os.environ.setdefault(TRACEBACK, "1")
+            guarded = sweep if wanted else main_guard(explaining(sweep, config_name))
             try:
-                sweep(command) if wanted else main_guard(explaining(sweep, config_name))(command)
+                with interruptible():
+                    guarded(command)
             finally:
                 if not wanted:
                     os.environ.pop(TRACEBACK, None)
@@ -76,15 +79,21 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 def sweep(command: Callable[[], Any]) -> None:
     """Run a Hydra command; where it was a sweep, say how its runs ended."""
-    SweepCallback.folder = None
     try:
         command()
     except KeyboardInterrupt:
-        if SweepCallback.folder is None:
+        folder = SweepCallback.end()
+        if folder is None:
             raise
-        raise Interrupted(f"stopped; the same command goes on in {SweepCallback.folder}") from None
-    if SweepCallback.folder is not None:
-        conclude(SweepCallback.folder)
+        raise Interrupted(f"stopped; the same command goes on in {folder}") from None
+    except ValueError as error:
+        # Hydra's plugin wants the best trial also where every one failed: conclude names those.
+        if NO_BEST not in str(error):
+            raise
+    finally:
+        folder = SweepCallback.end()
+    if folder is not None:
+        conclude(folder)
 
 
 def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
@@ -149,11 +158,6 @@ def _stop(error: Exception) -> NoReturn:
 def run_folder() -> Path:
     """The folder of the present run, made by Hydra (the run's or the sweep job's)."""
     return Path(HydraConfig.get().runtime.output_dir)
-
-
-def is_sweep() -> bool:
-    """Whether the present job is one of a sweep."""
-    return bool(HydraConfig.get().mode is RunMode.MULTIRUN)
 
 
 def prepare_torch(cfg: DictConfig) -> torch.device:

@@ -15,7 +15,9 @@ from typing import Any
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -159,6 +161,11 @@ def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictC
         return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
     with initialize_config_module(CONF, version_base="1.3"):
         return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+
+
+def is_sweep() -> bool:
+    """Whether this process does a run of a sweep; False outside Hydra, too."""
+    return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
 
 
 def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Exception:

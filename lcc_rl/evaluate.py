@@ -52,7 +52,9 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     if cfg.scenario.name == platoon_cases.SCENARIO:
         return platoon_cases.run(cfg, folder, quiet)
     for path in (cfg.policy, *cfg.compare):
-        if path is not None:  # a file that is missing should not be noticed after minutes of reading
+        if (
+            path is not None
+        ):  # a file that is missing should not be noticed after minutes of reading
             load_policy(path, cfg.variant, tuple(cfg.trust))
     inputs = load_inputs(cfg)
     for line in inputs.report:

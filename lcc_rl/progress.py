@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from lcc_rl.config import is_sweep
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.states import PROGRESS, read_progress
 
@@ -25,22 +26,23 @@ def clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
-def bar(console: Console) -> Progress:
-    """Return a bar for tasks with a ``note``; it draws nothing where there is no terminal."""
+def bar(console: Console, shown: bool) -> Progress:
+    """Return a bar for tasks with a ``note``; it draws nothing where it is not to be shown."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
         TimeElapsedColumn(),
         console=console,
-        disable=not console.is_terminal,
+        disable=not shown,
     )
 
 
 class ProgressReporter:
     """Shows how far a long job is: rate, ETA and current values.
 
-    On a terminal a live bar; elsewhere a plain line at most every ``every`` seconds. The log file
+    On a terminal a live bar, except in a sweep, which shows one table of all its runs
+    (:mod:`lcc_rl.sweeps`); elsewhere a plain line at most every ``every`` seconds. The log file
     gets the plain lines in both cases, and ``folder/progress.json`` always holds the latest state.
 
     Args:
@@ -66,9 +68,9 @@ class ProgressReporter:
         self.title, self.total, self.unit, self.start = title, total, unit, start
         self.folder, self.every = folder, every
         self.console = console or Console(stderr=True)
-        self.live = self.console.is_terminal
+        self.live = self.console.is_terminal and not is_sweep()
         self.begun = self.last_line = time.monotonic()
-        self.bar = bar(self.console)
+        self.bar = bar(self.console, self.live)
         self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note="")
 
     def __enter__(self) -> ProgressReporter:
@@ -131,7 +133,7 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
     console = Console(stderr=True)
     last = time.monotonic()
     futures = [future for _, future in jobs.values()]
-    with bar(console) as shown:
+    with bar(console, console.is_terminal) as shown:
         tasks = {name: shown.add_task(name, total=None, note="starting") for name in jobs}
         while wait(futures, 1.0, FIRST_EXCEPTION).not_done:
             due = not console.is_terminal and time.monotonic() - last >= every

@@ -8,25 +8,32 @@ import logging
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import configure_log
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, read_write
+from rich.console import Console
+from rich.live import Live
 
 from lcc_rl.errors import Interrupted, LccError
+from lcc_rl.overview import live
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.runs import NOT_IDENTITY, identity
 from lcc_rl.results.states import Busy, one_line, record, survey
+from lcc_rl.search import go_on
 
 log = logging.getLogger("lcc_rl")
 
 PLAN = "sweep.json"
 LONGEST_NAME = 100  # characters of a folder's name that say what is in it
-WAITING = math.nan  # what a run returns to a sweeper that has no result of it
+SILENT = logging.CRITICAL + 1
+WAITING = None  # what a run returns to a sweeper that has no result of it; Optuna refuses NaN
 
 
 def register_resolvers() -> None:
@@ -84,10 +91,12 @@ register_resolvers()
 
 
 class SweepCallback(Callback):
-    """Says at the start where a sweep's runs go, and keeps their number for onlookers."""
+    """Says at the start where a sweep's runs go, keeps their number for onlookers, draws them."""
 
     # Of the sweep of this process; Hydra tells nobody else where it is.
     folder: Path | None = None
+    table: Live | None = None
+    lines: ClassVar[Any] = None  # how log lines are shown where there is no table
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the plan and announce the folder."""
@@ -99,6 +108,36 @@ class SweepCallback(Callback):
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
         log.info(words, plan.runs, folder, folder)
+        go_on(config, alone=not any(state.state == "running" for state in survey(folder)))
+        if sys.stdout.isatty():
+            self._draw(config, plan.runs)
+
+    @classmethod
+    def _draw(cls, config: DictConfig, planned: int) -> None:
+        """Show one table instead of lines; Hydra sets its lines up anew after every run."""
+        hydra = config.hydra
+        cls.lines = hydra.hydra_logging.copy()
+        with read_write(config):
+            OmegaConf.update(hydra.hydra_logging, "root.handlers", [], force_add=True)
+        mute()
+        cls.table = live(Path(hydra.sweep.dir), lambda: planned, Console(highlight=False))
+        cls.table.start(refresh=True)
+
+    @classmethod
+    def end(cls) -> Path | None:
+        """Finish the table and forget the sweep; return its folder, if there was one."""
+        if cls.table is not None:
+            cls.table.stop()
+            configure_log(cls.lines)
+        folder, cls.folder, cls.table = cls.folder, None, None
+        return folder
+
+
+def mute() -> None:
+    """Keep log lines from the terminal, where they would cut the table up; files keep them."""
+    for handler in logging.getLogger().handlers:
+        if type(handler) is logging.StreamHandler:
+            handler.setLevel(SILENT)
 
 
 def limit_batches(config: DictConfig) -> None:
@@ -129,7 +168,7 @@ def make_plan(config: DictConfig) -> Plan:
     sweeper = config.hydra.sweeper
     typed = [str(item) for item in config.hydra.overrides.task]
     typed += [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
-    parsed = OverridesParser.create().parse_overrides(typed)
+    parsed = OverridesParser.create().parse_overrides(that_matter(typed))
     swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
     if "n_trials" in sweeper:
@@ -150,11 +189,13 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
     """Do one run of a sweep; a failure is recorded in its folder and does not stop the others.
 
     Returns:
-        What the function returns; NaN where it failed.
+        What the function returns; None where it failed.
 
     Raises:
         KeyboardInterrupt: where the user stopped it: that stops the sweep.
     """
+    if sys.stdout.isatty():
+        mute()
     try:
         return function(cfg)
     except Interrupted as error:

@@ -15,8 +15,8 @@ from lcc_rl.agents import Analytic
 from lcc_rl.agents.analytic import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.training import Trainer
-from lcc_rl.cli import entry_point, is_sweep, prepare_torch, run_folder
-from lcc_rl.config import TrainConfig, build, load, require
+from lcc_rl.cli import entry_point, prepare_torch, run_folder
+from lcc_rl.config import TrainConfig, build, is_sweep, load, require
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, load_inputs
 from lcc_rl.envs.factory import learns as learned

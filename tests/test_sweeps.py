@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
-import math
 import os
+import pty
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
+import compare_launchers
 import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 from test_entry_points import tiny
 
-from lcc_rl import results, train
+from lcc_rl import cli, results, train
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.results.files import read_parquet
@@ -22,6 +24,7 @@ from lcc_rl.results.runs import identity
 from lcc_rl.results.states import ERROR, Busy, claim
 from lcc_rl.sweeps import (
     Plan,
+    SweepCallback,
     conclude,
     make_plan,
     parallel_jobs,
@@ -67,6 +70,9 @@ def test_plans_know_grids_and_searches(tmp_path) -> None:
     cfg = hydra_like(tmp_path, "seed=4")
     cfg.hydra.overrides.task = ["seed=range(8)", "variant=alcc,reference", "agent.gamma=0.9"]
     assert make_plan(cfg) == Plan(16, ["seed", "variant"])
+    # Where its rows are sent to does not make another run.
+    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,tensorboard"]
+    assert make_plan(cfg) == Plan(8, ["seed"])
     cfg.hydra.sweeper = {"n_trials": 40, "params": {"agent.tau": "interval(0.001,0.01)"}}
     cfg.hydra.overrides.task = []
     assert make_plan(cfg) == Plan(40, ["agent.tau"])
@@ -82,7 +88,7 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
     def breaks(cfg):
         raise ConfigError("too much")
 
-    assert math.isnan(run_job(breaks, tiny("train"), tmp_path / "a"))
+    assert run_job(breaks, tiny("train"), tmp_path / "a") is None
     assert (tmp_path / "a" / ERROR).read_text() == "too much\n"
     with pytest.raises(LccError, match="1 of 1 runs failed"):
         conclude(tmp_path)
@@ -90,7 +96,7 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
     def busy(cfg):
         raise Busy("another process")
 
-    assert math.isnan(run_job(busy, tiny("train"), tmp_path / "b"))
+    assert run_job(busy, tiny("train"), tmp_path / "b") is None
     assert not (tmp_path / "b").exists()
 
     def stopped(cfg):
@@ -99,6 +105,17 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
     # Not an Exception: a launcher would take that for one run's failure and begin the next.
     with pytest.raises(KeyboardInterrupt):
         run_job(stopped, tiny("train"), tmp_path / "c")
+
+
+def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) -> None:
+    def command() -> None:
+        monkeypatch.setattr(SweepCallback, "folder", tmp_path)
+        assert run_job(lambda cfg: 1 / 0, tiny("train"), tmp_path / "a") is None
+        raise ValueError("No trials are completed yet.")
+
+    with pytest.raises(LccError, match="1 of 1 runs failed"):
+        cli.sweep(command)
+    assert SweepCallback.folder is None
 
 
 def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, monkeypatch) -> None:
@@ -173,26 +190,45 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     assert second.returncode == 2
 
 
+def on_terminal(cwd: Path, *words: str) -> str:
+    """Do a sweep on a terminal and return what that showed."""
+    ours, its = pty.openpty()
+    typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
+    env = {**os.environ, "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
+    child = subprocess.Popen(typed, cwd=cwd, stdin=its, stdout=its, stderr=its, env=env)
+    os.close(its)
+    shown = b""
+    with suppress(OSError), open(ours, "rb", buffering=0) as screen:
+        while part := screen.read(65536):
+            shown += part
+    assert child.wait(60) == 2, shown.decode()
+    return shown.decode()
+
+
+def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
+    words = ["experiment=smoke", "variant=idm", "data.platoons=4", "data.recordings=2"]
+    words += ["agent.time_gap=1.2,1.3,-1", "scenario.horizon=40", "sweep=mine"]
+    shown = on_terminal(tmp_path, *words)
+    table, _, end = shown.rpartition("┘")
+    assert "waiting" in table
+    assert "3 runs: 2 finished, 1 failed" in end
+    assert "2 of 3 runs finished" in end
+    assert "failed: agent.time_gap=-1_" in end
+    # Log lines stay in the files, also Hydra's own between two runs.
+    assert "[lcc_rl][INFO]" not in shown
+    assert "#2 :" not in shown
+    (log,) = (tmp_path / "outputs/train/mine").glob("agent.time_gap=1.3_*/train.log")
+    assert "synthetic stream" in log.read_text()
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("launcher", "package"),
-    [("lcc_joblib", "hydra_joblib_launcher"), ("lcc_submitit_local", "hydra_submitit_launcher")],
-)
-def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, package) -> None:
-    pytest.importorskip(f"hydra_plugins.{package}", reason="extra sweeps")
-    words = ["experiment=smoke", "variant=alcc", "data.platoons=4", "data.recordings=2"]
-    words += ["scenario.horizon=40", "agent.batch_size=64", "agent.hidden=[16,16]", "seed=0,1"]
-    done = sweep(tmp_path, *words, "sweep=x", f"hydra/launcher={launcher}")
-    assert done.returncode == 0, done.stderr
-    for seed in (0, 1):
-        cfg = tiny("train", "variant=alcc", f"seed={seed}")
-        train.run(cfg, tmp_path / str(seed), quiet=True)
-        (folder,) = (tmp_path / "outputs" / "train" / "x").glob(f"seed={seed}_*")
-        for table in ("training", "episodes", "steps"):
-            one, two = (
-                read_parquet(f / f"{table}.parquet") for f in (tmp_path / str(seed), folder)
-            )
-            pd.testing.assert_frame_equal(one, two, check_exact=True)
+@pytest.mark.parametrize("launcher", ["joblib", "submitit", "ray"])
+def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, capsys) -> None:
+    if not compare_launchers.installed(compare_launchers.LAUNCHERS[launcher][1]):
+        pytest.skip("extras sweeps, ray")
+    arguments = ["serial", launcher, "--seeds=1", f"--out={tmp_path}"]
+    assert compare_launchers.main(arguments) == 0
+    assert capsys.readouterr().out.count("those of serial") == 2
 
 
 def test_random_kills_lose_nothing() -> None:

@@ -25,6 +25,7 @@ from benchmarks.infer import infer
 from benchmarks.read import read
 from benchmarks.scale import scale
 from benchmarks.seeds import seeds
+from benchmarks.sweep import sweep
 from benchmarks.train import train
 from benchmarks.update import update
 from rich.console import Console
@@ -44,6 +45,7 @@ LISTED = (
     evaluate,
     scale,
     infer,
+    sweep,
 )
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
@@ -77,8 +79,8 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
 
 
 def devices(options: Namespace, name: str) -> list[str]:
-    """Return where to run a benchmark: the reader knows no device."""
-    if name == "read":
+    """Return where to run a benchmark: the reader knows no device, short runs need none."""
+    if name in ("read", "sweep"):
         return ["cpu"]
     if options.device is not None:
         return [options.device]

@@ -9,6 +9,7 @@ must equal those of a sweep that nobody disturbed. Prints what it saw; exit code
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import os
 import random
 import signal
@@ -62,6 +63,9 @@ def start(words: Sequence[str], log: Path) -> int:
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(output, 1)
     os.dup2(output, 2)
+    faulthandler.register(signal.SIGUSR1)
+    # A shell that starts this in the background makes it, and all below it, deaf to SIGINT.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.argv = ["train", "-m", *words]
     code = 0
     try:
@@ -98,6 +102,11 @@ def finished(sweep: Path) -> dict[str, int]:
     return {name: (sweep / name / train.EPISODES).stat().st_mtime_ns for name in names}
 
 
+def tail(log: Path, lines: int = 100) -> list[str]:
+    """Return the last lines of what a sweep said."""
+    return log.read_text(errors="replace").splitlines()[-lines:]
+
+
 def disturb(words: Sequence[str], sweep: Path, log: Path, delay: float, kind: int) -> str:
     """Start the sweep, send it a signal after a delay, and say what that did."""
     child = start(words, log)
@@ -110,8 +119,11 @@ def disturb(words: Sequence[str], sweep: Path, log: Path, delay: float, kind: in
     patience = time.monotonic() + 60
     while not os.waitpid(child, os.WNOHANG)[0]:
         if time.monotonic() > patience:
+            os.kill(child, signal.SIGUSR1)  # where it hangs
+            time.sleep(1.0)
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
+            print(f"hung after {signal.Signals(kind).name}:", *tail(log), sep="\n", flush=True)
             return "hung"
         time.sleep(0.002)
     return signal.Signals(kind).name
@@ -135,7 +147,7 @@ def run(kills: int, seed: int, folder: Path, limit: float) -> Counter[str]:
     words = [*TINY, "data=episodes", f"data.path={data}"]
     begun = time.monotonic()
     os.waitpid(start([*words, f"hydra.sweep.dir={whole}"], folder / "whole.log"), 0)
-    assert len(finished(whole)) == 2, (folder / "whole.log").read_text()[-2000:]
+    assert len(finished(whole)) == 2, "\n".join(tail(folder / "whole.log"))
     length, chance = time.monotonic() - begun, random.Random(seed)
     seen: Counter[str] = Counter()
     words.append(f"hydra.sweep.dir={sweep}")

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-import signal
-import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,6 +22,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import TrainingConfig, require
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
+from lcc_rl.interrupts import stop_signal
 from lcc_rl.progress import ProgressReporter
 from lcc_rl.results.files import read_torch, write_parquet, write_torch
 
@@ -216,29 +214,6 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
         **{f"reward_{name}": per_episode(terms[name]) for name in terms.keys()},  # noqa: SIM118
         "collisions": float((batch["next", "terminated"] & alive).sum()),
     }
-
-
-@contextmanager
-def stop_signal() -> Iterator[threading.Event]:
-    """Turn the first SIGINT or SIGTERM into a request to stop; the second acts at once."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    before = {kind: signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM)}
-
-    def request(number: int, frame: Any) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, before[signal.SIGINT])
-        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
-
-    for kind in before:
-        signal.signal(kind, request)
-    try:
-        yield event
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
 
 
 def _columns(frame: pd.DataFrame) -> dict[str, Tensor]:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import TARGET, build, find_target, load, plain
+from lcc_rl.config import TARGET, build, find_target, is_sweep, load, plain
 from lcc_rl.data.cycles import Case
 from lcc_rl.data.profiles import Profiles, leader_profiles
+from lcc_rl.data.sources import LoadedEpisodes, find_files
 from lcc_rl.envs.clock import Clock, Traffic
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.pieces import Piece, TotalReward
 from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
 from lcc_rl.pieces.vehicles import Population
@@ -56,7 +60,7 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
         return _platoon_inputs(cfg)
     report: Sequence[str] = ()
     if episodes is None:
-        loaded = build(cfg.data, "data").load()
+        loaded = _load_episodes(cfg.data)
         episodes, report = loaded.episodes, loaded.report
     scenario = cfg.scenario
     profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
@@ -65,6 +69,35 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     population = build(cfg.drivers, "drivers")
     available = {"profiles": len(windows), "drivers": len(population.time_gap)}
     return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
+
+
+# Of the sweep that this process works on: its runs mostly differ in other things than the data.
+_loaded: dict[str, LoadedEpisodes] = {}
+
+
+def _load_episodes(node: DictConfig) -> LoadedEpisodes:
+    """Load episodes; the runs of a sweep that one process does share those of the same files."""
+    if not is_sweep():
+        return build(node, "data").load()
+    settings = plain(node)
+    key = json.dumps([settings, list(_stamps(settings))])
+    if key not in _loaded:
+        loaded = build(node, "data").load()
+        _loaded.clear()
+        _loaded[key] = loaded
+    return _loaded[key]
+
+
+def _stamps(value: Any) -> Iterator[tuple[str, int, int]]:
+    """Yield name, time and size of every file that settings name, by a pattern, too."""
+    if isinstance(value, (Mapping, list)):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _stamps(item)
+    elif isinstance(value, str):
+        with suppress(DataError, OSError):
+            for name in find_files(value):
+                stat = Path(name).stat()
+                yield name, stat.st_mtime_ns, stat.st_size
 
 
 def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:

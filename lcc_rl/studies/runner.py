@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +20,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import load, plain
 from lcc_rl.errors import Interrupted
+from lcc_rl.interrupts import interruptible
 from lcc_rl.progress import clock
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.runs import CONFIG, NOT_IDENTITY, flatten, load_config
@@ -123,14 +122,14 @@ def _start(runs: Sequence[Run], jobs: int) -> list[Outcome]:
     """Run processes side by side; on an interrupt let each save its state."""
     children: set[subprocess.Popen[str]] = set()
     stopping = threading.Event()
-    with ThreadPoolExecutor(jobs) as pool, _terminated():
+    with ThreadPoolExecutor(jobs) as pool, interruptible():
         futures = [pool.submit(_one, run, children, stopping) for run in runs]
         try:
             return [future.result() for future in futures]
         except KeyboardInterrupt:
             stopping.set()
             for child in list(children):
-                child.send_signal(signal.SIGINT)
+                child.terminate()
             raise Interrupted("stopped; the same command goes on from here") from None
 
 
@@ -151,7 +150,7 @@ def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Eve
     )
     children.add(child)
     if stopping.is_set():
-        child.send_signal(signal.SIGINT)
+        child.terminate()
     _, errors = child.communicate()
     children.discard(child)
     if child.returncode == 0:
@@ -161,23 +160,6 @@ def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Eve
     if not stopping.is_set():
         log.error("%s: failed: %s", run.folder, lines[-1])
     return Outcome(run, FAILED, lines[-1])
-
-
-@contextmanager
-def _terminated() -> Iterator[None]:
-    """Treat SIGTERM as Ctrl-C, so that the trainings are told."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def note(folder: Path, study: str, command: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import POPULATION, VARIANTS, compose, small_env, wavy_profiles
@@ -9,8 +11,11 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
+from lcc_rl.data.episodes import write_episodes
+from lcc_rl.data.sources import EpisodesSource
+from lcc_rl.data.stream import StreamSource
 from lcc_rl.envs.clock import Clock
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.envs.factory import build_agent, build_env, load_inputs
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.power import motor_power
@@ -287,3 +292,28 @@ def test_cuda_agrees_with_cpu() -> None:
     cpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8), zero)[-1]
     gpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8, device="cuda"), zero.cuda())[-1]
     torch.testing.assert_close(cpu["hdv", "speed"], gpu["hdv", "speed"].cpu())
+
+
+def test_the_runs_of_a_sweep_share_the_data_while_its_files_stay_the_same(
+    tmp_path, monkeypatch
+) -> None:
+    path = tmp_path / "pairs.parquet"
+    stream = StreamSource(2, 3, 3, (35.0, 45.0))
+    write_episodes(stream.load().episodes, path)
+    cfg = compose("alcc", "data=episodes", f"data.path={path}", "evaluation.profiles=2")
+    read: list[str] = []
+    load = EpisodesSource.load
+    monkeypatch.setattr(EpisodesSource, "load", lambda own: (read.append(own.path), load(own))[1])
+    alone = [load_inputs(cfg) for _ in range(2)]
+    assert len(read) == 2
+    monkeypatch.setattr("lcc_rl.envs.factory.is_sweep", lambda: True)
+    shared = [load_inputs(cfg) for _ in range(2)]
+    assert len(read) == 3
+    for inputs in shared:
+        assert inputs.training.names == alone[0].training.names
+        assert inputs.report == alone[0].report
+    # Another file under the same name is another input.
+    write_episodes(replace(stream, seed=1).load().episodes, path)
+    changed = load_inputs(cfg)
+    assert len(read) == 4
+    assert changed.report != alone[0].report

@@ -38,6 +38,7 @@ def test_wandb_keeps_its_files_offline(tmp_path) -> None:
     assert list(tmp_path.rglob("*.wandb"))
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its database layer's own making
 def test_mlflow_holds_every_row(tmp_path) -> None:
     mlflow = pytest.importorskip("mlflow", reason="extra mlflow")
     send(RowLogger("mlflow"), tmp_path)

@@ -6,11 +6,14 @@ import json
 import os
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.console import Console, Group
 
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
+from lcc_rl.overview import counts, draw, headline, live, remaining
 from lcc_rl.results.states import (
     ERROR,
     LOCK,
@@ -23,7 +26,7 @@ from lcc_rl.results.states import (
     survey,
     working,
 )
-from lcc_rl.status import counts, headline, main, remaining
+from lcc_rl.status import main, watch
 
 
 def test_a_claimed_folder_is_refused_to_others_and_free_afterwards(tmp_path) -> None:
@@ -145,3 +148,42 @@ def test_nothing_to_see(tmp_path, capsys) -> None:
         main([str(tmp_path / "nowhere")])
     assert caught.value.code == 2
     assert "no such folder" in capsys.readouterr().err
+
+
+def test_an_empty_name_is_one_clear_error(capsys) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([""])
+    assert caught.value.code == 2
+    assert "the name of the folder is empty" in capsys.readouterr().err
+
+
+def printed(what: Group) -> list[str]:
+    console = Console(file=StringIO(), width=200)
+    console.print(what)
+    return console.file.getvalue().splitlines()
+
+
+def test_where_room_is_short_the_runs_at_work_and_in_trouble_come_first(tmp_path) -> None:
+    states = [RunState(f"run{i}", "finished", 8, 8) for i in range(30)]
+    states += [RunState("late", "running", 4, 8, 10.0), RunState("bad", "failed", error="[disk]")]
+    lines = printed(draw(tmp_path, states, 40, most=3))
+    assert [line.split()[1] for line in lines[3:7]] == ["late", "bad", "run0", "…"]
+    assert "ETA 0:10" in lines[3]
+    assert "[disk]" in lines[4]
+    assert "29 more" in lines[6]
+    assert lines[-1].endswith(
+        "40 runs: 30 finished, 1 running, 1 failed, 8 waiting; about 2:50 left"
+    )
+    assert len(printed(draw(tmp_path, states, 40))) == 32 + 5
+
+
+def test_a_watched_folder_is_drawn_until_all_is_done(tmp_path) -> None:
+    make_sweep(tmp_path)
+    console = Console(file=StringIO(), force_terminal=True, width=200, highlight=False)
+    with live(tmp_path, lambda: 4, console):
+        (tmp_path / "running" / "episodes.parquet").write_text("")
+    shown = console.file.getvalue()
+    assert "4 runs: 2 finished, 1 stopped, 1 failed" in shown.replace("\n", " ")
+    (tmp_path / "sweep.json").unlink()
+    watch(tmp_path, console, every=60)
+    assert console.file.getvalue().count("disk full") > shown.count("disk full")

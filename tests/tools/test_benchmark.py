@@ -24,6 +24,7 @@ NAMES = (
     "evaluate",
     "scale",
     "infer",
+    "sweep",
 )
 COLUMNS = [
     "benchmark",

@@ -70,7 +70,10 @@ def stream(quick: bool) -> StreamSource:
 
 def installed(*names: str) -> bool:
     """Whether all these packages of the extra ``bench`` are at hand."""
-    return all(find_spec(name) is not None for name in names)
+    try:
+        return all(find_spec(name) is not None for name in names)
+    except ModuleNotFoundError:  # of a package within one that is missing
+        return False
 
 
 def endings(options: Namespace) -> tuple[str, ...]:
