@@ -109,6 +109,20 @@ def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
                 node[key] = value
 
 
+def share_filter(cfg: DictConfig, other: DictConfig) -> None:
+    """Give another trained car the filter of the one under study; without one it keeps its own."""
+    node, pieces = cfg.scenario.pieces.get("barrier"), other.scenario.pieces
+    if node is None or "cav" not in pieces:
+        return
+    obedient = {**pieces.cav, "obeys": cfg.scenario.pieces.cav.obeys}
+    # It acts before the car, and the order of the pieces is that of the file.
+    names = [name for name in pieces if name != "barrier"]
+    names.insert(names.index("cav"), "barrier")
+    changed = {"barrier": node, "cav": obedient}
+    given = {name: changed[name] if name in changed else pieces[name] for name in names}
+    other.scenario.pieces = given
+
+
 def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
     """Build the strategy that the configuration asks for.
 
@@ -141,6 +155,7 @@ def trained(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
     """Build a trained strategy from its policy file, in the scenario under study."""
     weights, own = load_policy(path, trust=tuple(cfg.trust))
     share_scenario(cfg, own)
+    share_filter(cfg, own)
     return with_weights(own, weights, own.seed, path, inputs)
 
 

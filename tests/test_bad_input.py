@@ -53,6 +53,12 @@ def test_what_the_schema_knows_passes() -> None:
     check_keys(load("train", ["+reward.terms.x={_target_: mine.X}", "experiment=smoke"]))
 
 
+def test_a_filter_for_a_platoon_is_refused(tmp_path) -> None:
+    cfg = load("train", ["variant=ddpg", "+filter=barrier", "experiment=smoke"])
+    with pytest.raises(ConfigError, match=r"\+filter=barrier .* not to ddpg"):
+        train.run(cfg, tmp_path)
+
+
 @pytest.mark.parametrize("agent", ["idm", "none"])
 def test_an_agent_that_learns_nothing_is_no_learned_variant(tmp_path, agent) -> None:
     cfg = tiny("train", "variant=alcc", f"agent={agent}", agent=False)

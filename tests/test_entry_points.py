@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl import evaluate, pipeline, results, train
 from lcc_rl.config import load
@@ -105,6 +105,19 @@ def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_pat
     assert means[0]["idm"] == means[1]["idm"]
     assert means[0]["alcc"] != means[1]["alcc"]
     assert (held.loc[held["strategy"] == "alcc", "share_ttc_unsafe"] == 0).all()
+
+
+def test_compared_policies_get_the_filter_under_study(trained, tmp_path) -> None:
+    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "+filter=barrier")
+    OmegaConf.update(cfg, "compare", ["pretrained/reference"])
+    rows = evaluate.run(cfg, tmp_path)
+    learned = rows[rows["strategy"].isin(["alcc", "reference"])]
+    assert learned["strategy"].nunique() == 2
+    assert (learned["share_ttc_unsafe"] == 0).all()
+    alone = tiny("evaluate", "variant=reference", "policy=pretrained", "+filter=barrier")
+    again = evaluate.run(alone, tmp_path / "alone")
+    parts = [r[r["strategy"] == "reference"].reset_index(drop=True) for r in (rows, again)]
+    pd.testing.assert_frame_equal(parts[0][again.columns], parts[1], check_exact=True)
 
 
 def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:

@@ -14,6 +14,14 @@ from lcc_rl.interrupts import INTERRUPTED, interruptible, is_command, stop_signa
 IMPORTS = "import sys; sys.argv = ['-m']; import lcc_rl; print('on', flush=True); input()"
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """Hear SIGINT also where the tests were started in the background, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
