@@ -207,7 +207,9 @@ def figure_of_followers(folder: Path) -> Figure:
     for gamma in sorted(set(table["gamma"])):
         rows = table[table["gamma"] == gamma]
         error = 100.0 * 1.96 * rows["gain_sd"].fillna(0.0) / np.sqrt(rows["seeds"])
-        label = f"γ = {gamma:g} ({int(rows['seeds'].min())} seeds, 95 % interval)"
+        counts = sorted({int(count) for count in rows["seeds"]})
+        seeds = "/".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
+        label = f"γ = {gamma:g} ({seeds}, 95 % interval where more than one)"
         axis.errorbar(rows["followers"], 100.0 * rows["gain"], error, marker="o", label=label)
     axis.axhline(0.0, color="#222222", lw=0.8)
     style(
