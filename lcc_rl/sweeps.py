@@ -8,6 +8,7 @@ import logging
 import math
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -107,7 +108,7 @@ class SweepCallback(Callback):
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
-        log.info(words, plan.runs, folder, folder)
+        log.info(words, plan.runs, folder, shlex.quote(str(folder)))
         go_on(config, alone=not any(state.state == "running" for state in survey(folder)))
         if sys.stdout.isatty():
             self._draw(config, plan.runs)
@@ -215,9 +216,11 @@ def conclude(folder: Path) -> None:
     """Say how a sweep ended.
 
     Raises:
-        LccError: if runs failed, naming each with its error.
+        LccError: if there was no run, or if runs failed, naming each with its error.
     """
     states = survey(folder)
+    if not states:
+        raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")
     finished = sum(state.state == "finished" for state in states)
     failed = [state for state in states if state.state == "failed"]
     log.info("%d of %d runs finished, in %s", finished, len(states), folder)

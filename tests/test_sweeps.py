@@ -107,6 +107,11 @@ def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
         run_job(stopped, tiny("train"), tmp_path / "c")
 
 
+def test_a_sweep_of_nothing_is_an_error(tmp_path) -> None:
+    with pytest.raises(LccError, match=r"nothing was swept, in .*is a list of values empty"):
+        conclude(tmp_path)
+
+
 def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) -> None:
     def command() -> None:
         monkeypatch.setattr(SweepCallback, "folder", tmp_path)
