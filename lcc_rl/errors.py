@@ -30,6 +30,17 @@ class Diverged(LccError):
     """A loss or reward is no longer a number; the last checkpoint is from before that."""
 
 
+def require_positive(where: str, **settings: float) -> None:
+    """Check settings of one piece or agent.
+
+    Raises:
+        ConfigError: naming the first that is not positive, as ``where.setting``.
+    """
+    for name, value in settings.items():
+        if not value > 0:
+            raise ConfigError(f"{where}.{name} must be positive, got {value}")
+
+
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     """Build the error for an unknown name, listing the valid ones and the nearest."""
     options = sorted(valid)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
@@ -22,6 +23,7 @@ from lcc_rl.train import check_sizes, evaluate_and_write
 log = logging.getLogger("lcc_rl")
 
 BASELINES = ("direct", "idm")
+Policy = tuple[dict[str, Any], DictConfig]  # weights and configuration
 # What makes a baseline what it is; everything else it shares with the scenario under study.
 OWN_SETTINGS = {("cav", "max_acceleration")}
 
@@ -51,18 +53,17 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     if cfg.scenario.name == platoon_cases.SCENARIO:
         return platoon_cases.run(cfg, folder, quiet)
-    for path in (cfg.policy, *cfg.compare):
-        if (
-            path is not None
-        ):  # a file that is missing should not be noticed after minutes of reading
-            load_policy(path, cfg.variant, tuple(cfg.trust))
+    # Before the data: a missing file should not be noticed after minutes of reading.
+    trust = tuple(cfg.trust)
+    policy = None if cfg.policy is None else load_policy(cfg.policy, cfg.variant, trust)
+    compared = {path: load_policy(path, trust=trust) for path in cfg.compare}
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
     strategies = [baseline(cfg, name, inputs) for name in BASELINES]
-    strategies += [trained(cfg, path, inputs) for path in cfg.compare]
+    strategies += [trained(cfg, path, compared[path], inputs) for path in cfg.compare]
     if own and cfg.variant not in BASELINES:
-        strategies.append(studied(cfg, inputs))
+        strategies.append(studied(cfg, policy, inputs))
     check_distinct(strategies)
     save_config(cfg, folder)
     episodes = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
@@ -123,7 +124,7 @@ def share_filter(cfg: DictConfig, other: DictConfig) -> None:
     other.scenario.pieces = given
 
 
-def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
+def studied(cfg: DictConfig, policy: Policy | None, inputs: Inputs) -> Strategy:
     """Build the strategy that the configuration asks for.
 
     Raises:
@@ -132,12 +133,12 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
     agent = build_agent(cfg, inputs.population, cfg.device)
     if not agent.learns:
         return Strategy(cfg.variant, cfg, agent.policy)
-    if cfg.policy is None:
+    if policy is None:
         raise ConfigError(
             f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
             f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
         )
-    weights, own = load_policy(cfg.policy, cfg.variant, tuple(cfg.trust))
+    weights, own = policy
     if own.variant != cfg.variant:
         raise ConfigError(
             f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
@@ -151,9 +152,9 @@ def studied(cfg: DictConfig, inputs: Inputs) -> Strategy:
     return with_weights(cfg, weights, own.seed, str(cfg.policy), inputs)
 
 
-def trained(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
-    """Build a trained strategy from its policy file, in the scenario under study."""
-    weights, own = load_policy(path, trust=tuple(cfg.trust))
+def trained(cfg: DictConfig, path: str, policy: Policy, inputs: Inputs) -> Strategy:
+    """Build a trained strategy from the policy read from a file, in the scenario under study."""
+    weights, own = policy[0], policy[1].copy()
     share_scenario(cfg, own)
     share_filter(cfg, own)
     return with_weights(own, weights, own.seed, path, inputs)

@@ -24,6 +24,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.config import TrainingConfig, build, require
 from lcc_rl.envs.unroll import Unrolled
+from lcc_rl.errors import require_positive
 from lcc_rl.pieces.base import as_tuple
 from lcc_rl.pieces.rewards import TERMS, RewardTerm
 from lcc_rl.policies.actor import make_actor, seeded_mlp
@@ -88,9 +89,9 @@ class Analytic:
         require(not bootstrap or gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
         require(0.0 <= td_lambda <= 1.0, f"agent.td_lambda must lie in [0, 1], got {td_lambda}")
         require(0.0 < tau <= 1.0, f"agent.tau must lie in (0, 1], got {tau}")
-        positive = {"learning_rate": learning_rate, "clip_norm": clip_norm, "value_lr": value_lr}
-        for name, value in positive.items():
-            require(value > 0, f"agent.{name} must be positive, got {value}")
+        require_positive(
+            "agent", learning_rate=learning_rate, clip_norm=clip_norm, value_lr=value_lr
+        )
         require(0 < final_share <= 1, f"agent.final_share must lie in (0, 1], got {final_share}")
         self.learning_rate, self.final_share, self.clip_norm = learning_rate, final_share, clip_norm
         self.gamma, self.td_lambda, self.tau = gamma, td_lambda, tau

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require_positive
 from lcc_rl.pieces.base import Transition
 
 
@@ -53,15 +53,11 @@ class Barrier(Transition):
         vehicle: str = "cav",
         predecessor: str = "leader",
     ) -> None:
-        positive = {
-            "max_acceleration": max_acceleration,
-            "time_to_collision": time_to_collision,
-            "time_gap": 1.0 if time_gap is None else time_gap,
-            "rate": rate,
-        }
-        for label, value in positive.items():
-            if not value > 0:
-                raise ConfigError(f"{name}.{label} must be positive, got {value}")
+        require_positive(
+            name, max_acceleration=max_acceleration, time_to_collision=time_to_collision, rate=rate
+        )
+        if time_gap is not None:
+            require_positive(name, time_gap=time_gap)
         super().__init__(
             reads=[
                 "action",

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.functional.cacc import platoon_errors, speeds_ahead
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.random import stream_id, uniform
@@ -60,12 +60,7 @@ class PlatoonMotion(Transition):
     ) -> None:
         if followers < 1:
             raise ConfigError(f"{name}.followers must be at least 1, got {followers}")
-        for label, value in (
-            ("max_acceleration", max_acceleration),
-            ("safe_headway", safe_headway),
-        ):
-            if not value > 0:
-                raise ConfigError(f"{name}.{label} must be positive, got {value}")
+        require_positive(name, max_acceleration=max_acceleration, safe_headway=safe_headway)
         if not (0 <= gap_spread < safe_headway and speed_spread >= 0):
             raise ConfigError(
                 f"{name}: gap_spread {gap_spread} must lie in [0, {safe_headway}) and "

@@ -12,7 +12,7 @@ import math
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require_positive
 from lcc_rl.pieces.rewards import RewardTerm
 
 
@@ -56,8 +56,12 @@ class SmoothSafety(RewardTerm):
         rate_width: float = 0.1,
         vehicle: str = "cav",
     ) -> None:
-        _require_positive(
-            name, threshold=threshold, width=width, gap_width=gap_width, rate_width=rate_width
+        require_positive(
+            f"agent.surrogates.{name}",
+            threshold=threshold,
+            width=width,
+            gap_width=gap_width,
+            rate_width=rate_width,
         )
         super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "relative_speed")])
         self.log_threshold, self.width, self.margin = math.log(threshold), width, margin
@@ -93,7 +97,9 @@ class SmoothEfficiency(RewardTerm):
         speed_floor: float = 1.0,
         vehicle: str = "cav",
     ) -> None:
-        _require_positive(name, threshold=threshold, width=width, speed_floor=speed_floor)
+        require_positive(
+            f"agent.surrogates.{name}", threshold=threshold, width=width, speed_floor=speed_floor
+        )
         super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "speed")])
         self.threshold, self.width, self.speed_floor = threshold, width, speed_floor
 
@@ -126,9 +132,3 @@ class Smoothness(RewardTerm):
 def _log_softplus(value: Tensor) -> Tensor:
     """log(log(1 + eˣ)), which is x far below zero, where softplus itself is rounded to zero."""
     return softplus(value.clamp(min=-15.0)).log() + (value + 15.0).clamp(max=0.0)
-
-
-def _require_positive(name: str, **settings: float) -> None:
-    for key, value in settings.items():
-        if not value > 0:
-            raise ConfigError(f"agent.surrogates.{name}.{key} must be positive, got {value}")

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.functional.idm import IDMConstants, equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.random import choose, stream_id, uniform
@@ -66,12 +66,7 @@ class CAVMotion(Transition):
         name: str = "cav",
         predecessor: str = "leader",
     ) -> None:
-        for label, value in (
-            ("max_acceleration", max_acceleration),
-            ("standstill_gap", standstill_gap),
-        ):
-            if not value > 0:
-                raise ConfigError(f"{name}.{label} must be positive, got {value}")
+        require_positive(name, max_acceleration=max_acceleration, standstill_gap=standstill_gap)
         lowest, highest = initial_gap_range
         if not 0 < lowest <= highest:
             raise ConfigError(
