@@ -1,8 +1,6 @@
-"""Compare agents, what the car may know, and the number of human followers behind it.
+"""Compare agents, and what it is worth to know more than the present.
 
     python tools/compare_agents.py agents data=ngsim data.path=...      # ddpg, td3, sac, analytic
-    python tools/compare_agents.py followers data=ngsim data.path=...   # alcc against reference
-    python tools/compare_agents.py followers --numbers 1,5 --seeds 1 --agent ddpg --gammas 0.9,0.99
     python tools/compare_agents.py knowledge data=ngsim data.path=...   # memory and preview
 
 Each runs trainings into ``--out``, then reads their parquet files and writes a table and a
@@ -18,7 +16,6 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -50,27 +47,6 @@ def runs_of_agents(options: argparse.Namespace) -> list[Run]:
         for seed in range(options.seeds)
     ]
     return [*runs, Run(options.out / "idm", ("variant=idm", *data_overrides(options.overrides)))]
-
-
-def runs_of_followers(options: argparse.Namespace) -> list[Run]:
-    """Return a training per number of followers, discount, variant and seed."""
-    return [
-        Run(
-            options.out / f"n_{number}" / f"gamma_{gamma}" / variant / f"seed_{seed}",
-            (
-                f"agent={options.agent}",
-                f"variant={variant}",
-                f"scenario.followers={number}",
-                f"seed={seed}",
-                *([f"agent.gamma={gamma}"] if gamma != "default" else []),
-                *options.overrides,
-            ),
-        )
-        for number in options.numbers
-        for gamma in options.gammas
-        for variant in ("reference", "alcc")
-        for seed in range(options.seeds)
-    ]
 
 
 def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
@@ -159,68 +135,6 @@ def figure_of_agents(folder: Path) -> Figure:
     return figure
 
 
-def table_of_followers(folder: Path) -> pd.DataFrame:
-    """Return one row per number of followers and discount: what regard for them gains.
-
-    The gain of a seed is paired: 1 − E(alcc) / E(reference), total energy of all controlled and
-    human-driven cars, same profiles, drivers and noise.
-
-    Raises:
-        ResultsError: if no training is finished.
-    """
-    rows = []
-    for path in sorted(folder.rglob(EPISODES)):
-        episodes = results.load(path.parent)
-        first = episodes.iloc[0].to_dict()
-        rows.append(
-            {
-                "followers": int(first["scenario.followers"]),
-                "gamma": float(first["agent.gamma"]),
-                "seed": int(first["seed"]),
-                "variant": first["strategy"],
-                **{name: episodes[name].mean() for name in (ENERGY, UNSAFE, LONG)},
-                "collisions": int(episodes["collided"].sum()),
-            }
-        )
-    if not rows:
-        raise ResultsError(f"{folder}: no finished training below it")
-    runs = pd.DataFrame(rows)
-    keys = ["followers", "gamma", "seed"]
-    energy = runs.pivot_table(index=keys, columns="variant", values=ENERGY)
-    energy = energy.reindex(columns=["reference", "alcc"]).dropna()
-    energy["gain"] = 1.0 - energy["alcc"] / energy["reference"]
-    grouped = energy.groupby(level=["followers", "gamma"])
-    table = grouped[["reference", "alcc", "gain"]].mean()
-    table["gain_sd"], table["seeds"] = grouped["gain"].std(), grouped.size()
-    shares = runs.pivot_table(
-        index=["followers", "gamma"], columns="variant", values=[UNSAFE, LONG]
-    )
-    shares.columns = ["_".join(column) for column in shares.columns.to_flat_index()]
-    return table.join(shares).reset_index()
-
-
-def figure_of_followers(folder: Path) -> Figure:
-    """What regard for the human drivers behind gains, against their number."""
-    table = table_of_followers(folder)
-    figure = new_figure(6.0, 3.8)
-    axis = figure.subplots()
-    for gamma in sorted(set(table["gamma"])):
-        rows = table[table["gamma"] == gamma]
-        error = 100.0 * 1.96 * rows["gain_sd"].fillna(0.0) / np.sqrt(rows["seeds"])
-        counts = sorted({int(count) for count in rows["seeds"]})
-        seeds = "/".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
-        label = f"γ = {gamma:g} ({seeds}, 95 % interval where more than one)"
-        axis.errorbar(rows["followers"], 100.0 * rows["gain"], error, marker="o", label=label)
-    axis.axhline(0.0, color="#222222", lw=0.8)
-    style(
-        axis,
-        "human drivers behind the controlled car",
-        "total energy saved\nby regard for them [%]",
-    )
-    axis.legend(frameon=False)
-    return figure
-
-
 def table_of_knowledge(folder: Path) -> pd.DataFrame:
     """Return one row per kind of knowledge: what it is worth.
 
@@ -255,7 +169,6 @@ Part = tuple[
 ]
 PARTS: dict[str, Part] = {
     "agents": (runs_of_agents, table_of_agents, figure_of_agents),
-    "followers": (runs_of_followers, table_of_followers, figure_of_followers),
     "knowledge": (runs_of_knowledge, table_of_knowledge, figure_of_knowledge),
 }
 
@@ -292,22 +205,14 @@ def parser() -> argparse.ArgumentParser:
         if part == "agents":
             one.add_argument("--agents", type=words, default=list(AGENTS))
             one.add_argument("--variants", type=words, default=["alcc", "reference"])
-        if part != "agents":
+        else:
             one.add_argument("--agent", default="analytic")
-        if part == "followers":
-            one.add_argument("--numbers", type=numbers, default=[1, 2, 5, 10])
-            one.add_argument("--gammas", type=words, default=["default"])
     return top
 
 
 def words(text: str) -> list[str]:
     """Split a list with commas."""
     return text.split(",")
-
-
-def numbers(text: str) -> list[int]:
-    """Split a list of whole numbers with commas."""
-    return [int(word) for word in words(text)]
 
 
 def main(arguments: list[str]) -> int:

@@ -42,6 +42,7 @@ def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
         accept=tuple(arguments.accept),
         ablations=tuple(arguments.ablations) if arguments.ablations else None,
         profiles=arguments.profiles,
+        followers=tuple(arguments.followers),
     )
     note(study.folder, "alcc", command)
     outcomes = alcc.run(study, arguments.parts)
@@ -89,6 +90,8 @@ def parser() -> argparse.ArgumentParser:
     listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
     listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(alcc.ABLATIONS))
     one.add_argument("--profiles", type=int, default=4, help="profiles of the part single")
+    numbers = "numbers of human drivers behind the car, of the part followers"
+    one.add_argument("--followers", type=whole_numbers, default=[1, 2, 5, 10], help=numbers)
     two = study_parser(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     two.set_defaults(run=reproduce_hcfs)
     again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
@@ -115,6 +118,11 @@ def listing(
 ) -> None:
     """Add an option that takes names with commas between them."""
     target.add_argument(name, type=lambda words: words.split(","), default=default, help=text)
+
+
+def whole_numbers(text: str) -> list[int]:
+    """Split whole numbers with commas between them."""
+    return [int(word) for word in text.split(",")]
 
 
 def main(words: list[str]) -> int:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.alcc_tables import (
     PAPER_GENERALIZATION,
-    ablations,
+    comparison,
     generalization,
 )
 from lcc_rl.results.drawing import new_figure
@@ -197,21 +197,21 @@ PANELS = {
 }
 
 
-def ablation_figure(episodes: pd.DataFrame) -> Figure:
-    """What each change of the recipe does to energy, safety and efficiency (no counterpart).
+def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
+    """What each change of the study does to energy, safety and efficiency (no counterpart).
 
     Args:
-        episodes: rows of the evaluations, with the column ``ablation``; the first is the recipe
-            itself.
+        episodes: rows of the evaluations; those of the study itself come first.
+        by: the column that names the change.
     """
-    table = ablations(episodes)
-    names = list(dict.fromkeys(table["ablation"]))
+    table = comparison(episodes, by)
+    names = list(dict.fromkeys(table[by]))
     figure = new_figure(10.0, 1.3 + 0.42 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         for place, strategy in enumerate(dict.fromkeys(table["strategy"])):
             part = table[table["strategy"] == strategy]
-            rows = [names.index(name) + 0.18 * (2 * place - 1) for name in part["ablation"]]
+            rows = [names.index(name) + 0.18 * (2 * place - 1) for name in part[by]]
             _whiskers(axis, rows, part, column, colour(strategy))
             axis.plot(part[column], rows, "o", color=colour(strategy), ms=5, label=strategy)
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
@@ -220,7 +220,7 @@ def ablation_figure(episodes: pd.DataFrame) -> Figure:
         axis.set_axisbelow(True)
         style(axis, label, "")
         axis.tick_params(axis="y", length=0)
-    axes[0].set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    axes[0].set_yticks(range(len(names)), [str(name).replace("_", " ") for name in names])
     axes[0].set_ylim(len(names) - 0.4, -0.6)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
@@ -228,6 +228,29 @@ def ablation_figure(episodes: pd.DataFrame) -> Figure:
     seeds = "seed" if counts == ["1"] else "seeds"
     note = f"n = {' or '.join(counts)} {seeds}; lines: 95 % interval; dashed: the study's limit"
     figure.supxlabel(note, fontsize=8, color=SOFT)
+    return figure
+
+
+def followers_figure(episodes: pd.DataFrame) -> Figure:
+    """What regard for the human drivers behind saves, against their number (no counterpart).
+
+    Args:
+        episodes: rows of the evaluations of both trained strategies, with the column
+            ``followers``.
+    """
+    table = comparison(episodes, "followers")
+    table = table[table["strategy"] == "alcc"]
+    column = "saving_against_reference_pct"
+    figure = new_figure(6.5, 3.8)
+    axis = figure.subplots()
+    axis.plot(table["followers"], table[column], "o-", color=colour("alcc"))
+    _whiskers(axis, table["followers"].to_numpy(), table, column, colour("alcc"), upright=True)
+    for number, value, seeds in table[["followers", column, "seeds"]].itertuples(index=False):
+        text = f"{seeds} seeds" if seeds != "1" else "1 seed"
+        axis.annotate(text, (number, value), (6, -12), textcoords="offset points", fontsize=8)
+    axis.axhline(0.0, color=INK, lw=0.8)
+    words = "total energy saved by alcc\nagainst reference [%]"
+    style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
     return figure
 
 

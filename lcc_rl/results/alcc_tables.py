@@ -331,23 +331,24 @@ def learning(training: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def ablations(episodes: pd.DataFrame) -> pd.DataFrame:
-    """What each change of the recipe does, every ablation against the humans of its own scenario.
+def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
+    """What each change of the study does, every one against the humans of its own scenario.
 
     Args:
-        episodes: rows of the evaluations, with the column ``ablation``.
+        episodes: rows of the evaluations.
+        by: the column that names the change.
 
     Returns:
-        One row per ablation and trained strategy: total energy [kJ], savings against ``idm`` and
+        One row per change and trained strategy: total energy [kJ], savings against ``idm`` and
         ``reference`` [%] with intervals over seeds, collisions, and shares of time [%].
     """
     rows = []
-    for ablation, part in episodes.groupby("ablation", sort=False):
+    for change, part in episodes.groupby(by, sort=False):
         for strategy in per_seed(part, "total_energy_kj"):
             if strategy in HUMANS:
                 continue
             own = part[part["strategy"] == strategy]
-            row: dict[str, object] = {"ablation": ablation, "strategy": strategy}
+            row: dict[str, object] = {by: change, "strategy": strategy}
             row["seeds"] = _seeds(part, strategy)
             row |= mean(per_seed(part, "total_energy_kj")[strategy]).columns("total_energy_kj")
             for baseline in ("idm", "reference"):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from lcc_rl import evaluate
 from lcc_rl.config import load, require
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.profiles import leader_profiles
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.pipeline import TRAJECTORIES, calibrate_once, known_settings, root_key
 from lcc_rl.results.runs import identity, load_config
 from lcc_rl.studies.runner import FINISHED, FOREIGN, Outcome, Run, note_problems, quoted, run_all
@@ -22,33 +22,43 @@ from lcc_rl.studies.runner import FINISHED, FOREIGN, Outcome, Run, note_problems
 log = logging.getLogger("lcc_rl")
 
 VARIANTS = ("alcc", "reference")
-PARTS = ("main", "ablations", "single")
+PARTS = ("main", "filter", "ablations", "single", "followers")
 DRIVERS = Path("calibration/drivers.parquet")
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
+RECIPES = ("quickstart", "paper_alcc")  # how long, and with what batches, DDPG learns
 # What the calibration takes in place of the trainings.
 OF_CALIBRATION = ("data", "calibration")
 
 
-@dataclass(frozen=True)
-class Ablation:
-    """A change of the main recipe: its overrides, and the variants that it concerns."""
+# The longest time gap that the filter allows [s]: how it weighs safety against efficiency.
+FILTERS = (2.45, 2.0, 1.6, 1.3)
+# How the part "followers" learns: DDPG's seeds differ by more than regard for followers brings.
+PRECISE = ("agent=analytic", "+filter=barrier")
+EVERY_WINDOW = ("evaluation.profiles=null",)
 
-    overrides: tuple[str, ...]
+
+@dataclass(frozen=True)
+class Change:
+    """How a part differs from the main one: in overrides, variants, recipes, its evaluation."""
+
+    overrides: tuple[str, ...] = ()
     variants: tuple[str, ...] = VARIANTS
+    recipes: tuple[str, ...] = ()
+    evaluation: tuple[str, ...] = ()
 
 
 ABLATIONS = {
-    "no_safety": Ablation(("reward.terms.safety.weight=0",)),
-    "no_efficiency": Ablation(("reward.terms.efficiency.weight=0",)),
-    "no_cav_energy": Ablation(("reward.terms.cav_energy.weight=0",)),
-    "no_hdv_energy": Ablation(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
-    "true_acceleration": Ablation(("reward.terms.hdv_energy.power=power",), ("alcc",)),
-    "population_mean": Ablation(("scenario.pieces.estimator.learning_time=.inf",), ("alcc",)),
-    "no_recuperation": Ablation(("scenario.pieces.cav_power.recuperation=false",)),
-    "one_training_profile": Ablation(
-        ("split=single_training", "scenario.pieces.leader.start=first")
-    ),
-    **{f"gamma_{gamma:g}": Ablation((f"agent.gamma={gamma:g}",)) for gamma in GAMMAS},
+    "no_safety": Change(("reward.terms.safety.weight=0",)),
+    "no_efficiency": Change(("reward.terms.efficiency.weight=0",)),
+    "no_cav_energy": Change(("reward.terms.cav_energy.weight=0",)),
+    "no_hdv_energy": Change(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
+    "true_acceleration": Change(("reward.terms.hdv_energy.power=power",), ("alcc",)),
+    "population_mean": Change(("scenario.pieces.estimator.learning_time=.inf",), ("alcc",)),
+    "no_recuperation": Change(("scenario.pieces.cav_power.recuperation=false",)),
+    "one_training_profile": Change(("split=single_training", "scenario.pieces.leader.start=first")),
+    "short_training": Change(("training.episodes=300",)),
+    **{f"recipe_{name}": Change(recipes=(name,)) for name in RECIPES},
+    **{f"gamma_{gamma:g}": Change((f"agent.gamma={gamma:g}",)) for gamma in GAMMAS},
 }
 
 
@@ -58,7 +68,7 @@ class Study:
 
     Args:
         folder: where everything goes.
-        recipe: ``experiment`` of every training.
+        recipe: ``experiment`` of every training; None for the defaults of the agent.
         seeds: trainings of every variant, numbered from 0.
         overrides: further settings of every run, data and calibration included.
         jobs: trainings at a time.
@@ -66,20 +76,23 @@ class Study:
         ablations: which to run: a name of :data:`ABLATIONS`, or one's own as
             ``name:override``, e.g. ``early:reward.terms.safety.threshold=6``; None for all.
         profiles: how many profiles the single-profile protocol is tried on.
+        followers: numbers of human drivers behind the car in the part of that name.
     """
 
     folder: Path
-    recipe: str = "paper_alcc"
+    recipe: str | None = "paper_alcc"
     seeds: int = 8
     overrides: tuple[str, ...] = ()
     jobs: int = 2
     accept: tuple[str, ...] = ()
     ablations: tuple[str, ...] | None = None
     profiles: int = 4
+    followers: tuple[int, ...] = (1, 2, 5, 10)
 
     def __post_init__(self) -> None:
         for name in ("seeds", "jobs", "profiles"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1")
+        require(min(self.followers, default=0) >= 1, "followers must be at least 1")
         for item in self.ablations or ():
             chosen_ablation(item)
 
@@ -92,7 +105,7 @@ class Study:
         drivers = f"drivers.path={quoted(self.folder / DRIVERS)}"
         shared = [item for item in self.overrides if root_key(item) not in OF_CALIBRATION]
         return [
-            f"experiment=[{','.join([self.recipe, *recipes])}]",
+            f"experiment=[{','.join([*filter(None, [self.recipe]), *recipes])}]",
             f"variant={variant}",
             "data=episodes",
             data,
@@ -101,21 +114,27 @@ class Study:
             *own,
         ]
 
-    def runs(
-        self, folder: Path, own: Sequence[str], variants: Sequence[str], recipes: Sequence[str] = ()
-    ) -> list[Run]:
+    def runs(self, folder: Path, change: Change = Change()) -> list[Run]:
         """Return a training per seed and variant, seeds first so that all variants grow alike."""
         return [
             Run(
                 folder / variant / f"seed_{seed}",
-                tuple(self.settings("train", variant, f"seed={seed}", *own, recipes=recipes)),
+                tuple(
+                    self.settings(
+                        "train",
+                        variant,
+                        f"seed={seed}",
+                        *change.overrides,
+                        recipes=change.recipes,
+                    )
+                ),
             )
             for seed in range(self.seeds)
-            for variant in variants
+            for variant in change.variants
         ]
 
 
-def chosen_ablation(item: str) -> tuple[str, Ablation]:
+def chosen_ablation(item: str) -> tuple[str, Change]:
     """Return the name and the ablation that an item of a command line stands for.
 
     Raises:
@@ -123,7 +142,7 @@ def chosen_ablation(item: str) -> tuple[str, Ablation]:
     """
     name, _, override = item.partition(":")
     if override:
-        return name, Ablation((override,))
+        return name, Change((override,))
     if name not in ABLATIONS:
         raise unknown_name("ablation", name, ABLATIONS)
     return name, ABLATIONS[name]
@@ -134,7 +153,7 @@ def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
 
     Args:
         study: what to run.
-        parts: ``main``, ``ablations`` and ``single``, independent of each other.
+        parts: ``main``, and what goes with it: ``filter`` needs its policies, all others none.
 
     Returns:
         What became of every training.
@@ -145,10 +164,22 @@ def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
     for part in parts:
         if part not in PARTS:
             raise unknown_name("part", part, PARTS)
-    main = study.runs(study.folder / "train", (), VARIANTS)
-    wanted = main[0].compose()  # a typo must not cost a calibration
+    wanted = study.runs(study.folder / "train")[0].compose()  # a typo must not cost a calibration
+    if "filter" in parts and any("filter=" in item for item in study.overrides):
+        raise ConfigError(
+            "the part filter puts +filter=barrier on trained policies: give the override "
+            "or that part (--parts), not both"
+        )
+    if "followers" in parts:
+        followers_study(study).runs(study.folder, followers_change(study, 1))[0].compose()
     calibrate(study)
-    steps = {"main": _main, "ablations": _ablations, "single": _single}
+    steps = {
+        "main": _main,
+        "filter": _filter,
+        "ablations": _ablations,
+        "single": _single,
+        "followers": _followers,
+    }
     outcomes = []
     for part in (part for part in PARTS if part in parts):
         outcomes += steps[part](study, wanted)
@@ -167,43 +198,68 @@ def calibrate(study: Study) -> None:
 
 def _main(study: Study, wanted: DictConfig) -> list[Outcome]:
     folder = study.folder / "train"
-    outcomes = run_all(study.runs(folder, (), VARIANTS), study.jobs, study.accept)
+    outcomes = run_all(study.runs(folder), study.jobs, study.accept)
     settings = study.settings("evaluate", "alcc")
     evaluate_all(settings, folder, study.folder / "evaluation", foreign(outcomes))
     return outcomes
 
 
+def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
+    """Put the filter on the policies of the main part, with several settings."""
+    trained = study.folder / "train"
+    outcomes = run_all(study.runs(trained), study.jobs, study.accept)
+    for time_gap in FILTERS:
+        own = ("+filter=barrier", f"scenario.pieces.barrier.time_gap={time_gap:g}")
+        folder = study.folder / "filter" / f"time_gap_{time_gap:g}" / "evaluation"
+        evaluate_all(study.settings("evaluate", "alcc", *own), trained, folder, foreign(outcomes))
+    return []  # the trainings are those of the main part
+
+
 def _ablations(study: Study, wanted: DictConfig) -> list[Outcome]:
-    chosen = study.ablations or tuple(
-        name for name in ABLATIONS if name != f"gamma_{wanted.agent.gamma:g}"
-    )
-    changes = dict(chosen_ablation(item) for item in chosen)
-    folders = {name: study.folder / "ablations" / name for name in changes}
-    runs = [
-        run
-        for name, folder in folders.items()
-        for run in study.runs(folder, changes[name].overrides, changes[name].variants)
-    ]
-    outcomes = run_all(runs, study.jobs, study.accept)
-    for name, folder in folders.items():
-        settings = study.settings("evaluate", "alcc", *changes[name].overrides)
-        evaluate_all(settings, folder, folder / "evaluation", foreign(outcomes))
-    return outcomes
+    # Those that change nothing are the main part itself.
+    itself = {f"gamma_{wanted.agent.gamma:g}", f"recipe_{study.recipe}"}
+    chosen = study.ablations or tuple(name for name in ABLATIONS if name not in itself)
+    folder = study.folder / "ablations"
+    return _each(study, {folder / n: c for n, c in map(chosen_ablation, chosen)})
 
 
 def _single(study: Study, wanted: DictConfig) -> list[Outcome]:
-    recipes = ("single_profile",)
     chosen = spread_profiles(study.folder / TRAJECTORIES, wanted, study.profiles)
-    folders = {number: study.folder / "single" / str(number) for number in chosen}
-    runs = [
-        run
-        for number, folder in folders.items()
-        for run in study.runs(folder, (f"split.profile={number}",), VARIANTS, recipes)
-    ]
+    folder, recipes = study.folder / "single", ("single_profile",)
+    return _each(
+        study,
+        {folder / str(n): Change((f"split.profile={n}",), recipes=recipes) for n in chosen},
+    )
+
+
+def _followers(study: Study, wanted: DictConfig) -> list[Outcome]:
+    folder = study.folder / "followers"
+    changes = {folder / str(n): followers_change(study, n) for n in study.followers}
+    return _each(followers_study(study), changes)
+
+
+def followers_study(study: Study) -> Study:
+    """Return the study as its part ``followers`` learns: recipes are for DDPG, but for smoke."""
+    return replace(study, recipe="smoke" if study.recipe == "smoke" else None)
+
+
+def followers_change(study: Study, number: int) -> Change:
+    """Return what makes a training one of the part ``followers``, where the user says no other."""
+    given = {item.lstrip("+~").split("=")[0] for item in study.overrides}
+    learner, windows = (
+        tuple(item for item in items if item.lstrip("+").split("=")[0] not in given)
+        for items in (PRECISE, EVERY_WINDOW)
+    )
+    return Change((*learner, f"scenario.followers={number}"), evaluation=windows)
+
+
+def _each(study: Study, changes: Mapping[Path, Change]) -> list[Outcome]:
+    """Train and evaluate every change of the recipe in a folder of its own."""
+    runs = [run for folder, change in changes.items() for run in study.runs(folder, change)]
     outcomes = run_all(runs, study.jobs, study.accept)
-    for number, folder in folders.items():
-        own = f"split.profile={number}"
-        settings = study.settings("evaluate", "alcc", own, recipes=recipes)
+    for folder, change in changes.items():
+        own = (*change.overrides, *change.evaluation)
+        settings = study.settings("evaluate", "alcc", *own, recipes=change.recipes)
         evaluate_all(settings, folder, folder / "evaluation", foreign(outcomes))
     return outcomes
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -17,13 +17,14 @@ from lcc_rl.results.drawing import save
 from lcc_rl.results.files import read_parquet, write_parquet
 from lcc_rl.results.report import Section, made, write_report
 from lcc_rl.results.runs import CONFIG
-from lcc_rl.studies.alcc import ABLATIONS
+from lcc_rl.studies.alcc import ABLATIONS, FILTERS
 from lcc_rl.studies.runner import read_notes
 
 log = logging.getLogger("lcc_rl")
 
 TITLE = "Adaptive Leading Cruise Control: the study"
 ITSELF = "none (the recipe itself)"
+NO_FILTER = "without"
 Tables = list[tuple[str, pd.DataFrame]]
 Figures = list[tuple[str, Path]]
 
@@ -70,9 +71,11 @@ def write_results(folder: str | Path) -> Path:
     page = Page(Path(folder))
     parts: list[Callable[[Page], None]] = [
         _main,
+        _filter,
         _learning,
         _ablations,
         _single,
+        _followers,
         _people,
         _made,
     ]
@@ -260,8 +263,43 @@ def _learning(page: Page) -> None:
     page.add("Learning", text, tables, figures)
 
 
+def _filter(page: Page) -> None:
+    order = [f"time_gap_{value:g}" for value in FILTERS]
+    frames = _evaluations(page.folder / "filter", "filter", order)
+    if not frames:
+        return
+    main = read_parquet(page.folder / "evaluation" / "episodes.parquet")
+    episodes = pd.concat([main.assign(filter=NO_FILTER), *frames], ignore_index=True)
+    first, size = frames[0], _size(frames[0])
+    text = (
+        "The same policies, with +filter=barrier between them and the car: nothing is trained. "
+        "The filter keeps the time-to-collision above 4 s and, as far as that leaves room, the "
+        "time gap below scenario.pieces.barrier.time_gap, in seconds, by which the lines differ. "
+        f"The further tables are those of its default, {FILTERS[0]:g} s."
+    )
+    tables = [
+        page.table(
+            "filter",
+            f"Without and with the filter, {size}",
+            alcc_tables.comparison(episodes, "filter"),
+        ),
+        page.table("filter_headline", "Total energy saved", alcc_tables.headline(first)),
+        page.table("filter_constraints", "All episodes", alcc_tables.constraints(first)),
+        page.table("filter_by_seed", "Every seed", alcc_tables.constraints_by_seed(first)),
+        page.table("filter_human", "Human driver's energy", alcc_tables.human_energy(first)),
+    ]
+    figures = [
+        page.figure(
+            "filter",
+            "Energy, safety and efficiency without and with the filter.",
+            alcc_figures.comparison_figure(episodes, "filter"),
+        )
+    ]
+    page.add("A filter that keeps the time-to-collision", text, tables, figures)
+
+
 def _ablations(page: Page) -> None:
-    frames = _evaluations(page.folder / "ablations", "ablation")
+    frames = _evaluations(page.folder / "ablations", "ablation", list(ABLATIONS))
     if not frames:
         return
     main = read_parquet(page.folder / "evaluation" / "episodes.parquet")
@@ -271,9 +309,9 @@ def _ablations(page: Page) -> None:
         "against the human in the same scenario, so that a change of the scenario (no "
         "recuperation) is compared with itself."
     )
-    tables = [page.table("ablations", "Ablations", alcc_tables.ablations(episodes))]
+    tables = [page.table("ablations", "Ablations", alcc_tables.comparison(episodes))]
     caption = "Energy, safety and efficiency under each change."
-    figures = [page.figure("ablations", caption, alcc_figures.ablation_figure(episodes))]
+    figures = [page.figure("ablations", caption, alcc_figures.comparison_figure(episodes))]
     page.add("Ablations", text, tables, figures)
 
 
@@ -294,13 +332,35 @@ def _single(page: Page) -> None:
     page.add("One profile for training and evaluation", text, tables, figures)
 
 
-def _evaluations(root: Path, column: str) -> list[pd.DataFrame]:
-    """Read the evaluation of every part below a folder, its name as a column."""
-    known = list(ABLATIONS)
+def _followers(page: Page) -> None:
+    frames = _evaluations(page.folder / "followers", "followers")
+    if not frames:
+        return
+    episodes = pd.concat(frames, ignore_index=True)
+    episodes["followers"] = episodes["followers"].astype(int)
+    episodes = episodes.sort_values("followers", kind="stable")
+    text = (
+        "Total energy is that of the controlled car and of all human drivers behind it. Unless "
+        "the study's overrides say otherwise, both controllers learn by the gradient through the "
+        "simulator (agent=analytic), which is more precise than DDPG, have the filter, and are "
+        f"evaluated on every held-out window of 30 s ({_size(episodes)}). Time gaps tell whether a "
+        "saving is bought with distance."
+    )
+    table = alcc_tables.comparison(episodes, "followers")
+    tables = [page.table("followers", "Against the number of human drivers behind", table)]
+    figures = []
+    if {"alcc", "reference"} <= set(episodes["strategy"]):
+        caption = "Energy that regard for the human drivers behind saves, against their number."
+        figure = alcc_figures.followers_figure(episodes)
+        figures = [page.figure("followers", caption, figure)]
+    page.add("More human drivers behind", text, tables, figures)
+
+
+def _evaluations(root: Path, column: str, order: Sequence[str] = ()) -> list[pd.DataFrame]:
+    """Read the evaluation of every part below a folder, its name as a column; known ones first."""
     found = {path.parents[1].name: path for path in root.glob("*/evaluation/episodes.parquet")}
-    # Those of the study in its order, then one's own.
-    order = sorted(found, key=lambda name: (known.index(name) if name in known else 99, name))
-    return [read_parquet(found[name]).assign(**{column: name}) for name in order]
+    names = [*(name for name in order if name in found), *sorted(found.keys() - set(order))]
+    return [read_parquet(found[name]).assign(**{column: name}) for name in names]
 
 
 def _people(page: Page) -> None:

@@ -158,7 +158,7 @@ def test_ablations_are_compared_with_the_humans_of_their_own_scenario() -> None:
     other = episodes()
     other[["cav_energy_kj", "total_energy_kj"]] *= 2.0
     frame = pd.concat([episodes().assign(ablation="none"), other.assign(ablation="double")])
-    table = alcc_tables.ablations(frame).set_index(["ablation", "strategy"])
+    table = alcc_tables.comparison(frame).set_index(["ablation", "strategy"])
     one, two = (table.loc[(name, "alcc")] for name in ("none", "double"))
     assert one["saving_against_idm_pct"] == pytest.approx(two["saving_against_idm_pct"])
     assert two["total_energy_kj"] == pytest.approx(2 * one["total_energy_kj"])

@@ -47,6 +47,10 @@ def ablated() -> pd.DataFrame:
     return pd.concat([episodes().assign(ablation=name) for name in ("none", "no_safety")])
 
 
+def strings() -> pd.DataFrame:
+    return pd.concat([episodes().assign(followers=number) for number in (1, 5)])
+
+
 def single() -> pd.DataFrame:
     return pd.concat([episodes(profiles=1).assign(study_profile=number) for number in (3, 12)])
 
@@ -72,7 +76,8 @@ FIGURES = {
         lambda: alcc_figures.generalization_figure(episodes()),
         ["paper, 4 profiles", "n = 2", "mean of 2 seeds"],
     ),
-    "ablations": (lambda: alcc_figures.ablation_figure(ablated()), ["no safety", "n = 2 seeds"]),
+    "ablations": (lambda: alcc_figures.comparison_figure(ablated()), ["no safety", "n = 2 seeds"]),
+    "followers": (lambda: alcc_figures.followers_figure(strings()), ["human drivers", "2 seeds"]),
     "single": (lambda: alcc_figures.single_profile_figure(single()), ["profile 12", "idm", "kJ"]),
 }
 

@@ -54,48 +54,87 @@ def small(tmp_path, monkeypatch) -> alcc.Study:
 def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> None:
     study = alcc.Study(tmp_path, "paper_alcc", 1)
     seen = {}
-    for name, ablation in alcc.ABLATIONS.items():
-        configs = [
-            run.compose() for run in study.runs(tmp_path, ablation.overrides, ablation.variants)
-        ]
-        assert [cfg.variant for cfg in configs] == list(ablation.variants)
-        seen[OmegaConf.to_yaml(configs[0])] = name
-    assert len(seen) == len(alcc.ABLATIONS)
-    main = OmegaConf.to_yaml(study.runs(tmp_path, (), ("alcc",))[0].compose())
-    assert seen[main] == "gamma_0.9"  # the recipe itself, and nothing else is
-    single = study.runs(tmp_path, ("split.profile=5",), ("alcc",), ("single_profile",))
-    cfg = single[0].compose()
+    for name, change in alcc.ABLATIONS.items():
+        configs = [run.compose() for run in study.runs(tmp_path, change)]
+        assert [cfg.variant for cfg in configs] == list(change.variants)
+        seen.setdefault(OmegaConf.to_yaml(configs[0]), []).append(name)
+    main = OmegaConf.to_yaml(study.runs(tmp_path)[0].compose())
+    # The recipe itself, and nothing else is.
+    assert seen.pop(main) == ["recipe_paper_alcc", "gamma_0.9"]
+    assert all(len(names) == 1 for names in seen.values())
+    single = alcc.Change(("split.profile=5",), recipes=("single_profile",))
+    cfg = study.runs(tmp_path, single)[0].compose()
     assert (cfg.split.profile, cfg.scenario.pieces.leader.start) == (5, "first")
     assert cfg.training.episodes == 3000
 
 
+def test_a_recipe_brings_all_that_it_says_whatever_came_before(tmp_path) -> None:
+    paper = alcc.Study(tmp_path, "paper_alcc", 1).runs(tmp_path)[0].compose()
+    change = alcc.ABLATIONS["recipe_paper_alcc"]
+    assert alcc.Study(tmp_path, "quickstart", 1).runs(tmp_path, change)[0].compose() == paper
+
+
+def test_followers_learn_with_the_analytic_agent_unless_another_is_asked_for(tmp_path) -> None:
+    study = alcc.Study(tmp_path, "quickstart", 1)
+    change = alcc.followers_change(study, 5)
+    cfg = alcc.followers_study(study).runs(tmp_path, change)[0].compose()
+    assert cfg.agent._target_.endswith("Analytic")
+    assert cfg.scenario.followers == 5
+    assert cfg.scenario.pieces.barrier is not None
+    assert change.evaluation == ("evaluation.profiles=null",)
+    study = alcc.Study(tmp_path, overrides=("agent=td3", "evaluation.profiles=3"))
+    change = alcc.followers_change(study, 1)
+    assert change.overrides == ("+filter=barrier", "scenario.followers=1")
+    assert change.evaluation == ()
+
+
+def test_the_filter_is_put_on_once(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="not both"):
+        alcc.run(alcc.Study(tmp_path, overrides=("+filter=barrier",)))
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_whole_study_in_small(small) -> None:
-    outcomes = alcc.run(small, ["main"])
+    outcomes = alcc.run(small, ["main", "filter"])
     study = alcc.Study(**{**vars(small), "seeds": 1, "ablations": ("late:agent.tau=0.01",)})
     outcomes += alcc.run(study, ["ablations", "single"])
-    assert [outcome.status for outcome in outcomes] == [FINISHED] * (4 + 2 + 2)
+    shared = tuple(item for item in TINY if "batch_size" not in item)  # which analytic has not
+    settings = {"overrides": (*shared, "evaluation.profiles=2"), "followers": (1, 2)}
+    strings = alcc.Study(**{**vars(study), **settings})
+    outcomes += alcc.run(strings, ["followers"])
+    assert [outcome.status for outcome in outcomes] == [FINISHED] * (4 + 2 + 2 + 4)
     page = alcc_report.write_results(study.folder)
     episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
     counts = episodes.groupby("strategy")["training_seed"].nunique()
     assert counts.to_dict() == {"alcc": 2, "direct": 0, "idm": 0, "reference": 2}
     tables = {path.stem for path in (study.folder / "tables").iterdir()}
     assert {"headline", "table_iv", "ablations", "single_profile", "learning"} <= tables
+    filtered = read_parquet(study.folder / "tables" / "filter.parquet")
+    assert len(filtered) == 2 * (1 + len(alcc.FILTERS))
+    with_filter = filtered[filtered["filter"] == "time_gap_2.45"]
+    assert not with_filter["total_energy_kj"].isin(filtered["total_energy_kj"][:2]).any()
+    more = read_parquet(study.folder / "tables" / "followers.parquet")
+    assert more[["followers", "strategy"]].to_numpy().tolist() == [
+        [number, name] for number in (1, 2) for name in ("alcc", "reference")
+    ]
     ablated = read_parquet(study.folder / "tables" / "ablations.parquet")
     assert set(ablated["ablation"]) == {alcc_report.ITSELF, "late"}
     html = page.read_text()
-    for words in ("Ablations", "Table IV", "One profile", "late", "seed_1", "Configuration"):
+    sections = ("Ablations", "Table IV", "One profile", "A filter", "More human drivers")
+    for words in (*sections, "late", "seed_1", "Configuration"):
         assert words in html, words
     # The single profile is both trained on and evaluated on.
     (folder,) = (study.folder / "single").iterdir()
     once = read_parquet(folder / "evaluation" / "episodes.parquet")
     assert once["profile_id"].nunique() == 1
-    _everything_is_skipped(study)
+    _everything_is_skipped(study, ["main", "filter", "ablations", "single"])
+    _everything_is_skipped(strings, ["followers"])
     _the_page_needs_the_parquet_files_only(study)
 
 
-def _everything_is_skipped(study: alcc.Study) -> None:
+def _everything_is_skipped(study: alcc.Study, parts: list[str]) -> None:
     before = {p: p.stat().st_mtime_ns for p in study.folder.rglob("*.parquet")}
-    assert {outcome.status for outcome in alcc.run(study)} == {FINISHED}
+    assert {outcome.status for outcome in alcc.run(study, parts)} == {FINISHED}
     assert before == {p: p.stat().st_mtime_ns for p in study.folder.rglob("*.parquet")}
 
 
@@ -177,5 +216,5 @@ def test_one_profile_for_both_sides() -> None:
 
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
-    run = alcc.Study(folder, "smoke", 1).runs(folder / "train", (), ("alcc",))[0]
+    run = alcc.Study(folder, "smoke", 1).runs(folder / "train")[0]
     assert Path(run.compose().data.path) == folder / "trajectories.parquet"

@@ -45,20 +45,6 @@ def fabricate(folder: Path, variant: str, energy: float, *overrides: str) -> Non
     write_parquet(pd.DataFrame(timing), folder / "timing.parquet")
 
 
-def test_gain_of_followers_is_paired_by_seed(tmp_path) -> None:
-    for seed, (alone, aware) in enumerate([(100.0, 98.0), (110.0, 104.5)]):
-        for variant, energy in (("reference", alone), ("alcc", aware)):
-            settings = ("agent=analytic", "scenario.followers=5", f"seed={seed}")
-            fabricate(tmp_path / f"{variant}{seed}", variant, energy, *settings)
-    fabricate(tmp_path / "lonely", "alcc", 50.0, "agent=analytic", "scenario.followers=2")
-    assert tool.main(["followers", "--draw", "--out", str(tmp_path)]) == 0
-    table = read_parquet(tmp_path / "followers.parquet")
-    assert table[["followers", "gamma", "seeds"]].to_numpy().tolist() == [[5, 1.0, 2]]
-    assert table["gain"][0] == pytest.approx((0.02 + 0.05) / 2)
-    assert table["share_time_gap_long_alcc"][0] == pytest.approx(0.01)
-    assert (tmp_path / "followers.png").stat().st_size > 1000
-
-
 def test_table_of_agents(tmp_path) -> None:
     fabricate(tmp_path / "a", "alcc", 120.0, "agent=td3", "seed=2")
     fabricate(tmp_path / "b", "reference", 118.0, "agent=analytic")
@@ -78,13 +64,13 @@ def test_what_knowledge_is_worth(tmp_path) -> None:
     assert (tmp_path / "knowledge.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("part", ["agents", "followers", "knowledge"])
+@pytest.mark.parametrize("part", ["agents", "knowledge"])
 def test_every_run_it_would_start_composes(part, tmp_path) -> None:
     words = [part, "--seeds", "1", "--out", str(tmp_path), "experiment=smoke"]
     options, overrides = tool.parser().parse_known_args(words)
     options.overrides = overrides
     runs = tool.PARTS[part][0](options)
-    assert len(runs) == {"agents": 4 * 2 + 1, "followers": 4 * 2, "knowledge": 6}[part]
+    assert len(runs) == {"agents": 4 * 2 + 1, "knowledge": 6}[part]
     assert len({run.folder for run in runs}) == len(runs)
     for run in runs:
         assert run.compose().scenario.horizon == 60
@@ -92,9 +78,9 @@ def test_every_run_it_would_start_composes(part, tmp_path) -> None:
 
 def test_nothing_finished(tmp_path) -> None:
     with pytest.raises(ResultsError, match="no finished training"):
-        tool.main(["followers", "--draw", "--out", str(tmp_path)])
+        tool.main(["agents", "--draw", "--out", str(tmp_path)])
 
 
 def test_a_typing_error_is_no_override(tmp_path) -> None:
     with pytest.raises(ConfigError, match="--sedes"):
-        tool.main(["followers", "--sedes=3"])
+        tool.main(["agents", "--sedes=3"])
