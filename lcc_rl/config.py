@@ -54,6 +54,7 @@ class TrainingConfig:
     environments: int = MISSING
     segment: int = MISSING
     checkpoint_every: int = MISSING
+    keep_every: int | None = None
     compiled: bool | None = None
 
 

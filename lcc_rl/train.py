@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
 from lcc_rl.pieces.vehicles import Population
-from lcc_rl.results.files import parquet_metadata, read_parquet, write_parquet
+from lcc_rl.results.files import parquet_metadata, read_parquet, remove_leftovers, write_parquet
 from lcc_rl.results.loggers import Silent
 from lcc_rl.results.platoon_tables import case_table
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
@@ -33,7 +34,7 @@ from lcc_rl.results.tables import as_rich, show, summary
 
 log = logging.getLogger("lcc_rl")
 
-EPISODES = "episodes.parquet"
+EPISODES, POLICIES = "episodes.parquet", "policies"
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
 OBJECTIVES = (
     "kj_per_km",
@@ -58,7 +59,8 @@ def run(
     """Train the variant of a configuration, then evaluate it.
 
     Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
-    and, last, episodes.parquet; the first four after config.yaml only where something is learned.
+    and, last, episodes.parquet; the first four after config.yaml only where something is learned,
+    and policies/<iteration>.pt where training.keep_every says so.
 
     Args:
         cfg: configuration of the entry point ``train``; with ``resume`` the run in that folder
@@ -109,6 +111,8 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
         trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
         if resume:
             trainer.load()
+        remove_leftovers(folder / POLICIES)
+        trainer.on_keep = partial(keep_policy, agent, cfg, folder)
         with row_logger(cfg).opened(folder) as trainer.on_row:
             trainer.run()
         save_policy(agent.policy.state_dict(), cfg, folder / "policy.pt")
@@ -117,6 +121,12 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     policy = build_policy(cfg, agent.policy)
     strategy = Strategy(cfg.variant, cfg, policy, seed if agent.learns else None)
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+
+
+def keep_policy(agent: Any, cfg: DictConfig, folder: Path, iteration: int) -> None:
+    """Write the policy as it is after an iteration to ``policies/<iteration>.pt``."""
+    path = folder / POLICIES / f"{iteration:06d}.pt"
+    save_policy(agent.policy.state_dict(), cfg, path)
 
 
 def row_logger(cfg: DictConfig) -> Any:

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl import evaluate, pipeline, results, train
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.results.files import read_parquet
+from lcc_rl.results.runs import load_policy
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -78,6 +80,22 @@ def test_same_command_same_rows(trained, tmp_path) -> None:
     for table in ("training", "episodes", "steps"):
         one, two = (read_parquet(folder / f"{table}.parquet") for folder in (trained, tmp_path))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> None:
+    train.run(tiny("train", "variant=alcc", "training.keep_every=2"), tmp_path, quiet=True)
+    one, two = (read_parquet(folder / "training.parquet") for folder in (trained, tmp_path))
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
+    kept = tmp_path / "policies" / "000002.pt"
+    assert list((tmp_path / "policies").iterdir()) == [kept]  # of three iterations
+    weights, cfg = load_policy(kept, "alcc")
+    last, _ = load_policy(tmp_path)
+    assert cfg.training.keep_every == 2
+    assert all(weights[name].shape == last[name].shape for name in last)
+    assert any(not torch.equal(weights[name], last[name]) for name in last)
+    cfg = tiny("evaluate", "variant=alcc", f"policy={kept}", agent=False)
+    rows = evaluate.run(cfg, tmp_path / "evaluation", quiet=True)
+    assert set(rows["strategy"]) == {"direct", "idm", "alcc"}
 
 
 def test_a_folder_with_a_training_is_not_overwritten(trained) -> None:

@@ -1,6 +1,7 @@
 """Compare agents, and what it is worth to know more than the present.
 
     python tools/compare_agents.py agents data=ngsim data.path=...      # ddpg, td3, sac, analytic
+    python tools/compare_agents.py agents training.keep_every=5 ...     # ... and on the way there
     python tools/compare_agents.py knowledge data=ngsim data.path=...   # memory and preview
 
 Each runs trainings into ``--out``, then reads their parquet files and writes a table and a
@@ -21,17 +22,24 @@ from matplotlib.figure import Figure
 
 from lcc_rl import results
 from lcc_rl.cli import main_guard
+from lcc_rl.config import load
+from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.evaluate import trained
+from lcc_rl.evaluation.monte_carlo import evaluate
 from lcc_rl.results.drawing import new_figure, save
-from lcc_rl.results.files import write_parquet
+from lcc_rl.results.files import read_parquet, write_parquet
+from lcc_rl.results.runs import load_policy
 from lcc_rl.results.study_figures import colour, style
 from lcc_rl.studies.runner import FINISHED, Run, run_all
+from lcc_rl.train import POLICIES
 
 log = logging.getLogger("lcc_rl")
 
 AGENTS = ("analytic", "ddpg", "td3", "sac")
 PREVIEWS = (1.0, 2.0, 5.0, 10.0)  # [s]; five speeds, evenly spread up to there
-EPISODES = "episodes.parquet"
+EPISODES, KEPT = "episodes.parquet", "kept.parquet"
+HUES = {"analytic": "#0072b2", "ddpg": "#d55e00", "td3": "#009e73", "sac": "#cc79a7"}
 ENERGY, UNSAFE, LONG = "total_energy_kj", "share_ttc_unsafe", "share_time_gap_long"
 
 
@@ -72,6 +80,32 @@ def data_overrides(overrides: Iterable[str]) -> list[str]:
     return [item for item in overrides if item.lstrip("+~").split(".")[0].split("=")[0] in known]
 
 
+def evaluate_kept(options: argparse.Namespace) -> None:
+    """Evaluate the policies that each training kept on its way: kept.parquet in its folder."""
+    folders = sorted(path.parent for path in options.out.rglob(POLICIES) if path.is_dir())
+    folders = [folder for folder in folders if not (folder / KEPT).exists()]
+    if not folders:
+        return
+    cfg = load("evaluate", data_overrides(options.overrides))
+    inputs, size = load_inputs(cfg), cfg.evaluation
+    for folder in folders:
+        log.info("%s: evaluating the policies kept on the way", folder)
+        rows = []
+        for path in sorted((folder / POLICIES).glob("*.pt")):
+            strategy = trained(cfg, str(path), load_policy(path), inputs)
+            episodes, _ = evaluate(
+                strategy,
+                inputs.evaluation,
+                inputs.population,
+                size.drivers,
+                size.batch_size,
+                size.seed,
+            )
+            means = episodes[[ENERGY, UNSAFE, LONG, "collided"]].mean().to_dict()
+            rows.append({"iteration": float(path.stem), **means})
+        write_parquet(pd.DataFrame(rows), folder / KEPT)
+
+
 def table_of_agents(folder: Path) -> pd.DataFrame:
     """Return one row per run: energy, safety, and the time and steps that it trained.
 
@@ -103,36 +137,51 @@ def table_of_agents(folder: Path) -> pd.DataFrame:
 
 
 def figure_of_agents(folder: Path) -> Figure:
-    """Reward against wall time and steps, and energy against wall time at the end."""
+    """Held-out energy and training reward over wall time and over steps, every run a line."""
     table = table_of_agents(folder)
     learned = table[table["train_s"].notna()]
-    figure = new_figure(11.0, 3.8)
-    axes = figure.subplots(1, 3)
+    figure = new_figure(9.0, 6.4)
+    axes = figure.subplots(2, 2, sharex="col", sharey="row")
+    ends = []
     for run in learned.to_dict("records"):
-        training, timing = (results.load(folder / run["run"], x) for x in ("training", "timing"))
-        wall = (timing["collect_s"] + timing["learn_s"]).cumsum() / 60.0
-        smooth = training["episode_reward"].rolling(10, min_periods=1).mean()
-        hue = colour(run["agent"])
-        axes[0].plot(wall, smooth, color=hue, lw=1.0, alpha=0.8)
-        axes[1].plot(training["transitions"], smooth, color=hue, lw=1.0, alpha=0.8)
-        mark = "o" if run["variant"] == "alcc" else "s"
-        axes[2].plot(run["train_s"] / 60.0, run[ENERGY], mark, color=hue)
-    for agent in dict.fromkeys(learned["agent"]):
-        axes[0].plot([], [], color=colour(agent), label=agent)
-    for axis, words in zip(
-        axes, ("training time [min]", "environment steps", "training time [min]"), strict=True
-    ):
-        style(axis, words, "reward per training episode")
-        axis.set_xscale("log")
-    for axis in axes[:2]:
-        axis.set_ylim(-60.0, 0.0)
+        curve = course(folder / run["run"])
+        look = {"color": HUES[run["agent"]], "lw": 1.1, "alpha": 0.8}
+        look["ls"] = "-" if run["variant"] == "alcc" else ":"
+        kept = curve.dropna(subset=[ENERGY])
+        ends += kept[ENERGY].tail(len(kept) // 2).tolist()
+        for column, x in enumerate(("minutes", "transitions")):
+            axes[0, column].plot(kept[x], kept[ENERGY], marker=".", **look)
+            axes[1, column].plot(curve[x], curve["smooth"], **look)
     human = table.loc[table["variant"] == "idm", ENERGY]
-    if len(human):
-        axes[2].axhline(float(human.iloc[0]), color="#222222", lw=0.8, ls="--", label="idm")
-    style(axes[2], "training time [min]", "held-out total energy [kJ]")
-    axes[2].set_title("○ alcc, □ reference; dashed: human", fontsize=9)
-    axes[0].legend(frameon=False)
+    for axis in axes[0] if len(human) else ():
+        axis.axhline(float(human.iloc[0]), color="#222222", lw=0.8, ls="--")
+    if ends:  # the first policies of a training would set the scale
+        ends += human.tolist()
+        axes[0, 0].set_ylim(min(ends) - 2.0, max(ends) + 2.0)
+    axes[1, 0].set_ylim(-60.0, 0.0)
+    for axis, words in zip(axes[1], ("training time [min]", "environment steps"), strict=True):
+        style(axis, words, "")
+        axis.set_xscale("log")
+    style(axes[0, 0], "", "held-out total energy\n[kJ per episode]")
+    style(axes[0, 1], "", "")
+    style(axes[1, 0], "training time [min]", "reward per training episode\n(mean of 10 batches)")
+    for agent in dict.fromkeys(learned["agent"]):
+        axes[1, 0].plot([], [], color=HUES[agent], label=agent)
+    axes[1, 0].legend(frameon=False, loc="lower right")
+    note = "a line per training; solid: alcc, dotted: reference; dashed: a human in the car's place"
+    figure.supxlabel(note, fontsize=8)
     return figure
+
+
+def course(folder: Path) -> pd.DataFrame:
+    """Return the course of a training: minutes, steps, reward; held-out energy where kept."""
+    training, timing = (results.load(folder, name) for name in ("training", "timing"))
+    frame = training[["iteration", "transitions"]].copy()
+    frame["minutes"] = (timing["collect_s"] + timing["learn_s"]).cumsum() / 60.0
+    frame["smooth"] = training["episode_reward"].rolling(10, min_periods=1).mean()
+    path = folder / KEPT
+    kept = read_parquet(path) if path.exists() else pd.DataFrame({"iteration": [], ENERGY: []})
+    return frame.merge(kept, on="iteration", how="left")
 
 
 def table_of_knowledge(folder: Path) -> pd.DataFrame:
@@ -183,6 +232,7 @@ def perform(part: str, options: argparse.Namespace) -> int:
         for outcome in wrong:
             log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
         failed = int(bool(wrong))
+        evaluate_kept(options)
     table = tabulate(options.out)
     write_parquet(table, options.out / f"{part}.parquet")
     save(draw(options.out), options.out / f"{part}.png")

@@ -79,6 +79,11 @@ class TrainingLoop(ABC):
             f"training.segment ({settings.segment}) must divide scenario.horizon ({self.horizon})",
         )
         require(settings.checkpoint_every >= 1, "training.checkpoint_every must be at least 1")
+        self.keep_every = getattr(settings, "keep_every", None)  # older runs have no such choice
+        require(
+            self.keep_every is None or self.keep_every >= 1,
+            f"training.keep_every must be at least 1, or null, got {self.keep_every}",
+        )
         self.agent, self.env, self.settings = agent, env, settings
         self.seed, self.folder, self.identity = seed, folder, identity
         self.iterations = settings.episodes // batch
@@ -87,6 +92,8 @@ class TrainingLoop(ABC):
         self.times: list[dict[str, float]] = []
         # Told every row as it appears; see lcc_rl.results.loggers.
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
+        # Told the number of every iteration whose policy is to be kept.
+        self.on_keep: Callable[[int], None] = lambda iteration: None
 
     @abstractmethod
     def _source(self) -> Any:
@@ -112,6 +119,8 @@ class TrainingLoop(ABC):
             while self.iteration < self.iterations:
                 row = self._iterate(source)
                 self.on_row(row)
+                if self.keep_every is not None and self.iteration % self.keep_every == 0:
+                    self.on_keep(self.iteration)
                 progress.update(
                     self.iteration, {"reward": row["episode_reward"], "loss": row[self.watched]}
                 )

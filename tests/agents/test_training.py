@@ -118,6 +118,7 @@ def test_damaged_checkpoints(tmp_path, damage) -> None:
         ("training.episodes=2", "at least"),
         ("training.episodes=21", "multiple"),
         ("training.checkpoint_every=0", "checkpoint_every"),
+        ("training.keep_every=0", "keep_every"),
     ],
 )
 def test_contradictory_lengths(tmp_path, override, words) -> None:

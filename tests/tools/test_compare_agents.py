@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pandas as pd
 import pytest
 from helpers import compose
 
+from lcc_rl import train
+from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.results.files import read_parquet, write_parquet
 from lcc_rl.results.runs import save_config
@@ -53,6 +56,26 @@ def test_table_of_agents(tmp_path) -> None:
     assert table.loc["a", ["agent", "seed", "env_steps", "train_s"]].tolist() == ["td3", 2, 80, 10]
     assert table.loc["b", "total_energy_kj"] == 118.0
     assert (tmp_path / "agents.png").stat().st_size > 1000
+
+
+def test_policies_kept_on_the_way_are_evaluated_once(tmp_path) -> None:
+    data = ("data.platoons=4", "data.recordings=2", "scenario.horizon=40", "experiment=smoke")
+    small = ("agent.batch_size=64", "agent.hidden=[16,16]", "training.keep_every=1")
+    folder = tmp_path / "ddpg" / "alcc" / "seed_0"
+    train.run(load("train", [*data, *small]), folder, quiet=True)
+    options = argparse.Namespace(out=tmp_path, overrides=[*data, *small])
+    tool.evaluate_kept(options)
+    kept = read_parquet(folder / "kept.parquet")
+    assert kept["iteration"].tolist() == [1.0, 2.0, 3.0]
+    # The last one is the policy of the run, evaluated on the same episodes.
+    last = read_parquet(folder / "episodes.parquet")["total_energy_kj"].mean()
+    assert kept["total_energy_kj"].iloc[-1] == pytest.approx(last, rel=1e-6)
+    assert kept["total_energy_kj"].nunique() == 3
+    for path in (folder / "policies").iterdir():
+        path.unlink()
+    tool.evaluate_kept(options)  # done before: nothing is read again
+    assert tool.course(folder)["total_energy_kj"].notna().all()
+    assert tool.main(["agents", "--draw", "--out", str(tmp_path)]) == 0
 
 
 def test_what_knowledge_is_worth(tmp_path) -> None:
