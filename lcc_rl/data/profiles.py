@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -24,6 +24,8 @@ class Profiles:
         names: a readable identity of each record: recording, vehicle and start.
         recordings: the recording that each record comes from.
         time_step: time between samples [s].
+        reach: samples known of each record, shape ``[profiles]``: those to play and what follows
+            a window, for those who look ahead; None for ``lengths``.
     """
 
     speeds: Tensor
@@ -32,6 +34,7 @@ class Profiles:
     names: tuple[str, ...]
     recordings: tuple[str, ...]
     time_step: float
+    reach: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -54,6 +57,8 @@ class Profiles:
     def windows(self, horizon: int, limit: int | None = None) -> Profiles:
         """Cut the records into consecutive windows of ``horizon`` steps that do not overlap.
 
+        What follows a window in its record stays within ``reach``.
+
         Args:
             horizon: steps per window; a window has one sample more.
             limit: keep at most this many, spread evenly over all; None keeps every window.
@@ -69,12 +74,14 @@ class Profiles:
         if not cuts:
             raise DataError(self._too_short(horizon))
         cuts = [cuts[i] for i in evenly(len(cuts), limit)]
-        return from_records(
-            [self.record(i)[start : start + horizon + 1] for i, start in cuts],
+        whole = from_records(
+            [self.record(i)[start:] for i, start in cuts],
             [f"{self.names[i]}+{start * self.time_step:g}s" for i, start in cuts],
             [self.recordings[i] for i, _ in cuts],
             self.time_step,
         )
+        played = torch.full_like(whole.lengths, horizon + 1)
+        return replace(whole, lengths=played, reach=whole.lengths)
 
     def spread(self, limit: int | None) -> Profiles:
         """Return at most ``limit`` of the records, spread evenly; None for all."""

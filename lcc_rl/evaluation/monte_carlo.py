@@ -100,11 +100,14 @@ def evaluate(
     """
     require(batch_size >= 1, f"evaluation.batch_size must be at least 1, got {batch_size}")
     profile, driver = pairs(len(profiles), len(population.time_gap), drivers)
+    cfg = strategy.cfg.copy()
+    if "profile" in cfg.scenario.pieces.get("leader", {}):
+        cfg.scenario.pieces.leader.profile = None  # the one to train on; here all are given
     kept = set(np.linspace(0, len(profile) - 1, max(sample_episodes, 1)).round().astype(int))
     episodes, steps = [], []
     for start in range(0, len(profile), batch_size):
         part = slice(start, start + batch_size)
-        env = build_env(strategy.cfg, profiles, population, len(profile[part]), 0, device)
+        env = build_env(cfg, profiles, population, len(profile[part]), 0, device)
         given = choices(env, profile[part], driver[part], seed, len(population.time_gap))
         series, alive = roll(env, strategy.policy, given)
         table = measure(series, alive, strategy.cfg.scenario.time_step)
@@ -122,7 +125,8 @@ def choices(
 ) -> TensorDict:
     """Build what ``env.reset`` needs to play given profiles to given drivers."""
     batch = env.batch_size
-    # Every episode gets its own stream; a vehicle string repeats the driver it is named after.
+    # Every episode gets its own stream. A string begins with the driver it is named after, those
+    # of the next ids follow: every driver is met equally often in every place.
     number = profile * drivers + driver
     given = TensorDict(batch_size=batch, device=env.device)
     given.set(SEED, (hash_bits(number + seed * 0x9E3779B1) >> 1).unsqueeze(-1))
@@ -132,7 +136,8 @@ def choices(
     if ("cav", "gap_factor") in spec.keys(True):
         given.set(("cav", "gap_factor"), torch.ones(*batch, 1))
     shape = spec["hdv", "driver"].shape
-    given.set(("hdv", "driver"), driver.view(-1, 1, 1).expand(shape).clone())
+    place = torch.arange(shape[-2]).unsqueeze(-1)
+    given.set(("hdv", "driver"), (driver.view(-1, 1, 1) + place) % drivers)
     return given
 
 

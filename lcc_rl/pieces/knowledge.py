@@ -22,7 +22,7 @@ class LeaderPreview(Feature):
     """The leader's speed some seconds ahead, as a message from further down the road would give.
 
     Writes ``(name, "speed")`` [m/s], shape ``[*batch, horizons]``. Beyond the end of a record its
-    last speed stands. Reading the record is what makes it an upper bound: no real message knows
+    last speed stands; a window cut from a longer record goes on in it. Reading the record is what makes it an upper bound: no real message knows
     this much.
 
     Args:
@@ -65,7 +65,8 @@ class LeaderPreview(Feature):
         steps = [round((horizon - delay) / time_step) for horizon in horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
-        self.register_buffer("last", profiles.lengths - 1)
+        known = profiles.lengths if profiles.reach is None else profiles.reach
+        self.register_buffer("last", known - 1)
         self.register_buffer("shift", torch.tensor(steps))
         self.register_buffer("columns", torch.arange(len(steps)))
 

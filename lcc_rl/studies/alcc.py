@@ -53,7 +53,7 @@ ABLATIONS = {
     "no_cav_energy": Change(("reward.terms.cav_energy.weight=0",)),
     "no_hdv_energy": Change(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
     "true_acceleration": Change(("reward.terms.hdv_energy.power=power",), ("alcc",)),
-    "population_mean": Change(("scenario.pieces.estimator.learning_time=.inf",), ("alcc",)),
+    "population_mean": Change(("scenario.pieces.estimator.learning_time=inf",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.cav_power.recuperation=false",)),
     "one_training_profile": Change(("split=single_training", "scenario.pieces.leader.start=first")),
     "short_training": Change(("training.episodes=300",)),

@@ -5,9 +5,9 @@ import pytest
 import torch
 from helpers import POPULATION, compose, wavy_profiles
 
-from lcc_rl.envs.factory import build_agent
+from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.monte_carlo import Strategy, evaluate, pairs
+from lcc_rl.evaluation.monte_carlo import Strategy, choices, evaluate, pairs
 from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
 from lcc_rl.functional.power import motor_power
 
@@ -92,6 +92,20 @@ def test_string_of_followers_adds_up() -> None:
     one, _ = run("direct")
     three, _ = run("direct", "scenario.followers=3")
     assert (three["hdv_distance_m"] > 2.0 * one["hdv_distance_m"]).all()
+
+
+def test_a_string_begins_with_its_driver_and_goes_on_with_the_next() -> None:
+    cfg = strategy("direct", "scenario.followers=3").cfg
+    env = build_env(cfg, PROFILES, POPULATION, 2)
+    count = len(POPULATION.time_gap)
+    given = choices(env, torch.tensor([0, 1]), torch.tensor([0, count - 1]), 1, count)
+    assert given["hdv", "driver"].squeeze(-1).tolist() == [[0, 1, 2], [count - 1, 0, 1]]
+
+
+def test_a_record_chosen_for_training_is_no_choice_for_evaluation() -> None:
+    one, _ = run("idm")
+    other, _ = run("idm", "scenario.pieces.leader.profile=77")
+    pd.testing.assert_frame_equal(one, other)
 
 
 def test_sample_episodes_are_time_series() -> None:

@@ -43,6 +43,18 @@ def test_beyond_the_record_its_last_speed_stands() -> None:
     assert piece.compute(zero, zero, zero, zero)[0] == profiles.record(0)[-1]
 
 
+def test_a_window_goes_on_in_the_record_it_was_cut_from() -> None:
+    whole = wavy_profiles(samples=301)
+    cut = whole.windows(100)
+    piece = LeaderPreview(cut, 0.1, [5.0])
+    at = torch.tensor([80])
+    for window in (0, 1):  # of the first record: samples 0…100 and 101…201
+        ahead = piece.compute(torch.tensor([window]), 0 * at, at, at)
+        assert ahead[0] == whole.record(0)[101 * window + 130]
+    assert cut.lengths.tolist() == [101] * len(cut)
+    assert torch.equal(cut.record(1), whole.record(0)[101:202])
+
+
 def test_noise_is_as_large_as_stated_and_repeats_with_the_seed() -> None:
     profiles, zero = wavy_profiles(), torch.zeros(20000, 1, dtype=torch.int64)
     seeds = torch.arange(20000).unsqueeze(-1)
