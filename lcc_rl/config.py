@@ -267,6 +267,8 @@ def _accepted(hint: Any) -> tuple[type, ...]:
         return tuple(kind for part in parts for kind in part) if all(parts) else ()
     if hint is type(None):
         return (type(None),)
+    if typing.get_origin(hint) is Sequence:
+        return (list,)
     return SIMPLE.get(hint, ())
 
 

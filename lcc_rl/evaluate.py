@@ -18,7 +18,7 @@ from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
-from lcc_rl.train import check_sizes, evaluate_and_write
+from lcc_rl.train import EPISODES, check_sizes, evaluate_and_write
 
 log = logging.getLogger("lcc_rl")
 
@@ -65,6 +65,8 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     if own and cfg.variant not in BASELINES:
         strategies.append(studied(cfg, policy, inputs))
     check_distinct(strategies)
+    # The rows of an earlier evaluation must never stand beside the configuration of this one.
+    (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     episodes = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet:
@@ -144,17 +146,27 @@ def studied(cfg: DictConfig, policy: Policy | None, inputs: Inputs) -> Strategy:
             f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
             f"say variant={own.variant}"
         )
-    if own.observation != OmegaConf.create(OmegaConf.to_container(cfg.observation, resolve=True)):
-        raise ConfigError(f"policy={cfg.policy} was trained with another observation than this")
+    trained_with, observed = (
+        OmegaConf.to_container(node, resolve=True) for node in (own.observation, cfg.observation)
+    )
+    if trained_with != observed:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained with another observation than this: expected "
+            f"{trained_with}, got {observed}; say +knowledge=… and observation.… as in its training"
+        )
     cfg = cfg.copy()
     OmegaConf.set_struct(cfg, False)
     cfg.agent = own.agent
+    if cfg.scenario.pieces.get("barrier") is None and own.scenario.pieces.get("barrier"):
+        log.info("policy=%s was trained with a filter and keeps it", cfg.policy)
+        share_filter(own, cfg)
     return with_weights(cfg, weights, own.seed, str(cfg.policy), inputs)
 
 
 def trained(cfg: DictConfig, path: str, policy: Policy, inputs: Inputs) -> Strategy:
     """Build a trained strategy from the policy read from a file, in the scenario under study."""
     weights, own = policy[0], policy[1].copy()
+    own.device = cfg.device
     share_scenario(cfg, own)
     share_filter(cfg, own)
     return with_weights(own, weights, own.seed, path, inputs)

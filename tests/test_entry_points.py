@@ -20,7 +20,7 @@ from lcc_rl import evaluate, pipeline, results, train
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.results.files import read_parquet
-from lcc_rl.results.runs import load_policy
+from lcc_rl.results.runs import identity, load_config, load_policy
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -98,6 +98,12 @@ def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> N
     assert set(rows["strategy"]) == {"direct", "idm", "alcc"}
 
 
+def test_what_is_kept_is_no_part_of_a_run_and_a_given_policy_is() -> None:
+    assert identity(load("train", ["training.keep_every=5"])) == identity(load("train"))
+    given = [load("train", ["variant=hcfs", f"policy={name}"]) for name in "ab"]
+    assert len({identity(cfg) for cfg in given}) == 2
+
+
 def test_a_folder_with_a_training_is_not_overwritten(trained) -> None:
     with pytest.raises(ConfigError, match="already holds a training"):
         train.run(tiny("train", "variant=alcc"), trained)
@@ -136,6 +142,32 @@ def test_compared_policies_get_the_filter_under_study(trained, tmp_path) -> None
     again = evaluate.run(alone, tmp_path / "alone")
     parts = [r[r["strategy"] == "reference"].reset_index(drop=True) for r in (rows, again)]
     pd.testing.assert_frame_equal(parts[0][again.columns], parts[1], check_exact=True)
+
+
+def test_a_policy_keeps_the_filter_it_was_trained_with(tmp_path) -> None:
+    folder = tmp_path / "run"
+    train.run(tiny("train", "variant=alcc", "+filter=barrier"), folder, quiet=True)
+    own = read_parquet(folder / "episodes.parquet")
+    ways = {"policy": (f"policy={folder}",), "compare": (f"compare=[{folder}]",)}
+    for name, words in ways.items():
+        cfg = tiny("evaluate", "variant=alcc", *words)
+        rows = evaluate.run(cfg, tmp_path / name, own=name == "policy", quiet=True)
+        again = rows[rows["strategy"] == "alcc"].reset_index(drop=True)[own.columns]
+        pd.testing.assert_frame_equal(again, own, check_exact=True)
+
+
+def test_an_interrupted_evaluation_leaves_no_old_rows(trained, tmp_path, monkeypatch) -> None:
+    evaluate.run(tiny("evaluate", "variant=alcc", f"policy={trained}"), tmp_path, quiet=True)
+
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "evaluate_and_write", interrupted)
+    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "evaluation.seed=7")
+    with pytest.raises(KeyboardInterrupt):
+        evaluate.run(cfg, tmp_path, quiet=True)
+    assert load_config(tmp_path).evaluation.seed == 7
+    assert not (tmp_path / "episodes.parquet").exists()
 
 
 def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:

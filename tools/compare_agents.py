@@ -21,12 +21,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl import results
-from lcc_rl.cli import main_guard
-from lcc_rl.config import load
+from lcc_rl.cli import main_guard, prepare_torch
+from lcc_rl.config import load, require
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluate import trained
 from lcc_rl.evaluation.monte_carlo import evaluate
+from lcc_rl.pipeline import root_key
 from lcc_rl.results.drawing import new_figure, save
 from lcc_rl.results.files import read_parquet, write_parquet
 from lcc_rl.results.runs import load_policy
@@ -76,23 +77,30 @@ def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
 
 def data_overrides(overrides: Iterable[str]) -> list[str]:
     """Keep the overrides that mean something to a controller that learns nothing."""
-    known = ("data", "split", "drivers", "evaluation", "scenario", "experiment")
-    return [item for item in overrides if item.lstrip("+~").split(".")[0].split("=")[0] in known]
+    known = ("data", "split", "drivers", "evaluation", "scenario", "experiment", "trust", "device")
+    own = tuple(f"scenario.pieces.{piece}." for piece in ("barrier", "preview", "memory"))
+    return [
+        item
+        for item in overrides
+        if root_key(item) in known and not item.lstrip("+~").startswith(own)
+    ]
 
 
 def evaluate_kept(options: argparse.Namespace) -> None:
-    """Evaluate the policies that each training kept on its way: kept.parquet in its folder."""
-    folders = sorted(path.parent for path in options.out.rglob(POLICIES) if path.is_dir())
-    folders = [folder for folder in folders if not (folder / KEPT).exists()]
-    if not folders:
+    """Evaluate the policies that each finished training kept on its way: kept.parquet beside."""
+    folders = [path.parent for path in sorted(options.out.rglob(EPISODES))]
+    kept = {folder: sorted((folder / POLICIES).glob("*.pt")) for folder in folders}
+    todo = {folder: paths for folder, paths in kept.items() if paths and outdated(folder, paths)}
+    if not todo:
         return
     cfg = load("evaluate", data_overrides(options.overrides))
-    inputs, size = load_inputs(cfg), cfg.evaluation
-    for folder in folders:
+    prepare_torch(cfg)
+    inputs, size, trust = load_inputs(cfg), cfg.evaluation, tuple(cfg.trust)
+    for folder, paths in todo.items():
         log.info("%s: evaluating the policies kept on the way", folder)
         rows = []
-        for path in sorted((folder / POLICIES).glob("*.pt")):
-            strategy = trained(cfg, str(path), load_policy(path), inputs)
+        for path in paths:
+            strategy = trained(cfg, str(path), load_policy(path, trust=trust), inputs)
             episodes, _ = evaluate(
                 strategy,
                 inputs.evaluation,
@@ -100,10 +108,18 @@ def evaluate_kept(options: argparse.Namespace) -> None:
                 size.drivers,
                 size.batch_size,
                 size.seed,
+                device=cfg.device,
             )
             means = episodes[[ENERGY, UNSAFE, LONG, "collided"]].mean().to_dict()
             rows.append({"iteration": float(path.stem), **means})
         write_parquet(pd.DataFrame(rows), folder / KEPT)
+
+
+def outdated(folder: Path, policies: list[Path]) -> bool:
+    """Whether kept.parquet of a training is missing or of other policies than these."""
+    path = folder / KEPT
+    numbers = [float(policy.stem) for policy in policies]
+    return not path.exists() or read_parquet(path)["iteration"].tolist() != numbers
 
 
 def table_of_agents(folder: Path) -> pd.DataFrame:
@@ -139,13 +155,15 @@ def table_of_agents(folder: Path) -> pd.DataFrame:
 def figure_of_agents(folder: Path) -> Figure:
     """Held-out energy and training reward over wall time and over steps, every run a line."""
     table = table_of_agents(folder)
+    if "train_s" not in table:
+        raise ResultsError(f"{folder}: no finished training below it, only what learns nothing")
     learned = table[table["train_s"].notna()]
     figure = new_figure(9.0, 6.4)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
     ends = []
     for run in learned.to_dict("records"):
         curve = course(folder / run["run"])
-        look = {"color": HUES[run["agent"]], "lw": 1.1, "alpha": 0.8}
+        look = {"color": HUES.get(run["agent"], "#222222"), "lw": 1.1, "alpha": 0.8}
         look["ls"] = "-" if run["variant"] == "alcc" else ":"
         kept = curve.dropna(subset=[ENERGY])
         ends += kept[ENERGY].tail(len(kept) // 2).tolist()
@@ -166,7 +184,7 @@ def figure_of_agents(folder: Path) -> Figure:
     style(axes[0, 1], "", "")
     style(axes[1, 0], "training time [min]", "reward per training episode\n(mean of 10 batches)")
     for agent in dict.fromkeys(learned["agent"]):
-        axes[1, 0].plot([], [], color=HUES[agent], label=agent)
+        axes[1, 0].plot([], [], color=HUES.get(agent, "#222222"), label=agent)
     axes[1, 0].legend(frameon=False, loc="lower right")
     note = "a line per training; solid: alcc, dotted: reference; dashed: a human in the car's place"
     figure.supxlabel(note, fontsize=8)
@@ -268,8 +286,9 @@ def words(text: str) -> list[str]:
 def main(arguments: list[str]) -> int:
     """Run a comparison; whatever is no option is an override of every training."""
     options, overrides = parser().parse_known_args(arguments)
-    if any(item.startswith("-") or "=" not in item for item in overrides):
+    if any(item[0] == "-" or ("=" not in item and item[0] != "~") for item in overrides):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(overrides)}")
+    require(options.jobs >= 1 and options.seeds >= 1, "--jobs and --seeds must be at least 1")
     options.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     return perform(options.part, options)

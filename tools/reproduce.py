@@ -2,6 +2,7 @@
 
   python tools/reproduce.py alcc                            # embedded stream, 8 seeds, Table III
   python tools/reproduce.py alcc data=ngsim data.path=...   # real trajectories; any override
+  python tools/reproduce.py alcc --recipe quickstart --parts main,filter   # in an hour, not days
   python tools/reproduce.py alcc --recipe smoke --seeds 1   # everything once, in seconds
   python tools/reproduce.py hcfs                            # the platoon: 8 DDPG parents, hybrids
   python tools/reproduce.py report outputs/alcc             # tables, figures and page, from parquet
@@ -16,7 +17,7 @@ import argparse
 import logging
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,7 @@ def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
         followers=tuple(arguments.followers),
     )
     note(study.folder, "alcc", command)
-    outcomes = alcc.run(study, arguments.parts)
-    return concluded(outcomes, alcc_report.write_results(study.folder))
+    return concluded(alcc.run(study, arguments.parts), study.folder, alcc_report.write_results)
 
 
 def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
@@ -60,15 +60,17 @@ def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
         accept=tuple(arguments.accept),
     )
     note(study.folder, "hcfs", command)
-    outcomes = hcfs.run(study)
-    return concluded(outcomes, hcfs_report.write_results(study.folder))
+    return concluded(hcfs.run(study), study.folder, hcfs_report.write_results)
 
 
-def concluded(outcomes: Sequence[Outcome], page: Path) -> int:
-    """Say what became of the trainings; 1 if one failed."""
+def concluded(
+    outcomes: Sequence[Outcome], folder: Path, write_results: Callable[[Path], Path]
+) -> int:
+    """Say what became of the trainings and write the page; 1 if one failed."""
     wrong = [outcome for outcome in outcomes if outcome.status != FINISHED]
     for outcome in wrong:
         log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
+    page = write_results(folder)
     log.info("%d of %d trainings in %s", len(outcomes) - len(wrong), len(outcomes), page)
     return 1 if wrong else 0
 

@@ -9,7 +9,6 @@ et al., "Accelerated policy learning with parallel differentiable simulation", I
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, anneal, derived_seed, episode_statistics
 from lcc_rl.config import TrainingConfig, build, require
 from lcc_rl.envs.unroll import Unrolled
 from lcc_rl.errors import require_positive
@@ -93,7 +92,7 @@ class Analytic:
             "agent", learning_rate=learning_rate, clip_norm=clip_norm, value_lr=value_lr
         )
         require(0 < final_share <= 1, f"agent.final_share must lie in (0, 1], got {final_share}")
-        self.learning_rate, self.final_share, self.clip_norm = learning_rate, final_share, clip_norm
+        self.final_share, self.clip_norm = final_share, clip_norm
         self.gamma, self.td_lambda, self.tau = gamma, td_lambda, tau
         self.bootstrap, self.compiled = bootstrap, compiled
         self.surrogates = _terms("surrogates", surrogates, time_step, device)
@@ -118,11 +117,7 @@ class Analytic:
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""
-        falling = 0.5 * (1.0 + math.cos(math.pi * share))
-        rate = self.learning_rate * (self.final_share + (1.0 - self.final_share) * falling)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        return rate
+        return anneal([self.optimizer], share, self.final_share)
 
     def update(self, rewards: Tensor, running: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Take one gradient step on the policy, and one on the value where it is learned.

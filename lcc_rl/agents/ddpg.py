@@ -13,7 +13,8 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from lcc_rl.agents.fused import FusedUpdate
-from lcc_rl.errors import ConfigError
+from lcc_rl.agents.loop import anneal
+from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
 
@@ -63,6 +64,8 @@ class DDPG:
         saturation: weight of a penalty on the square of the actor's output before its tanh; 0 is
             the literal algorithm. Without it some seeds brake fully for ever: where every action
             leads to the same end, nothing else draws the actor back from the tanh's flat part.
+        final_share: share of the learning rates at the end; they fall to it along half a cosine.
+            1 is the literal algorithm, whose policy keeps swinging until it stops.
         updates_per_transition: updates per collected transition.
         exploration: schedule of the action noise.
         fused: compute the update with its gradient written out, which gives the numbers of
@@ -89,14 +92,18 @@ class DDPG:
         buffer_size: int = 20000,
         tau: float = 0.005,
         saturation: float = 0.001,
+        final_share: float = 1.0,
         updates_per_transition: float = 0.125,
         exploration: dict[str, float] | None = None,
         fused: bool = True,
         device: str = "cpu",
     ) -> None:
         check_settings(gamma, batch_size, buffer_size, tau, updates_per_transition)
+        check_gentleness(saturation, final_share)
+        require_positive("agent", actor_lr=actor_lr, critic_lr=critic_lr)
         self.gamma, self.batch_size, self.buffer_size = gamma, batch_size, buffer_size
         self.updates_per_transition, self.saturation = updates_per_transition, saturation
+        self.final_share = final_share
         self.exploration = Exploration(**(exploration or {}))
         self.policy: TensorDictModuleBase = make_actor(
             observation_size, action_size, hidden, seed
@@ -123,6 +130,10 @@ class DDPG:
             return
         groups = [{"params": actor, "lr": actor_lr}, {"params": critic, "lr": critic_lr}]
         self.optimizer = torch.optim.Adam(groups, fused=True)
+
+    def anneal(self, share: float) -> float:
+        """Set the learning rates after this share of the training; return the policy's."""
+        return anneal([self.optimizer], share, self.final_share)
 
     def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
         """Take one gradient step on actor and critic and move the targets.
@@ -164,7 +175,11 @@ def leaves(parameters: TensorDictBase) -> list[torch.Tensor]:
 
 
 def check_settings(
-    gamma: float, batch_size: int, buffer_size: int, tau: float, updates_per_transition: float
+    gamma: float,
+    batch_size: int,
+    buffer_size: int,
+    tau: float,
+    updates_per_transition: float,
 ) -> None:
     """Check settings that all agents with a replay buffer share.
 
@@ -184,3 +199,15 @@ def check_settings(
         raise ConfigError(
             f"agent.updates_per_transition must be positive, got {updates_per_transition}"
         )
+
+
+def check_gentleness(saturation: float, final_share: float) -> None:
+    """Check what keeps a policy from running away and from swinging.
+
+    Raises:
+        ConfigError: naming the one at fault.
+    """
+    if saturation < 0:
+        raise ConfigError(f"agent.saturation must not be negative, got {saturation}")
+    if not 0.0 < final_share <= 1.0:
+        raise ConfigError(f"agent.final_share must lie in (0, 1], got {final_share}")

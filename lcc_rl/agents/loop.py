@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,6 +34,24 @@ def derived_seed(*parts: object) -> int:
     """Return a seed that depends on all parts; distinct purposes get independent streams."""
     digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1
+
+
+def anneal(optimizers: Iterable[torch.optim.Optimizer], share: float, final_share: float) -> float:
+    """Let learning rates fall along half a cosine, from what they are made with to a share of it.
+
+    Args:
+        optimizers: whose rates to set.
+        share: how much of the training is over.
+        final_share: of the rate at the start, at the end; 1 for a constant rate.
+
+    Returns:
+        The first rate.
+    """
+    factor = final_share + (1.0 - final_share) * 0.5 * (1.0 + math.cos(math.pi * share))
+    groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+    for group in groups:
+        group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
+    return float(groups[0]["lr"])
 
 
 class TrainingLoop(ABC):

@@ -15,8 +15,8 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
-from lcc_rl.agents.ddpg import Exploration, check_settings, leaves
-from lcc_rl.agents.loop import derived_seed
+from lcc_rl.agents.ddpg import Exploration, check_gentleness, check_settings, leaves
+from lcc_rl.agents.loop import anneal, derived_seed
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
@@ -26,7 +26,7 @@ class OffPolicy(ABC):
 
     Args:
         observation_size, action_size, seed, gamma, hidden, batch_size, buffer_size, tau,
-            updates_per_transition, saturation, exploration, device: see
+            updates_per_transition, saturation, final_share, exploration, device: see
             :class:`lcc_rl.agents.DDPG`.
 
     Raises:
@@ -47,13 +47,15 @@ class OffPolicy(ABC):
         tau: float,
         updates_per_transition: float,
         saturation: float,
+        final_share: float,
         exploration: Mapping[str, float] | None,
         device: str,
     ) -> None:
         check_settings(gamma, batch_size, buffer_size, tau, updates_per_transition)
+        check_gentleness(saturation, final_share)
         self.seed, self.gamma, self.saturation = seed, gamma, saturation
         self.batch_size, self.buffer_size = batch_size, buffer_size
-        self.updates_per_transition = updates_per_transition
+        self.updates_per_transition, self.final_share = updates_per_transition, final_share
         self.exploration = Exploration(**(exploration or {}))
         self.policy: TensorDictModuleBase = make_actor(
             observation_size, action_size, hidden, seed
@@ -65,6 +67,10 @@ class OffPolicy(ABC):
             for number in (1, 3)
         ]
         self.count = 0
+
+    def anneal(self, share: float) -> float:
+        """Set the learning rates after this share of the training; return the policy's."""
+        return anneal(self.optimizers.values(), share, self.final_share)
 
     @abstractmethod
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:

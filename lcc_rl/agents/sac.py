@@ -12,7 +12,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.config import require
+from lcc_rl.errors import require_positive
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.policies.actor import seeded_mlp
@@ -94,6 +94,7 @@ class SAC(OffPolicy):
         buffer_size: int = 20000,
         tau: float = 0.005,
         saturation: float = 0.001,
+        final_share: float = 1.0,
         updates_per_transition: float = 0.125,
         exploration: dict[str, float] | None = None,
         alpha_init: float = 0.1,
@@ -112,10 +113,12 @@ class SAC(OffPolicy):
             tau,
             updates_per_transition,
             saturation,
+            final_share,
             exploration or {"initial": 1.0, "final": 1.0},
             device,
         )
-        require(alpha_init > 0, f"agent.alpha_init must be positive, got {alpha_init}")
+        rates = {"actor_lr": actor_lr, "critic_lr": critic_lr, "alpha_lr": alpha_lr}
+        require_positive("agent", alpha_init=alpha_init, **rates)
         spread = seeded_mlp(observation_size, action_size, hidden[-1:], seed + 2).to(device)
         head = Head(self.policy.module[0], spread)
         self.noise = SampledAction(head)

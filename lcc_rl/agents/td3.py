@@ -11,6 +11,7 @@ from torchrl.objectives import TD3Loss
 
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.config import require
+from lcc_rl.errors import require_positive
 
 
 class TD3(OffPolicy):
@@ -39,6 +40,7 @@ class TD3(OffPolicy):
         buffer_size: int = 20000,
         tau: float = 0.005,
         saturation: float = 0.001,
+        final_share: float = 1.0,
         updates_per_transition: float = 0.125,
         exploration: dict[str, float] | None = None,
         policy_noise: float = 0.1,
@@ -57,9 +59,11 @@ class TD3(OffPolicy):
             tau,
             updates_per_transition,
             saturation,
+            final_share,
             exploration,
             device,
         )
+        require_positive("agent", actor_lr=actor_lr, critic_lr=critic_lr)
         require(policy_delay >= 1, f"agent.policy_delay must be at least 1, got {policy_delay}")
         require(
             policy_noise >= 0 and noise_clip >= 0,

@@ -74,6 +74,7 @@ class Trainer(TrainingLoop):
         """Play one batch of episodes, learning after every segment of them."""
         sigma = self.agent.exploration.sigma(self.iteration / self.iterations)
         self.exploration.sigma.fill_(sigma)
+        rate = self.agent.anneal(self.iteration / self.iterations)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         self.sampler.manual_seed(derived_seed(self.seed, self.iteration, "replay"))
         collector.reset()
@@ -99,6 +100,7 @@ class Trainer(TrainingLoop):
             "transitions": float(self.iteration * learned),
             "updates": float(self.updates),
             "exploration_sigma": sigma,
+            "learning_rate": rate,
             **episode_statistics(episodes),
             **{name: sum(loss[name] for loss in losses) / len(losses) for name in losses[0]},
         }

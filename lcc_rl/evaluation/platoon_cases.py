@@ -149,7 +149,7 @@ def load_learned(cfg: DictConfig, inputs: Inputs) -> tuple[Any, DictConfig]:
         ConfigError: if the policy is of another scenario or observation.
         ResultsError: if it is missing or damaged.
     """
-    weights, own = load_policy(cfg.policy, LEARNED)
+    weights, own = load_policy(cfg.policy, LEARNED, tuple(cfg.get("trust") or ()))
     name = own.get("scenario", {}).get("name")
     if name != SCENARIO:
         raise ConfigError(

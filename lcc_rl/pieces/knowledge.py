@@ -22,8 +22,8 @@ class LeaderPreview(Feature):
     """The leader's speed some seconds ahead, as a message from further down the road would give.
 
     Writes ``(name, "speed")`` [m/s], shape ``[*batch, horizons]``. Beyond the end of a record its
-    last speed stands; a window cut from a longer record goes on in it. Reading the record is what makes it an upper bound: no real message knows
-    this much.
+    last speed stands; a window cut from a longer record goes on in it. Reading the record is what
+    makes it an upper bound: no real message knows this much.
 
     Args:
         profiles: the leader's records.

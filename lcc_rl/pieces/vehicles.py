@@ -52,7 +52,8 @@ class CAVMotion(Transition):
         predecessor: namespace of the vehicle ahead.
 
     Raises:
-        ConfigError: if ``max_acceleration``, ``standstill_gap`` or the range is not positive.
+        ConfigError: if ``max_acceleration``, ``standstill_gap`` or the range is not positive, or
+            the time gap negative.
     """
 
     def __init__(
@@ -67,8 +68,9 @@ class CAVMotion(Transition):
         predecessor: str = "leader",
     ) -> None:
         require_positive(name, max_acceleration=max_acceleration, standstill_gap=standstill_gap)
-        lowest, highest = initial_gap_range
-        if not 0 < lowest <= highest:
+        if initial_time_gap < 0:
+            raise ConfigError(f"{name}.initial_time_gap must not be negative: {initial_time_gap}")
+        if len(initial_gap_range) != 2 or not 0 < initial_gap_range[0] <= initial_gap_range[1]:
             raise ConfigError(
                 f"{name}.initial_gap_range must be two increasing positive factors, got "
                 f"{list(initial_gap_range)}"
@@ -87,7 +89,7 @@ class CAVMotion(Transition):
             constants=factor,
             choices=factor,
         )
-        self.lowest, self.highest = float(lowest), float(highest)
+        self.lowest, self.highest = map(float, initial_gap_range)
         self.factor_stream = stream_id(f"{name}.gap_factor")
         self.time_step, self.max_acceleration = time_step, max_acceleration
         self.standstill_gap, self.initial_time_gap = standstill_gap, initial_time_gap

@@ -33,12 +33,30 @@ REGISTRY = tuple(
 )
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # Settings that say where and how to run, not what: they do not change any row.
-NOT_IDENTITY = ("resume", "compare", "policy", "jobs", "sweep", "objective", "logger", "trust")
+NOT_IDENTITY = (
+    "resume",
+    "compare",
+    "jobs",
+    "sweep",
+    "objective",
+    "logger",
+    "trust",
+    "training.keep_every",
+)
 
 
 def identity(cfg: DictConfig) -> str:
     """Return the hash of everything in a configuration that determines the results."""
-    return config_hash({k: v for k, v in plain(cfg).items() if k not in NOT_IDENTITY})
+    content = plain(cfg)
+    for key in NOT_IDENTITY:
+        *path, last = key.split(".")
+        node = content
+        for part in path:
+            node = node.get(part) or {}
+        node.pop(last, None)
+    if content.get("policy") is None:  # of use only where there is one
+        content.pop("policy", None)
+    return config_hash(content)
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,15 @@ from lcc_rl.data.profiles import leader_profiles
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.pipeline import TRAJECTORIES, calibrate_once, known_settings, root_key
 from lcc_rl.results.runs import identity, load_config
-from lcc_rl.studies.runner import FINISHED, FOREIGN, Outcome, Run, note_problems, quoted, run_all
+from lcc_rl.studies.runner import (
+    FINISHED,
+    Outcome,
+    Run,
+    differences,
+    note_problems,
+    quoted,
+    run_all,
+)
 
 log = logging.getLogger("lcc_rl")
 
@@ -25,6 +33,8 @@ VARIANTS = ("alcc", "reference")
 PARTS = ("main", "filter", "ablations", "single", "followers")
 DRIVERS = Path("calibration/drivers.parquet")
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
+ROWS = "*/seed_*/episodes.parquet"
+SMOKE = "smoke"
 RECIPES = ("quickstart", "paper_alcc")  # how long, and with what batches, DDPG learns
 # What the calibration takes in place of the trainings.
 OF_CALIBRATION = ("data", "calibration")
@@ -56,7 +66,7 @@ ABLATIONS = {
     "population_mean": Change(("scenario.pieces.estimator.learning_time=inf",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.cav_power.recuperation=false",)),
     "one_training_profile": Change(("split=single_training", "scenario.pieces.leader.start=first")),
-    "short_training": Change(("training.episodes=300",)),
+    "short_training": Change(("training.episodes=320",)),
     **{f"recipe_{name}": Change(recipes=(name,)) for name in RECIPES},
     **{f"gamma_{gamma:g}": Change((f"agent.gamma={gamma:g}",)) for gamma in GAMMAS},
 }
@@ -114,7 +124,9 @@ class Study:
             *own,
         ]
 
-    def runs(self, folder: Path, change: Change = Change()) -> list[Run]:
+    def runs(
+        self, folder: Path, change: Change = Change(), seeds: Iterable[int] | None = None
+    ) -> list[Run]:
         """Return a training per seed and variant, seeds first so that all variants grow alike."""
         return [
             Run(
@@ -129,8 +141,19 @@ class Study:
                     )
                 ),
             )
-            for seed in range(self.seeds)
+            for seed in (range(self.seeds) if seeds is None else seeds)
             for variant in change.variants
+        ]
+
+    def earlier(self, folder: Path, change: Change = Change()) -> list[Outcome]:
+        """Return what an earlier command left of further seeds: finished, of the same settings."""
+        found = {int(path.parent.name.removeprefix("seed_")) for path in folder.glob(ROWS)}
+        runs = self.runs(folder, change, sorted(found - set(range(self.seeds))))
+        return [
+            Outcome(run, FINISHED)
+            for run in runs
+            if (run.folder / "episodes.parquet").exists()
+            and not differences(run, run.compose(), self.accept)
         ]
 
 
@@ -180,11 +203,11 @@ def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
         "single": _single,
         "followers": _followers,
     }
-    outcomes = []
+    outcomes: dict[Path, Outcome] = {}  # the part filter has the trainings of the main one
     for part in (part for part in PARTS if part in parts):
-        outcomes += steps[part](study, wanted)
-    note_problems(study.folder, outcomes)
-    return outcomes
+        outcomes |= {outcome.run.folder: outcome for outcome in steps[part](study, wanted)}
+    note_problems(study.folder, list(outcomes.values()))
+    return list(outcomes.values())
 
 
 def calibrate(study: Study) -> None:
@@ -197,28 +220,34 @@ def calibrate(study: Study) -> None:
 
 
 def _main(study: Study, wanted: DictConfig) -> list[Outcome]:
+    outcomes, usable = _trained(study)
+    evaluate_all(study.settings("evaluate", "alcc"), usable, study.folder / "evaluation")
+    return outcomes
+
+
+def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
+    """Train what is left of the main part; return its outcomes, and those with earlier seeds."""
     folder = study.folder / "train"
     outcomes = run_all(study.runs(folder), study.jobs, study.accept)
-    settings = study.settings("evaluate", "alcc")
-    evaluate_all(settings, folder, study.folder / "evaluation", foreign(outcomes))
-    return outcomes
+    return outcomes, outcomes + study.earlier(folder)
 
 
 def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
     """Put the filter on the policies of the main part, with several settings."""
-    trained = study.folder / "train"
-    outcomes = run_all(study.runs(trained), study.jobs, study.accept)
+    outcomes, usable = _trained(study)
     for time_gap in FILTERS:
         own = ("+filter=barrier", f"scenario.pieces.barrier.time_gap={time_gap:g}")
         folder = study.folder / "filter" / f"time_gap_{time_gap:g}" / "evaluation"
-        evaluate_all(study.settings("evaluate", "alcc", *own), trained, folder, foreign(outcomes))
-    return []  # the trainings are those of the main part
+        evaluate_all(study.settings("evaluate", "alcc", *own), usable, folder)
+    return outcomes
 
 
 def _ablations(study: Study, wanted: DictConfig) -> list[Outcome]:
-    # Those that change nothing are the main part itself.
-    itself = {f"gamma_{wanted.agent.gamma:g}", f"recipe_{study.recipe}"}
-    chosen = study.ablations or tuple(name for name in ABLATIONS if name not in itself)
+    # Those that change nothing are the main part itself; what is tried in seconds stays short.
+    left_out = {f"gamma_{wanted.agent.gamma:g}", f"recipe_{study.recipe}"}
+    if study.recipe == SMOKE:
+        left_out |= {f"recipe_{name}" for name in RECIPES}
+    chosen = study.ablations or tuple(name for name in ABLATIONS if name not in left_out)
     folder = study.folder / "ablations"
     return _each(study, {folder / n: c for n, c in map(chosen_ablation, chosen)})
 
@@ -239,8 +268,16 @@ def _followers(study: Study, wanted: DictConfig) -> list[Outcome]:
 
 
 def followers_study(study: Study) -> Study:
-    """Return the study as its part ``followers`` learns: recipes are for DDPG, but for smoke."""
-    return replace(study, recipe="smoke" if study.recipe == "smoke" else None)
+    """Return the study as its part ``followers`` learns, with an agent of its own.
+
+    Recipes (but smoke) and overrides of agent and training are DDPG's and do not count there,
+    unless the user chooses the agent.
+    """
+    if any(item.startswith("agent=") for item in study.overrides):
+        return study
+    kept = [item for item in study.overrides if root_key(item) not in ("agent", "training")]
+    recipe = SMOKE if study.recipe == SMOKE else None
+    return replace(study, recipe=recipe, overrides=tuple(kept))
 
 
 def followers_change(study: Study, number: int) -> Change:
@@ -258,9 +295,11 @@ def _each(study: Study, changes: Mapping[Path, Change]) -> list[Outcome]:
     runs = [run for folder, change in changes.items() for run in study.runs(folder, change)]
     outcomes = run_all(runs, study.jobs, study.accept)
     for folder, change in changes.items():
+        of_it = [outcome for outcome in outcomes if folder in outcome.run.folder.parents]
+        of_it += study.earlier(folder, change)
         own = (*change.overrides, *change.evaluation)
         settings = study.settings("evaluate", "alcc", *own, recipes=change.recipes)
-        evaluate_all(settings, folder, folder / "evaluation", foreign(outcomes))
+        evaluate_all(settings, of_it, folder / "evaluation")
     return outcomes
 
 
@@ -273,29 +312,20 @@ def spread_profiles(table: Path, cfg: DictConfig, count: int) -> list[int]:
     return [int(place * len(profiles)) for place in places]
 
 
-def foreign(outcomes: Sequence[Outcome]) -> set[Path]:
-    """Return the folders of runs that were made with other settings."""
-    return {outcome.run.folder for outcome in outcomes if outcome.status == FOREIGN}
-
-
-def evaluate_all(
-    settings: Sequence[str], trained: Path, folder: Path, excluded: Collection[Path] = ()
-) -> None:
-    """Evaluate every finished policy of a folder beside the humans, unless that is done already.
+def evaluate_all(settings: Sequence[str], outcomes: Sequence[Outcome], folder: Path) -> None:
+    """Evaluate every finished policy beside the humans, unless that is done already.
 
     Args:
         settings: overrides of the entry point ``evaluate``.
-        trained: holds ``<variant>/seed_<n>``.
+        outcomes: trainings in ``<variant>/seed_<n>``; those that did not finish are left out.
         folder: where the evaluation goes.
-        excluded: runs to leave out.
     """
-    finished = {path.parent for path in trained.glob("*/seed_*/episodes.parquet")}
     runs = sorted(
-        finished - set(excluded),
+        (outcome.run.folder for outcome in outcomes if outcome.status == FINISHED),
         key=lambda path: (path.parent.name, int(path.name.removeprefix("seed_"))),
     )
     if not runs:
-        log.warning("%s: nothing trained to evaluate", trained)
+        log.warning("%s: nothing trained to evaluate", folder)
         return
     cfg = load("evaluate", settings)
     cfg.compare = [str(path) for path in runs]

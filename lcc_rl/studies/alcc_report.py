@@ -23,6 +23,7 @@ from lcc_rl.studies.runner import read_notes
 log = logging.getLogger("lcc_rl")
 
 TITLE = "Adaptive Leading Cruise Control: the study"
+MAIN = Path("evaluation", "episodes.parquet")
 ITSELF = "none (the recipe itself)"
 NO_FILTER = "without"
 Tables = list[tuple[str, pd.DataFrame]]
@@ -79,7 +80,7 @@ def write_results(folder: str | Path) -> Path:
         _people,
         _made,
     ]
-    if not (page.folder / "evaluation" / "episodes.parquet").exists():
+    if not any(page.folder.glob("**/evaluation/episodes.parquet")):
         raise ResultsError(
             f"{folder}: no evaluation/episodes.parquet; python tools/reproduce.py alcc makes it"
         )
@@ -90,7 +91,9 @@ def write_results(folder: str | Path) -> Path:
 
 def _main(page: Page) -> None:
     """Add what the evaluation of the main runs says."""
-    episodes = read_parquet(page.folder / "evaluation" / "episodes.parquet")
+    if not (page.folder / MAIN).exists():
+        return
+    episodes = read_parquet(page.folder / MAIN)
     size = _size(episodes)
     _headline(page, episodes, size)
     _constraints(page, episodes, size)
@@ -268,8 +271,7 @@ def _filter(page: Page) -> None:
     frames = _evaluations(page.folder / "filter", "filter", order)
     if not frames:
         return
-    main = read_parquet(page.folder / "evaluation" / "episodes.parquet")
-    episodes = pd.concat([main.assign(filter=NO_FILTER), *frames], ignore_index=True)
+    episodes = _beside_main(page, frames, filter=NO_FILTER)
     first, size = frames[0], _size(frames[0])
     text = (
         "The same policies, with +filter=barrier between them and the car: nothing is trained. "
@@ -302,8 +304,7 @@ def _ablations(page: Page) -> None:
     frames = _evaluations(page.folder / "ablations", "ablation", list(ABLATIONS))
     if not frames:
         return
-    main = read_parquet(page.folder / "evaluation" / "episodes.parquet")
-    episodes = pd.concat([main.assign(ablation=ITSELF), *frames], ignore_index=True)
+    episodes = _beside_main(page, frames, ablation=ITSELF)
     text = (
         "Each line changes one thing of the recipe by an override and trains anew; savings are "
         "against the human in the same scenario, so that a change of the scenario (no "
@@ -354,6 +355,13 @@ def _followers(page: Page) -> None:
         figure = alcc_figures.followers_figure(episodes)
         figures = [page.figure("followers", caption, figure)]
     page.add("More human drivers behind", text, tables, figures)
+
+
+def _beside_main(page: Page, frames: Sequence[pd.DataFrame], **column: str) -> pd.DataFrame:
+    """Join evaluations to that of the main part, where there is one; it gets the column."""
+    path = page.folder / MAIN
+    main = [read_parquet(path).assign(**column)] if path.exists() else []
+    return pd.concat([*main, *frames], ignore_index=True)
 
 
 def _evaluations(root: Path, column: str, order: Sequence[str] = ()) -> list[pd.DataFrame]:

@@ -25,6 +25,7 @@ from lcc_rl.evaluation.platoon_cases import (
 from lcc_rl.pipeline import known_settings
 from lcc_rl.results.runs import identity, load_config, save_config
 from lcc_rl.studies.runner import FINISHED, Outcome, Run, note_problems, run_all
+from lcc_rl.train import EPISODES
 
 log = logging.getLogger("lcc_rl")
 
@@ -136,12 +137,13 @@ def _evaluate(
     if _up_to_date(cfg, folder, trained):
         return None
     log.info("evaluating %d strategies into %s", len(strategies), folder)
+    (folder / EPISODES).unlink(missing_ok=True)  # never beside another configuration
     save_config(cfg, folder)
     return evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)
 
 
 def _up_to_date(cfg: DictConfig, folder: Path, trained: Path | None) -> bool:
-    table = folder / "episodes.parquet"
+    table = folder / EPISODES
     if not table.exists() or identity(load_config(folder)) != identity(cfg):
         return False
     newest = 0.0 if trained is None else (trained / "policy.pt").stat().st_mtime

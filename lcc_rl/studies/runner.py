@@ -89,7 +89,11 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
 
 
 def _settings(cfg: DictConfig) -> dict[str, Any]:
-    return {k: v for k, v in flatten(plain(cfg)) if k.split(".")[0] not in NOT_IDENTITY}
+    return {k: v for k, v in flatten(plain(cfg)) if not _no_matter(k)}
+
+
+def _no_matter(key: str) -> bool:
+    return any(key == item or key.startswith(f"{item}.") for item in NOT_IDENTITY)
 
 
 def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:

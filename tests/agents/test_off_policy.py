@@ -132,6 +132,10 @@ def test_sac_explores_around_the_policy_that_is_kept() -> None:
         ("td3", "agent.policy_noise=-1", "policy_noise"),
         ("td3", "agent.gamma=1", "gamma"),
         ("sac", "agent.alpha_init=0", "alpha_init"),
+        ("sac", "agent.alpha_lr=-1", "alpha_lr"),
+        ("td3", "agent.critic_lr=0", "critic_lr"),
+        ("ddpg", "agent.actor_lr=-1", "actor_lr"),
+        ("ddpg", "agent.saturation=-1", "saturation"),
         ("sac", "agent.batch_size=5000000", "buffer_size"),
     ],
 )

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from helpers import wavy_profiles
+from helpers import POPULATION, wavy_profiles
 from omegaconf import OmegaConf
 
 from lcc_rl import train
 from lcc_rl.data.profiles import SingleProfile, Split
+from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError, LccError, ResultsError
 from lcc_rl.results.files import read_parquet
 from lcc_rl.studies import alcc, alcc_report, runner
@@ -88,6 +89,27 @@ def test_followers_learn_with_the_analytic_agent_unless_another_is_asked_for(tmp
     assert change.evaluation == ()
 
 
+def test_settings_of_ddpg_are_not_those_of_the_followers(tmp_path) -> None:
+    given = ("agent.batch_size=64", "training.episodes=40", "scenario.horizon=40")
+    study = alcc.Study(tmp_path, "quickstart", 1, given)
+    cfg = alcc.followers_study(study).runs(tmp_path, alcc.followers_change(study, 2))[0].compose()
+    assert (cfg.scenario.horizon, cfg.training.episodes) == (40, 51200)
+    own = alcc.Study(tmp_path, "quickstart", 1, ("agent=td3", *given))
+    cfg = alcc.followers_study(own).runs(tmp_path, alcc.followers_change(own, 2))[0].compose()
+    assert (cfg.agent.batch_size, cfg.training.episodes) == (64, 40)
+
+
+@pytest.mark.parametrize("name", alcc.ABLATIONS)
+def test_every_ablation_can_be_built(tmp_path, name) -> None:
+    run = alcc.Study(tmp_path, "smoke", 1).runs(tmp_path, alcc.ABLATIONS[name])[0]
+    cfg = run.compose()
+    if name.startswith("recipe_"):
+        cfg.training.environments = 20
+    build_env(cfg, wavy_profiles(samples=400), POPULATION, 2).rollout(2)
+    build_agent(cfg, POPULATION)
+    assert cfg.training.episodes % cfg.training.environments == 0
+
+
 def test_the_filter_is_put_on_once(tmp_path) -> None:
     with pytest.raises(ConfigError, match="not both"):
         alcc.run(alcc.Study(tmp_path, overrides=("+filter=barrier",)))
@@ -98,8 +120,7 @@ def test_the_whole_study_in_small(small) -> None:
     outcomes = alcc.run(small, ["main", "filter"])
     study = alcc.Study(**{**vars(small), "seeds": 1, "ablations": ("late:agent.tau=0.01",)})
     outcomes += alcc.run(study, ["ablations", "single"])
-    shared = tuple(item for item in TINY if "batch_size" not in item)  # which analytic has not
-    settings = {"overrides": (*shared, "evaluation.profiles=2"), "followers": (1, 2)}
+    settings = {"overrides": (*TINY, "evaluation.profiles=2"), "followers": (1, 2)}
     strings = alcc.Study(**{**vars(study), **settings})
     outcomes += alcc.run(strings, ["followers"])
     assert [outcome.status for outcome in outcomes] == [FINISHED] * (4 + 2 + 2 + 4)
@@ -194,6 +215,12 @@ def test_unknown_parts_and_typing_errors_come_before_any_work(tmp_path) -> None:
     with pytest.raises(ConfigError, match="sede"):
         alcc.run(alcc.Study(tmp_path, seeds=1, overrides=("sede=1",)))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_part_alone_has_a_page(small) -> None:
+    study = alcc.Study(**{**vars(small), "seeds": 1, "ablations": ("late:agent.tau=0.01",)})
+    alcc.run(study, ["ablations"])
+    assert "late" in alcc_report.write_results(study.folder).read_text()
 
 
 def test_a_folder_without_an_evaluation_has_no_page(tmp_path) -> None:

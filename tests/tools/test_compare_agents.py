@@ -71,9 +71,12 @@ def test_policies_kept_on_the_way_are_evaluated_once(tmp_path) -> None:
     last = read_parquet(folder / "episodes.parquet")["total_energy_kj"].mean()
     assert kept["total_energy_kj"].iloc[-1] == pytest.approx(last, rel=1e-6)
     assert kept["total_energy_kj"].nunique() == 3
+    (folder / "policies" / "000002.pt").unlink()
+    tool.evaluate_kept(options)  # other policies than before
+    assert read_parquet(folder / "kept.parquet")["iteration"].tolist() == [1.0, 3.0]
     for path in (folder / "policies").iterdir():
         path.unlink()
-    tool.evaluate_kept(options)  # done before: nothing is read again
+    tool.evaluate_kept(options)  # there is nothing to evaluate: what was done stays
     assert tool.course(folder)["total_energy_kj"].notna().all()
     assert tool.main(["agents", "--draw", "--out", str(tmp_path)]) == 0
 
@@ -102,6 +105,25 @@ def test_every_run_it_would_start_composes(part, tmp_path) -> None:
 def test_nothing_finished(tmp_path) -> None:
     with pytest.raises(ResultsError, match="no finished training"):
         tool.main(["agents", "--draw", "--out", str(tmp_path)])
+
+
+def test_only_a_human_is_finished(tmp_path) -> None:
+    fabricate(tmp_path / "idm", "idm", 120.0)
+    for name in ("training", "timing"):
+        (tmp_path / "idm" / f"{name}.parquet").unlink()
+    with pytest.raises(ResultsError, match="learns nothing"):
+        tool.main(["agents", "--draw", "--out", str(tmp_path)])
+
+
+def test_settings_of_filter_and_knowledge_are_not_those_of_a_human() -> None:
+    given = ["+filter=barrier", "scenario.pieces.barrier.rate=2", "scenario.horizon=40", "~x.y"]
+    assert tool.data_overrides(given) == ["scenario.horizon=40"]
+
+
+@pytest.mark.parametrize("option", ["--jobs", "--seeds"])
+def test_numbers_of_trainings(option, tmp_path) -> None:
+    with pytest.raises(ConfigError, match="at least 1"):
+        tool.main(["agents", option, "0", "--out", str(tmp_path)])
 
 
 def test_a_typing_error_is_no_override(tmp_path) -> None:
