@@ -246,8 +246,8 @@ def check_sizes(cfg: DictConfig) -> None:
         require(value is None or value >= 1, f"{name} must be at least 1, got {value}")
     pieces = cfg.scenario.pieces
     require(
-        pieces.get("barrier") is None or ("_target_" in pieces.get("cav", {}) and learned(cfg)),
-        f"+filter=barrier belongs to a learned car (alcc, reference), not to {cfg.variant}",
+        pieces.get("barrier") is None or "_target_" in pieces.get("cav", {}),
+        f"+filter=barrier belongs to a car of its own (alcc, reference, idm), not to {cfg.variant}",
     )
     measured = [name for name in MEASURED if "cav" in pieces and name not in pieces]
     require(not measured, f"scenario.pieces lacks {measured}, which the evaluation measures")

@@ -79,23 +79,3 @@ class IDMPolicy(TensorDictModuleBase):
             self.drivers,
         )
         return tensordict.set("action", (acceleration / self.max_acceleration).clamp(-1.0, 1.0))
-
-
-class NoPolicy(TensorDictModuleBase):
-    """Writes action 0: for scenarios without a controlled car."""
-
-    learns: ClassVar[bool] = False
-
-    def __init__(self) -> None:
-        self.in_keys = ["observation"]
-        self.out_keys = ["action"]
-        super().__init__()
-
-    @property
-    def policy(self) -> TensorDictModuleBase:
-        """The policy itself: what an agent of any kind offers."""
-        return self
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action, shape ``[*batch, 1]``."""
-        return tensordict.set("action", torch.zeros_like(tensordict.get("observation")[..., :1]))

@@ -40,8 +40,9 @@ RECIPES = ("quickstart", "paper_alcc")  # how long, and with what batches, DDPG 
 OF_CALIBRATION = ("data", "calibration")
 
 
-# The longest time gap that the filter allows [s]: how it weighs safety against efficiency.
-FILTERS = (2.45, 2.0, 1.6, 1.3)
+# From which speed on the filter allows the longest time gap [m/s], its own first: how near the
+# car is kept, at the price of energy.
+FILTERS = (12, 10, 8, 0)
 # How the part "followers" learns: DDPG's seeds differ by more than regard for followers brings.
 PRECISE = ("agent=analytic", "+filter=barrier")
 EVERY_WINDOW = ("evaluation.profiles=null",)
@@ -66,6 +67,7 @@ ABLATIONS = {
     "population_mean": Change(("scenario.pieces.estimator.learning_time=inf",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.cav_power.recuperation=false",)),
     "one_training_profile": Change(("split=single_training", "scenario.pieces.leader.start=first")),
+    "constant_rate": Change(("agent.final_share=1.0",)),
     "short_training": Change(("training.episodes=320",)),
     **{f"recipe_{name}": Change(recipes=(name,)) for name in RECIPES},
     **{f"gamma_{gamma:g}": Change((f"agent.gamma={gamma:g}",)) for gamma in GAMMAS},
@@ -235,10 +237,11 @@ def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
 def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
     """Put the filter on the policies of the main part, with several settings."""
     outcomes, usable = _trained(study)
-    for time_gap in FILTERS:
-        own = ("+filter=barrier", f"scenario.pieces.barrier.time_gap={time_gap:g}")
-        folder = study.folder / "filter" / f"time_gap_{time_gap:g}" / "evaluation"
-        evaluate_all(study.settings("evaluate", "alcc", *own), usable, folder)
+    for speed in FILTERS:
+        # The variant barrier is evaluated, too: what the filter does by itself.
+        own = f"scenario.pieces.barrier.full_speed={speed}"
+        folder = study.folder / "filter" / f"full_speed_{speed}" / "evaluation"
+        evaluate_all(study.settings("evaluate", "barrier", own), usable, folder, own=True)
     return outcomes
 
 
@@ -312,13 +315,16 @@ def spread_profiles(table: Path, cfg: DictConfig, count: int) -> list[int]:
     return [int(place * len(profiles)) for place in places]
 
 
-def evaluate_all(settings: Sequence[str], outcomes: Sequence[Outcome], folder: Path) -> None:
+def evaluate_all(
+    settings: Sequence[str], outcomes: Sequence[Outcome], folder: Path, own: bool = False
+) -> None:
     """Evaluate every finished policy beside the humans, unless that is done already.
 
     Args:
         settings: overrides of the entry point ``evaluate``.
         outcomes: trainings in ``<variant>/seed_<n>``; those that did not finish are left out.
         folder: where the evaluation goes.
+        own: evaluate the variant of the settings, too.
     """
     runs = sorted(
         (outcome.run.folder for outcome in outcomes if outcome.status == FINISHED),
@@ -331,7 +337,7 @@ def evaluate_all(settings: Sequence[str], outcomes: Sequence[Outcome], folder: P
     cfg.compare = [str(path) for path in runs]
     if not _up_to_date(cfg, folder, runs):
         log.info("evaluating %d policies into %s", len(runs), folder)
-        evaluate.run(cfg, folder, own=False, quiet=True)
+        evaluate.run(cfg, folder, own=own, quiet=True)
 
 
 def _up_to_date(cfg: DictConfig, folder: Path, runs: Sequence[Path]) -> bool:

@@ -267,7 +267,7 @@ def _learning(page: Page) -> None:
 
 
 def _filter(page: Page) -> None:
-    order = [f"time_gap_{value:g}" for value in FILTERS]
+    order = [f"full_speed_{value}" for value in FILTERS]
     frames = _evaluations(page.folder / "filter", "filter", order)
     if not frames:
         return
@@ -276,8 +276,10 @@ def _filter(page: Page) -> None:
     text = (
         "The same policies, with +filter=barrier between them and the car: nothing is trained. "
         "The filter keeps the time-to-collision above 4 s and, as far as that leaves room, the "
-        "time gap below scenario.pieces.barrier.time_gap, in seconds, by which the lines differ. "
-        f"The further tables are those of its default, {FILTERS[0]:g} s."
+        "time gap below 2.45 s; below scenario.pieces.barrier.full_speed, in m/s, by which the "
+        "lines differ, below less than that. The strategy barrier is the filter by itself, moving "
+        "a car that always brakes a little: what the policies add is the difference to it. "
+        f"The further tables are those of the default, {FILTERS[0]} m/s."
     )
     tables = [
         page.table(

@@ -44,20 +44,20 @@ def test_the_environment_keeps_its_word(variant) -> None:
 
 def test_between_the_limits_the_policy_decides() -> None:
     piece = Barrier(0.1)
-    action = torch.tensor([-0.4, 0.0, 0.3]).unsqueeze(-1)
+    action = torch.tensor([-0.05, 0.0, 0.3]).unsqueeze(-1)
     speed, gap = torch.full((3, 1), 10.0), torch.full((3, 1), 15.0)
     assert torch.equal(piece.compute(action, speed, gap, speed, torch.zeros(3, 1)), action)
 
 
 def test_safety_wins() -> None:
     # A gap far too long, closing far too fast: the limits contradict each other.
-    piece = Barrier(0.1, time_gap=0.5)
+    piece = Barrier(0.1, time_gap=0.5, full_speed=0.0)
     speed, gap, ahead = (torch.full((1, 1), x) for x in (10.0, 20.0, 2.0))
     assert piece.compute(torch.ones(1, 1), speed, gap, ahead, torch.zeros(1, 1)) == -1.0
 
 
 def test_a_limit_leaves_the_state_a_gradient() -> None:
-    piece = Barrier(0.1)
+    piece = Barrier(0.1, rate=1.0)
     gap = torch.full((1, 1), 5.5, requires_grad=True)
     speed, ahead = torch.full((1, 1), 6.0), torch.full((1, 1), 5.0)
     piece.compute(torch.ones(1, 1), speed, gap, ahead, torch.zeros(1, 1)).sum().backward()
@@ -66,7 +66,34 @@ def test_a_limit_leaves_the_state_a_gradient() -> None:
     assert gap.grad.item() == pytest.approx(1.0 / 4.05 / 3.0, rel=1e-5)
 
 
-@pytest.mark.parametrize("setting", ["time_to_collision", "time_gap", "rate", "max_acceleration"])
+def test_the_longest_gap_grows_with_the_square_of_the_speed_up_to_full_speed() -> None:
+    piece = Barrier(0.1, time_gap=2.4, full_speed=12.0, least_gap=2.0)
+    speed = torch.tensor([[0.0], [2.0], [6.0], [11.0], [20.0]], requires_grad=True)
+    longest, slope = piece._longest_gap(speed, 2.4)
+    assert torch.allclose(longest.flatten(), torch.tensor([2.0, 2.0, 7.2, 24.2, 48.0]))
+    (derivative,) = torch.autograd.grad(longest.sum(), speed)
+    assert torch.allclose(slope[2:], derivative[2:])  # elsewhere the least gap has none
+    always, _ = Barrier(0.1, time_gap=2.4, full_speed=0.0)._longest_gap(speed, 2.4)
+    assert torch.allclose(always.flatten(), 2.4 * speed.flatten().clamp(min=1.0))
+
+
+def test_far_away_the_car_is_drawn_near() -> None:
+    piece = Barrier(0.1)
+    speed, gap = torch.full((1, 1), 6.0), torch.full((1, 1), 14.0)
+    pushed = piece.compute(-torch.ones(1, 1), speed, gap, speed, torch.zeros(1, 1))
+    allowed = 2.45 * 6.0**2 / 12.0
+    expected = 0.2 * (14.0 - allowed) / (2 * 2.45 * 6.0 / 12.0)
+    assert 3.0 * pushed.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_full_speed_is_no_negative_number() -> None:
+    with pytest.raises(ConfigError, match=r"barrier\.full_speed"):
+        Barrier(0.1, full_speed=-1.0)
+
+
+@pytest.mark.parametrize(
+    "setting", ["time_to_collision", "time_gap", "rate", "time_gap_rate", "max_acceleration"]
+)
 def test_limits_must_be_positive(setting) -> None:
     with pytest.raises(ConfigError, match=f"barrier.{setting} must be positive"):
         Barrier(0.1, **{setting: 0.0})
