@@ -87,7 +87,7 @@ def _missing_choice(error: MissingConfigException) -> ConfigError:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
         extra = EXTRAS[name]
-        return ConfigError(f"{group}/{name} is not installed: pip install 'lcc_rl[{extra}]'")
+        return ConfigError(f"{group}/{name} is not installed: pip install -e '.[{extra}]'")
     return unknown_name(f"choice of {group}" if group else "option", name, error.options or ())
 
 

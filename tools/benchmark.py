@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.width = max(console.width, 110)
     missing = [name for name in EXTRA if not installed(name)]
     if missing:
-        console.print(f"left out: {', '.join(missing)} (pip install 'lcc_rl\\[bench]')")
+        console.print(f"left out: {', '.join(missing)} (pip install -e '.\\[bench]')")
     try:
         for name in options.names:
             if name not in BENCHMARKS:

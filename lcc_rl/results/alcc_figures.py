@@ -209,9 +209,10 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
     figure = new_figure(10.0, 1.3 + 0.42 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
-        for place, strategy in enumerate(dict.fromkeys(table["strategy"])):
+        strategies = list(dict.fromkeys(table["strategy"]))
+        for strategy, offset in zip(strategies, _spread(len(strategies)), strict=True):
             part = table[table["strategy"] == strategy]
-            rows = [names.index(name) + 0.18 * (2 * place - 1) for name in part[by]]
+            rows = [names.index(name) + offset for name in part[by]]
             _whiskers(axis, rows, part, column, colour(strategy))
             axis.plot(part[column], rows, "o", color=colour(strategy), ms=5, label=strategy)
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
@@ -223,12 +224,17 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
     axes[0].set_yticks(range(len(names)), [str(name).replace("_", " ") for name in names])
     axes[0].set_ylim(len(names) - 0.4, -0.6)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
-    counts = sorted({str(seeds) for seeds in table["seeds"]}, key=int)
-    seeds = "seed" if counts == ["1"] else "seeds"
-    note = f"n = {' or '.join(counts)} {seeds}; lines: 95 % interval; dashed: the study's limit"
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
+    counts = sorted({int(seeds) for seeds in table["seeds"] if str(seeds).isdigit()})
+    seeds = f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
+    note = f"n = {seeds}; lines: 95 % interval; dashed: the study's limit"
     figure.supxlabel(note, fontsize=8, color=SOFT)
     return figure
+
+
+def _spread(count: int) -> np.ndarray:
+    """Return places around zero for marks of one row, one beside the other."""
+    return 0.18 * np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
 
 
 def followers_figure(episodes: pd.DataFrame) -> Figure:

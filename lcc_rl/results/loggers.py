@@ -55,7 +55,7 @@ class RowLogger:
             logger = self._make(folder)
         except ImportError as error:
             raise ConfigError(
-                f"logger={self.kind} is not installed: pip install 'lcc_rl[{self.kind}]' ({error})"
+                f"logger={self.kind} is not installed: pip install -e '.[{self.kind}]' ({error})"
             ) from error
         try:
             yield lambda row: _send(logger, row)

@@ -44,7 +44,8 @@ OF_CALIBRATION = ("data", "calibration")
 # car is kept, at the price of energy.
 FILTERS = (12, 10, 8, 0)
 # How the part "followers" learns: DDPG's seeds differ by more than regard for followers brings.
-PRECISE = ("agent=analytic", "+filter=barrier")
+# Its filter keeps the time-to-collision only; all else is the policy's.
+PRECISE = ("agent=analytic", "+filter=barrier", "scenario.pieces.barrier.time_gap=null")
 EVERY_WINDOW = ("evaluation.profiles=null",)
 
 
@@ -237,11 +238,13 @@ def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
 def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
     """Put the filter on the policies of the main part, with several settings."""
     outcomes, usable = _trained(study)
+    # The variant barrier is evaluated, too: what the filter does by itself; it has no agent.
+    kept = [item for item in study.overrides if root_key(item) != "agent"]
+    alone = replace(study, overrides=tuple(kept))
     for speed in FILTERS:
-        # The variant barrier is evaluated, too: what the filter does by itself.
         own = f"scenario.pieces.barrier.full_speed={speed}"
         folder = study.folder / "filter" / f"full_speed_{speed}" / "evaluation"
-        evaluate_all(study.settings("evaluate", "barrier", own), usable, folder, own=True)
+        evaluate_all(alone.settings("evaluate", "barrier", own), usable, folder, own=True)
     return outcomes
 
 
