@@ -71,7 +71,7 @@ class Analytic:
         seed: int,
         time_step: float,
         hidden: Sequence[int] = (200, 100, 50),
-        learning_rate: float = 2e-3,
+        learning_rate: float = 3e-3,
         final_share: float = 0.05,
         clip_norm: float = 1.0,
         gamma: float = 1.0,
@@ -223,6 +223,8 @@ class GradientTrainer(TrainingLoop):
 
     def _source(self) -> Unrolled:
         compiled = self.agent.compiled
+        if compiled is None:
+            compiled = self.settings.compiled
         if compiled is None:
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
         return Unrolled(
