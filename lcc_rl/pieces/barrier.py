@@ -24,8 +24,9 @@ class Barrier(Transition):
     to keep its last measured acceleration.
 
     Behind a leader at standstill both limits are about the same number, gap / speed, so who comes
-    from afar must break one. Therefore ``longest(v)`` is ``time_gap·v`` from ``full_speed`` on and
-    falls with the square of the speed below: the car is near before its leader stands.
+    from afar must break one. With a ``full_speed``, ``longest(v)`` is ``time_gap·v`` from there on
+    and falls with the square of the speed below: the car is near before its leader stands, and
+    pays for it with energy.
 
     Reads ``"action"`` in [−1, 1], writes ``(name, "action")``, both ``[*batch, 1]``; a car obeys
     it with ``CAVMotion(obeys="next.barrier.action")``. Differentiable.
@@ -58,7 +59,7 @@ class Barrier(Transition):
         margin: float = 0.2,
         time_gap: float | None = 2.45,
         time_gap_rate: float = 0.2,
-        full_speed: float = 12.0,
+        full_speed: float = 0.0,
         least_gap: float = 2.0,
         name: str = "barrier",
         vehicle: str = "cav",

@@ -276,10 +276,10 @@ def _filter(page: Page) -> None:
     text = (
         "The same policies, with +filter=barrier between them and the car: nothing is trained. "
         "The filter keeps the time-to-collision above 4 s and, as far as that leaves room, the "
-        "time gap below 2.45 s; below scenario.pieces.barrier.full_speed, in m/s, by which the "
-        "lines differ, below less than that. The strategy barrier is the filter by itself, moving "
-        "a car that always brakes a little: what the policies add is the difference to it. "
-        f"The further tables are those of the default, {FILTERS[0]} m/s."
+        "time gap below 2.45 s; at speeds below scenario.pieces.barrier.full_speed, in m/s, by "
+        "which the lines differ, below proportionally less. The strategy barrier is the filter by "
+        "itself, moving a car that always brakes a little: what the policies add is the difference "
+        f"to it. The further tables are those of the default, {FILTERS[0]} m/s."
     )
     tables = [
         page.table(

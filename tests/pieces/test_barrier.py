@@ -78,7 +78,7 @@ def test_the_longest_gap_grows_with_the_square_of_the_speed_up_to_full_speed() -
 
 
 def test_far_away_the_car_is_drawn_near() -> None:
-    piece = Barrier(0.1)
+    piece = Barrier(0.1, full_speed=12.0)
     speed, gap = torch.full((1, 1), 6.0), torch.full((1, 1), 14.0)
     pushed = piece.compute(-torch.ones(1, 1), speed, gap, speed, torch.zeros(1, 1))
     allowed = 2.45 * 6.0**2 / 12.0

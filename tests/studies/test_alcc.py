@@ -132,7 +132,7 @@ def test_the_whole_study_in_small(small) -> None:
     assert {"headline", "table_iv", "ablations", "single_profile", "learning"} <= tables
     filtered = read_parquet(study.folder / "tables" / "filter.parquet")
     assert len(filtered) == 2 + 3 * len(alcc.FILTERS)
-    with_filter = filtered[filtered["filter"] == "full_speed_12"]
+    with_filter = filtered[filtered["filter"] == "full_speed_0"]
     assert set(with_filter["strategy"]) == {"alcc", "reference", "barrier"}
     assert not with_filter["total_energy_kj"].isin(filtered["total_energy_kj"][:2]).any()
     more = read_parquet(study.folder / "tables" / "followers.parquet")
