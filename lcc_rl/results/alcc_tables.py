@@ -340,7 +340,8 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
 
     Returns:
         One row per change and trained strategy: total energy [kJ], savings against ``idm`` and
-        ``reference`` [%] with intervals over seeds, collisions, and shares of time [%].
+        ``reference`` [%] with intervals over seeds, collisions, shares of time [%], and RMS jerk
+        [m/s³]; energy and jerk also of the worst seed.
     """
     rows = []
     for change, part in episodes.groupby(by, sort=False):
@@ -350,7 +351,9 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
             own = part[part["strategy"] == strategy]
             row: dict[str, object] = {by: change, "strategy": strategy}
             row["seeds"] = _seeds(part, strategy)
-            row |= mean(per_seed(part, "total_energy_kj")[strategy]).columns("total_energy_kj")
+            energy = per_seed(part, "total_energy_kj")[strategy]
+            row |= mean(energy).columns("total_energy_kj")
+            row["worst_seed_energy_kj"] = energy.max()
             for baseline in ("idm", "reference"):
                 found = savings(part, "total_energy_kj", strategy, baseline)
                 if baseline == strategy:
@@ -362,6 +365,8 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
                 ("long_time_gap_pct", "share_time_gap_long"),
             ):
                 row |= mean(per_seed(part, column)[strategy]).columns(name, 100.0)
+            jerk = per_seed(part, "rms_jerk_mps3")[strategy]
+            row["rms_jerk_mps3"], row["worst_seed_rms_jerk_mps3"] = jerk.mean(), jerk.max()
             rows.append(row)
     return pd.DataFrame(rows)
 

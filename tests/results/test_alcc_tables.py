@@ -163,6 +163,8 @@ def test_ablations_are_compared_with_the_humans_of_their_own_scenario() -> None:
     assert one["saving_against_idm_pct"] == pytest.approx(two["saving_against_idm_pct"])
     assert two["total_energy_kj"] == pytest.approx(2 * one["total_energy_kj"])
     assert one["unsafe_ttc_pct"] == pytest.approx(0.1)
+    assert (one["rms_jerk_mps3"], one["worst_seed_rms_jerk_mps3"]) == (1.5, 2.0)
+    assert one["worst_seed_energy_kj"] > one["total_energy_kj"]
     assert np.isnan(table.loc[("none", "reference"), "saving_against_reference_pct"])
 
 
