@@ -42,7 +42,7 @@ OF_CALIBRATION = ("data", "calibration")
 
 # From which speed on the filter allows the longest time gap [m/s], its own first: how near the
 # car is kept, at the price of energy.
-FILTERS = (0, 6, 8, 10, 12)
+FILTERS = (0, 6, 7, 8, 10, 12)
 # How the part "followers" learns: DDPG's seeds differ by more than regard for followers brings.
 # Its filter keeps the time-to-collision only; all else is the policy's.
 PRECISE = ("agent=analytic", "+filter=barrier", "scenario.pieces.barrier.time_gap=null")
