@@ -19,7 +19,14 @@ from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import TrainConfig, build, is_sweep, load, require
 from lcc_rl.data.profiles import Profiles, from_records
-from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, load_inputs
+from lcc_rl.envs.factory import (
+    Inputs,
+    any_leader,
+    build_agent,
+    build_env,
+    build_policy,
+    load_inputs,
+)
 from lcc_rl.envs.factory import learns as learned
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation import platoon_cases
@@ -185,10 +192,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     population = build(cfg.drivers, "drivers")
     agent = build_agent(cfg, population, cfg.device)
     check_variant(cfg, agent.learns)
-    trial = cfg.copy()
-    OmegaConf.set_struct(trial, False)
-    if "profile" in trial.scenario.pieces.get("leader", {}):
-        trial.scenario.pieces.leader.profile = None  # the name of a record is known to the data
+    trial = any_leader(cfg)
     steps = cfg.scenario.horizon + 1
     speed = torch.full((max(2, steps),), 10.0)
     profiles = from_records([speed], ["trial"], ["trial"], cfg.scenario.time_step)

@@ -24,7 +24,7 @@ from lcc_rl import results
 from lcc_rl.cli import main_guard, prepare_torch
 from lcc_rl.config import load, require
 from lcc_rl.envs.factory import load_inputs
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ResultsError
 from lcc_rl.evaluate import trained
 from lcc_rl.evaluation.monte_carlo import evaluate
 from lcc_rl.pipeline import root_key
@@ -32,7 +32,8 @@ from lcc_rl.results.drawing import new_figure, save
 from lcc_rl.results.files import read_parquet, write_parquet
 from lcc_rl.results.runs import load_policy
 from lcc_rl.results.study_figures import colour, style
-from lcc_rl.studies.runner import FINISHED, Run, run_all
+from lcc_rl.studies.runner import FINISHED, Run, check_overrides, run_all
+from lcc_rl.sweeps import key_of
 from lcc_rl.train import POLICIES
 
 log = logging.getLogger("lcc_rl")
@@ -80,9 +81,7 @@ def data_overrides(overrides: Iterable[str]) -> list[str]:
     known = ("data", "split", "drivers", "evaluation", "scenario", "experiment", "trust", "device")
     own = tuple(f"scenario.pieces.{piece}." for piece in ("barrier", "preview", "memory"))
     return [
-        item
-        for item in overrides
-        if root_key(item) in known and not item.lstrip("+~").startswith(own)
+        item for item in overrides if root_key(item) in known and not key_of(item).startswith(own)
     ]
 
 
@@ -286,8 +285,7 @@ def words(text: str) -> list[str]:
 def main(arguments: list[str]) -> int:
     """Run a comparison; whatever is no option is an override of every training."""
     options, overrides = parser().parse_known_args(arguments)
-    if any(item[0] == "-" or ("=" not in item and item[0] != "~") for item in overrides):
-        raise ConfigError(f"expected overrides such as data=stream, got {' '.join(overrides)}")
+    check_overrides(overrides)
     require(options.jobs >= 1 and options.seeds >= 1, "--jobs and --seeds must be at least 1")
     options.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")

@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.cli import main_guard
-from lcc_rl.errors import ConfigError
 from lcc_rl.studies import alcc, alcc_report, hcfs, hcfs_report
-from lcc_rl.studies.runner import FINISHED, Outcome, note, read_notes
+from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, note, read_notes
 
 log = logging.getLogger("lcc_rl")
 
@@ -134,8 +133,7 @@ def main(words: list[str]) -> int:
     wrong = [item for item in overrides if item.startswith("-")]
     if wrong or (overrides and "folder" in arguments):
         top.error(f"unknown: {' '.join(wrong or overrides)}")
-    if any("=" not in item and not item.startswith("~") for item in overrides):
-        raise ConfigError(f"expected overrides such as data=stream, got {' '.join(overrides)}")
+    check_overrides(overrides)
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     return int(arguments.run(arguments, shlex.join(["python", "tools/reproduce.py", *words])))

@@ -20,7 +20,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.loop import REPORTED, TrainingLoop, anneal, derived_seed, episode_statistics
+from lcc_rl.agents.loop import (
+    REPORTED,
+    TrainingLoop,
+    anneal,
+    check_final_share,
+    derived_seed,
+    episode_statistics,
+)
 from lcc_rl.config import TrainingConfig, build, require
 from lcc_rl.envs.unroll import Unrolled
 from lcc_rl.errors import require_positive
@@ -91,7 +98,7 @@ class Analytic:
         require_positive(
             "agent", learning_rate=learning_rate, clip_norm=clip_norm, value_lr=value_lr
         )
-        require(0 < final_share <= 1, f"agent.final_share must lie in (0, 1], got {final_share}")
+        check_final_share(final_share)
         self.final_share, self.clip_norm = final_share, clip_norm
         self.gamma, self.td_lambda, self.tau = gamma, td_lambda, tau
         self.bootstrap, self.compiled = bootstrap, compiled

@@ -13,7 +13,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from lcc_rl.agents.fused import FusedUpdate
-from lcc_rl.agents.loop import anneal
+from lcc_rl.agents.loop import anneal, check_final_share
 from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
@@ -175,11 +175,7 @@ def leaves(parameters: TensorDictBase) -> list[torch.Tensor]:
 
 
 def check_settings(
-    gamma: float,
-    batch_size: int,
-    buffer_size: int,
-    tau: float,
-    updates_per_transition: float,
+    gamma: float, batch_size: int, buffer_size: int, tau: float, updates_per_transition: float
 ) -> None:
     """Check settings that all agents with a replay buffer share.
 
@@ -209,5 +205,4 @@ def check_gentleness(saturation: float, final_share: float) -> None:
     """
     if saturation < 0:
         raise ConfigError(f"agent.saturation must not be negative, got {saturation}")
-    if not 0.0 < final_share <= 1.0:
-        raise ConfigError(f"agent.final_share must lie in (0, 1], got {final_share}")
+    check_final_share(final_share)

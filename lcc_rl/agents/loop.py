@@ -36,6 +36,15 @@ def derived_seed(*parts: object) -> int:
     return int.from_bytes(digest[:4], "big") >> 1
 
 
+def check_final_share(final_share: float) -> None:
+    """Check the share of learning rates at the end, see :func:`anneal`.
+
+    Raises:
+        ConfigError: if it is out of range.
+    """
+    require(0 < final_share <= 1, f"agent.final_share must lie in (0, 1], got {final_share}")
+
+
 def anneal(optimizers: Iterable[torch.optim.Optimizer], share: float, final_share: float) -> float:
     """Let learning rates fall along half a cosine, from what they are made with to a share of it.
 

@@ -17,6 +17,7 @@ from torchrl.objectives.common import LossModule
 
 from lcc_rl.agents.ddpg import Exploration, check_gentleness, check_settings, leaves
 from lcc_rl.agents.loop import anneal, derived_seed
+from lcc_rl.errors import require_positive
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
@@ -77,7 +78,12 @@ class OffPolicy(ABC):
         """Take one gradient step; as :meth:`lcc_rl.agents.DDPG.update`."""
 
     def _complete(self, loss: LossModule, tau: float, rates: tuple[float, float]) -> None:
-        """Set discount, followers and optimizers of a loss with an actor and Q networks."""
+        """Set discount, followers and optimizers of a loss with an actor and Q networks.
+
+        Raises:
+            ConfigError: if a learning rate, of the actor or the Q networks, is not positive.
+        """
+        require_positive("agent", actor_lr=rates[0], critic_lr=rates[1])
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.gamma)
         self.targets = SoftUpdate(self.loss, tau=tau)

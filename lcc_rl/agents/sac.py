@@ -117,8 +117,7 @@ class SAC(OffPolicy):
             exploration or {"initial": 1.0, "final": 1.0},
             device,
         )
-        rates = {"actor_lr": actor_lr, "critic_lr": critic_lr, "alpha_lr": alpha_lr}
-        require_positive("agent", alpha_init=alpha_init, **rates)
+        require_positive("agent", alpha_init=alpha_init, alpha_lr=alpha_lr)
         spread = seeded_mlp(observation_size, action_size, hidden[-1:], seed + 2).to(device)
         head = Head(self.policy.module[0], spread)
         self.noise = SampledAction(head)

@@ -11,7 +11,6 @@ from torchrl.objectives import TD3Loss
 
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.config import require
-from lcc_rl.errors import require_positive
 
 
 class TD3(OffPolicy):
@@ -63,7 +62,6 @@ class TD3(OffPolicy):
             exploration,
             device,
         )
-        require_positive("agent", actor_lr=actor_lr, critic_lr=critic_lr)
         require(policy_delay >= 1, f"agent.policy_delay must be at least 1, got {policy_delay}")
         require(
             policy_noise >= 0 and noise_clip >= 0,

@@ -195,6 +195,17 @@ def _check_wiring(pieces: Sequence[Piece]) -> None:
                 )
 
 
+def any_leader(cfg: DictConfig) -> DictConfig:
+    """Return a configuration without the one record that its leader may be told to play.
+
+    That record is one to train on: with other profiles at hand its number means nothing.
+    """
+    cfg = cfg.copy()
+    if "profile" in cfg.scenario.pieces.get("leader", {}):
+        cfg.scenario.pieces.leader.profile = None
+    return cfg
+
+
 def learns(cfg: DictConfig) -> bool:
     """Whether the agent of a configuration learns anything."""
     return bool(getattr(find_target(cfg.agent[TARGET], "agent"), "learns", True))

@@ -17,7 +17,7 @@ from torchrl.envs.utils import step_mdp
 
 from lcc_rl.config import require
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.envs.factory import build_env
+from lcc_rl.envs.factory import any_leader, build_env
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures
 from lcc_rl.functional.random import hash_bits
 from lcc_rl.pieces.base import SEED
@@ -100,9 +100,7 @@ def evaluate(
     """
     require(batch_size >= 1, f"evaluation.batch_size must be at least 1, got {batch_size}")
     profile, driver = pairs(len(profiles), len(population.time_gap), drivers)
-    cfg = strategy.cfg.copy()
-    if "profile" in cfg.scenario.pieces.get("leader", {}):
-        cfg.scenario.pieces.leader.profile = None  # the one to train on; here all are given
+    cfg = any_leader(strategy.cfg)
     kept = set(np.linspace(0, len(profile) - 1, max(sample_episodes, 1)).round().astype(int))
     episodes, steps = [], []
     for start in range(0, len(profile), batch_size):

@@ -85,7 +85,7 @@ class Barrier(Transition):
         self.time_step, self.max_acceleration = time_step, max_acceleration
         self.shortest, self.rate, self.margin = time_to_collision, rate, margin
         self.longest, self.time_gap_rate = time_gap, time_gap_rate
-        self.full_speed, self.least_gap = full_speed, least_gap
+        self.full_speed, self.least_gap = max(full_speed, SLOWEST), least_gap
 
     def compute(
         self, action: Tensor, speed: Tensor, gap: Tensor, ahead: Tensor, ahead_acceleration: Tensor
@@ -105,10 +105,6 @@ class Barrier(Transition):
     def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
         """Return the longest gap at a speed, and how it grows with the speed."""
         moving = speed.clamp(min=SLOWEST)
-        if self.full_speed <= SLOWEST:
-            longest, slope = time_gap * moving, torch.full_like(moving, time_gap)
-        else:
-            share = (moving / self.full_speed).clamp(max=1.0)
-            longest = time_gap * share * moving
-            slope = time_gap * torch.where(share < 1.0, 2.0 * share, share)
-        return longest.clamp(min=self.least_gap), slope
+        share = (moving / self.full_speed).clamp(max=1.0)
+        slope = time_gap * torch.where(share < 1.0, 2.0 * share, share)
+        return (time_gap * share * moving).clamp(min=self.least_gap), slope

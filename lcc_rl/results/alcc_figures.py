@@ -210,7 +210,7 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         strategies = list(dict.fromkeys(table["strategy"]))
-        for strategy, offset in zip(strategies, _spread(len(strategies)), strict=True):
+        for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
             part = table[table["strategy"] == strategy]
             rows = [names.index(name) + offset for name in part[by]]
             _whiskers(axis, rows, part, column, colour(strategy))
@@ -232,9 +232,9 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
     return figure
 
 
-def _spread(count: int) -> np.ndarray:
-    """Return places around zero for marks of one row, one beside the other."""
-    return 0.18 * np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
+def _abreast(count: int, reach: float) -> np.ndarray:
+    """Return evenly spread places around zero, at most ``reach`` from it; one alone is there."""
+    return reach * np.linspace(-1.0, 1.0, count) * (count > 1)
 
 
 def followers_figure(episodes: pd.DataFrame) -> Figure:
@@ -279,7 +279,7 @@ def single_profile_figure(episodes: pd.DataFrame) -> Figure:
         for number, strategy in enumerate(sorted(learned, reverse=True)):
             values = energy[strategy].to_numpy(float)
             centre = place - 0.16 + 0.32 * number
-            jitter = centre + 0.1 * np.linspace(-1, 1, len(values)) * (len(values) > 1)
+            jitter = centre + _abreast(len(values), 0.1)
             axis.plot(jitter, values, "o", color=colour(strategy), ms=5, alpha=0.6, mew=0)
             axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=colour(strategy), lw=2)
             _once(axis, seen, strategy, f"{strategy}: seeds and mean", "o")

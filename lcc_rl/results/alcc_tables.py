@@ -345,13 +345,12 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
     """
     rows = []
     for change, part in episodes.groupby(by, sort=False):
-        for strategy in per_seed(part, "total_energy_kj"):
+        for strategy, energy in per_seed(part, "total_energy_kj").items():
             if strategy in HUMANS:
                 continue
             own = part[part["strategy"] == strategy]
             row: dict[str, object] = {by: change, "strategy": strategy}
             row["seeds"] = _seeds(part, strategy)
-            energy = per_seed(part, "total_energy_kj")[strategy]
             row |= mean(energy).columns("total_energy_kj")
             row["worst_seed_energy_kj"] = energy.max()
             for baseline in ("idm", "reference"):

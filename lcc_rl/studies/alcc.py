@@ -26,6 +26,7 @@ from lcc_rl.studies.runner import (
     quoted,
     run_all,
 )
+from lcc_rl.sweeps import key_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -191,7 +192,7 @@ def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
         if part not in PARTS:
             raise unknown_name("part", part, PARTS)
     wanted = study.runs(study.folder / "train")[0].compose()  # a typo must not cost a calibration
-    if "filter" in parts and any("filter=" in item for item in study.overrides):
+    if "filter" in parts and any(root_key(item) == "filter" for item in study.overrides):
         raise ConfigError(
             "the part filter puts +filter=barrier on trained policies: give the override "
             "or that part (--parts), not both"
@@ -279,7 +280,7 @@ def followers_study(study: Study) -> Study:
     Recipes (but smoke) and overrides of agent and training are DDPG's and do not count there,
     unless the user chooses the agent.
     """
-    if any(item.startswith("agent=") for item in study.overrides):
+    if any(key_of(item) == "agent" for item in study.overrides):
         return study
     kept = [item for item in study.overrides if root_key(item) not in ("agent", "training")]
     recipe = SMOKE if study.recipe == SMOKE else None
@@ -288,9 +289,9 @@ def followers_study(study: Study) -> Study:
 
 def followers_change(study: Study, number: int) -> Change:
     """Return what makes a training one of the part ``followers``, where the user says no other."""
-    given = {item.lstrip("+~").split("=")[0] for item in study.overrides}
+    given = {key_of(item) for item in study.overrides}
     learner, windows = (
-        tuple(item for item in items if item.lstrip("+").split("=")[0] not in given)
+        tuple(item for item in items if key_of(item) not in given)
         for items in (PRECISE, EVERY_WINDOW)
     )
     return Change((*learner, f"scenario.followers={number}"), evaluation=windows)

@@ -19,7 +19,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from lcc_rl.config import load, plain
-from lcc_rl.errors import Interrupted
+from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.interrupts import interruptible
 from lcc_rl.progress import clock
 from lcc_rl.results.files import atomic_path
@@ -66,6 +66,16 @@ class Outcome:
 def quoted(path: str | Path) -> str:
     """Return a path as Hydra's command line takes it, whatever characters are in it."""
     return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def check_overrides(words: Sequence[str]) -> None:
+    """Check that what is left of a command line are overrides.
+
+    Raises:
+        ConfigError: if a word is an option or nothing.
+    """
+    if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
+        raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
 
 
 def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> list[str]:
