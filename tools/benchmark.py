@@ -20,7 +20,7 @@ from benchmarks.collect import collect
 from benchmarks.env import env
 from benchmarks.estimator import estimator
 from benchmarks.evaluate import evaluate
-from benchmarks.harness import EXTRA, Row, drawn, installed, machine
+from benchmarks.harness import EXTRA, Row, drawn, installed
 from benchmarks.infer import infer
 from benchmarks.read import read
 from benchmarks.scale import scale
@@ -31,7 +31,7 @@ from benchmarks.update import update
 from rich.console import Console
 
 from lcc_rl.errors import LccError, unknown_name
-from lcc_rl.results.files import write_parquet
+from lcc_rl.results.files import processor, write_parquet
 
 LISTED = (
     read,
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in options.names:
             if name not in BENCHMARKS:
                 raise unknown_name("benchmark", name, BENCHMARKS)
-        here = {"threads": options.threads, "machine": machine(), "torch": torch.__version__}
+        here = {"threads": options.threads, "machine": processor(), "torch": torch.__version__}
         for name in options.names or BENCHMARKS:
             for device in devices(options, name):
                 measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))

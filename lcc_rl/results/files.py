@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import platform
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from lcc_rl.errors import ResultsError
 SCHEMA_VERSION = "1"
 # From a version to the next: whoever raises SCHEMA_VERSION adds what older tables need.
 MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
+PROCESSOR = "lcc_rl.processor"  # in a table's metadata
 
 
 @contextmanager
@@ -71,7 +74,9 @@ def remove_leftovers(folder: Path) -> None:
 def write_parquet(
     frame: pd.DataFrame, path: str | Path, metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write a table atomically, with schema and package version in its metadata.
+    """Write a table atomically; its metadata name schema, package, torch and processor.
+
+    Trainings differ between kinds of processor by as much as between seeds, so a table says which.
 
     Args:
         frame: the table; its index is not kept.
@@ -83,13 +88,28 @@ def write_parquet(
     """
     from lcc_rl import __version__
 
-    own = {"lcc_rl.schema": SCHEMA_VERSION, "lcc_rl.version": __version__}
+    own = {
+        "lcc_rl.schema": SCHEMA_VERSION,
+        "lcc_rl.version": __version__,
+        "lcc_rl.torch": torch.__version__,
+        PROCESSOR: processor(),
+    }
     table = pa.Table.from_pandas(frame, preserve_index=False)
     table = table.replace_schema_metadata(
         {**(table.schema.metadata or {}), **own, **(metadata or {})}
     )
     with atomic_path(path) as temporary:
         pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+
+
+@cache
+def processor() -> str:
+    """Return the name of this machine's processor."""
+    try:
+        _, found, after = Path("/proc/cpuinfo").read_text().partition("model name")
+    except OSError:
+        found = ""
+    return after.splitlines()[0].lstrip("\t :") if found else platform.processor() or "unknown"
 
 
 def read_parquet(path: str | Path) -> pd.DataFrame:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import platform
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from html import escape
@@ -15,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.files import atomic_path
+from lcc_rl.results.files import PROCESSOR, atomic_path, parquet_metadata
 
 UNITS = {"kj": "kJ", "pct": "%", "s": "s", "m": "m", "mps": "m/s", "mps3": "m/s³"}
 UNITS |= {"kj_per_km": "kJ/km", "ms": "ms"}
@@ -107,18 +108,27 @@ def write_report(folder: str | Path, title: str, sections: Sequence[Section]) ->
     return path
 
 
-def made(commands: Sequence[str], details: Sequence[tuple[str, str]] = ()) -> Section:
+def made(
+    commands: Sequence[str],
+    details: Sequence[tuple[str, str]] = (),
+    runs: Iterable[Path] = (),
+) -> Section:
     """Return the section that says how a study was made.
 
     Args:
         commands: what was typed, oldest first, with dates where known.
         details: title and text of configurations and notes, folded away.
+        runs: a table of each training, which says where it ran.
     """
     rows = [("lcc_rl" if name == "lcc_rl" else name, version(name)) for name in PACKAGES]
     rows += [("Python", platform.python_version()), ("machine", platform.machine())]
     written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"This page was written on {written} from parquet files alone."
     listing = [("Commands", "\n".join(commands))] if commands else []
+    places = Counter(parquet_metadata(path).get(PROCESSOR, "not recorded") for path in runs)
+    if places:
+        counted = (f"{place} ({count})" for place, count in places.most_common())
+        text += f" Its trainings ran on: {', '.join(counted)}."
     return Section(
         "How it was made",
         text,

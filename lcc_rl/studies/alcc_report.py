@@ -409,7 +409,7 @@ def _made(page: Page) -> None:
         (f"Configuration of {name}, {path.parent.name}", path.read_text())
         for name, path in sorted(firsts.items())
     ]
-    section = made(notes.get("commands", []), details)
+    section = made(notes.get("commands", []), details, page.folder.rglob("training.parquet"))
     seeds = [f"{p.parents[1].name}/{p.parent.name}" for p in configs]
     extra = f"\n\nTrainings behind the main part: {', '.join(seeds)}." if seeds else ""
     trouble = f"\n\n{len(problems)} runs failed or were left out, see below." if problems else ""

@@ -55,7 +55,8 @@ def write_results(folder: str | Path) -> Path:
         (str(path.parent.relative_to(page.folder)), path.read_text())
         for path in sorted((page.folder / "evaluation").glob(f"seed_*/{CONFIG}"))[:1]
     ]
-    page.sections.append(made(read_notes(page.folder).get("commands", []), configs))
+    commands = read_notes(page.folder).get("commands", [])
+    page.sections.append(made(commands, configs, page.folder.rglob("training.parquet")))
     return write_report(page.folder, TITLE, page.sections)
 
 

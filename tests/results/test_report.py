@@ -10,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.drawing import new_figure, save
+from lcc_rl.results.files import processor, write_parquet
 from lcc_rl.results.report import Section, heading, made, write_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -95,6 +98,15 @@ def test_how_it_was_made(page) -> None:
     assert "python tools/reproduce.py alcc" in html
     assert "<td>torch</td>" in html
     assert re.search(r"written on \d{4}-\d\d-\d\d", html)
+
+
+def test_where_trainings_ran_is_counted(tmp_path) -> None:
+    paths = [tmp_path / f"{number}.parquet" for number in range(3)]
+    for path in paths[:2]:
+        write_parquet(pd.DataFrame({"a": [1]}), path)
+    pq.write_table(pa.table({"a": [1]}), paths[2])  # of a release that did not say
+    text = made([], runs=paths).text
+    assert text.endswith(f"ran on: {processor()} (2), not recorded (1).")
 
 
 def test_headings_say_units() -> None:

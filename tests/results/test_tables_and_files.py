@@ -86,7 +86,8 @@ def test_parquet_round_trip_with_metadata(tmp_path) -> None:
     pd.testing.assert_frame_equal(read_parquet(path), frame)
     metadata = parquet_metadata(path)
     assert metadata["lcc_rl.config"] == "abc"
-    assert {"lcc_rl.schema", "lcc_rl.version"} <= set(metadata)
+    assert {"lcc_rl.schema", "lcc_rl.version", "lcc_rl.torch"} <= set(metadata)
+    assert metadata["lcc_rl.processor"].strip()
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path) -> None:

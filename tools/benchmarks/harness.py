@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,15 +77,6 @@ def installed(*names: str) -> bool:
 def endings(options: Namespace) -> tuple[str, ...]:
     """Return what is appended to the names of eager cases and, if wanted, of compiled ones."""
     return ("", ", compiled") if options.compile else ("",)
-
-
-def machine() -> str:
-    """Name of the processor."""
-    try:
-        _, found, after = Path("/proc/cpuinfo").read_text().partition("model name")
-    except OSError:
-        found = ""
-    return after.splitlines()[0].lstrip("\t :") if found else platform.processor() or "unknown"
 
 
 def drawn(name: str, rows: list[Row]) -> Table:
