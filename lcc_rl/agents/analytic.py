@@ -57,7 +57,8 @@ class Analytic:
             objective; their weights multiply the terms' own. Those of terms that the reward
             lacks are ignored.
         regularizers: nodes of reward terms that belong to the objective only.
-        bootstrap: learn a value and add it at the end of every segment.
+        bootstrap: learn a value and add it at the end of every segment; without it the segment is
+            all that counts, and should be the whole episode.
         value_lr: learning rate of the value network.
         td_lambda: weight of longer returns in the value's targets.
         tau: share by which the value's target network follows at every update.
@@ -81,10 +82,10 @@ class Analytic:
         learning_rate: float = 3e-3,
         final_share: float = 0.05,
         clip_norm: float = 1.0,
-        gamma: float = 1.0,
+        gamma: float = 0.99,
         surrogates: dict[str, Any] | None = None,
         regularizers: dict[str, Any] | None = None,
-        bootstrap: bool = False,
+        bootstrap: bool = True,
         value_lr: float = 1e-3,
         td_lambda: float = 0.95,
         tau: float = 0.05,

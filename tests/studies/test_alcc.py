@@ -93,7 +93,7 @@ def test_settings_of_ddpg_are_not_those_of_the_followers(tmp_path) -> None:
     given = ("agent.batch_size=64", "training.episodes=40", "scenario.horizon=40")
     study = alcc.Study(tmp_path, "quickstart", 1, given)
     cfg = alcc.followers_study(study).runs(tmp_path, alcc.followers_change(study, 2))[0].compose()
-    assert (cfg.scenario.horizon, cfg.training.episodes) == (40, 51200)
+    assert (cfg.scenario.horizon, cfg.training.episodes) == (40, 30720)
     own = alcc.Study(tmp_path, "quickstart", 1, ("agent=td3", *given))
     cfg = alcc.followers_study(own).runs(tmp_path, alcc.followers_change(own, 2))[0].compose()
     assert (cfg.agent.batch_size, cfg.training.episodes) == (64, 40)
