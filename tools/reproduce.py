@@ -3,6 +3,7 @@
   python tools/reproduce.py alcc                            # embedded stream, 8 seeds, Table III
   python tools/reproduce.py alcc data=ngsim data.path=...   # real trajectories; any override
   python tools/reproduce.py alcc --recipe quickstart --parts main,filter   # in an hour, not days
+  python tools/reproduce.py alcc --parts main,filter agent=analytic   # another agent, its settings
   python tools/reproduce.py alcc --recipe smoke --seeds 1   # everything once, in seconds
   python tools/reproduce.py hcfs                            # the platoon: 8 DDPG parents, hybrids
   python tools/reproduce.py report outputs/alcc             # tables, figures and page, from parquet
@@ -24,6 +25,7 @@ from typing import Any
 from lcc_rl.cli import main_guard
 from lcc_rl.studies import alcc, alcc_report, hcfs, hcfs_report
 from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, note, read_notes
+from lcc_rl.sweeps import key_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -33,9 +35,10 @@ REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
     """Run the ALCC study and write its page; 1 if a training failed."""
+    another = any(key_of(item) == "agent" for item in arguments.overrides)
     study = alcc.Study(
         folder=arguments.out,
-        recipe=arguments.recipe,
+        recipe=arguments.recipe or (None if another else "paper_alcc"),
         seeds=arguments.seeds,
         overrides=tuple(arguments.overrides),
         jobs=arguments.jobs,
@@ -52,7 +55,7 @@ def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
     """Run the HCFS study and write its page; 1 if a training failed."""
     study = hcfs.Study(
         folder=arguments.out,
-        recipe=arguments.recipe,
+        recipe=arguments.recipe or "paper_hcfs",
         seeds=arguments.seeds,
         overrides=tuple(arguments.overrides),
         jobs=arguments.jobs,
@@ -108,8 +111,8 @@ def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser
     one.add_argument("--out", type=Path, default=folder, help="the study's folder")
     one.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
     one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
-    recipe = f"paper_{name}"
-    one.add_argument("--recipe", default=recipe, help=f"experiment: {recipe}, quickstart …")
+    text = f"experiment: paper_{name} unless agent=… is given, quickstart …"
+    one.add_argument("--recipe", help=text)
     listing(one, "--accept", (), "settings in which runs found in the folder may differ: data,…")
     return one
 

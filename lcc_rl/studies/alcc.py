@@ -37,6 +37,7 @@ GAMMAS = (0.9, 0.95, 0.99, 0.995)
 ROWS = "*/seed_*/episodes.parquet"
 SMOKE = "smoke"
 RECIPES = ("quickstart", "paper_alcc")  # how long, and with what batches, DDPG learns
+OF_DDPG = ("short_training", *(f"recipe_{name}" for name in RECIPES))
 # What the calibration takes in place of the trainings.
 OF_CALIBRATION = ("data", "calibration")
 
@@ -45,8 +46,7 @@ OF_CALIBRATION = ("data", "calibration")
 # car is kept, at the price of energy.
 FILTERS = (0, 6, 7, 8, 10, 12)
 # How the part "followers" learns: DDPG's seeds differ by more than regard for followers brings.
-# Its filter keeps the time-to-collision only; all else is the policy's.
-PRECISE = ("agent=analytic", "+filter=barrier", "scenario.pieces.barrier.time_gap=null")
+PRECISE = ("agent=analytic",)
 EVERY_WINDOW = ("evaluation.profiles=null",)
 
 
@@ -252,8 +252,8 @@ def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
 def _ablations(study: Study, wanted: DictConfig) -> list[Outcome]:
     # Those that change nothing are the main part itself; what is tried in seconds stays short.
     left_out = {f"gamma_{wanted.agent.gamma:g}", f"recipe_{study.recipe}"}
-    if study.recipe == SMOKE:
-        left_out |= {f"recipe_{name}" for name in RECIPES}
+    if study.recipe in (None, SMOKE):
+        left_out |= set(OF_DDPG)
     chosen = study.ablations or tuple(name for name in ABLATIONS if name not in left_out)
     folder = study.folder / "ablations"
     return _each(study, {folder / n: c for n, c in map(chosen_ablation, chosen)})

@@ -79,7 +79,6 @@ def test_followers_learn_with_the_analytic_agent_unless_another_is_asked_for(tmp
     study = alcc.Study(tmp_path, "quickstart", 1)
     change = alcc.followers_change(study, 5)
     cfg = alcc.followers_study(study).runs(tmp_path, change)[0].compose()
-    assert cfg.scenario.pieces.barrier.time_gap is None
     assert cfg.agent._target_.endswith("Analytic")
     assert cfg.scenario.followers == 5
     assert change.evaluation == ("evaluation.profiles=null",)
