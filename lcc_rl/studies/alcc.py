@@ -65,6 +65,8 @@ ABLATIONS = {
     "no_efficiency": Change(("reward.terms.efficiency.weight=0",)),
     "no_cav_energy": Change(("reward.terms.cav_energy.weight=0",)),
     "no_hdv_energy": Change(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
+    # Is it regard for others, or only that energy counts twice?
+    "own_energy_twice": Change(("reward.terms.cav_energy.weight=2",), ("reference",)),
     "true_acceleration": Change(("reward.terms.hdv_energy.power=power",), ("alcc",)),
     "population_mean": Change(("scenario.pieces.estimator.learning_time=inf",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.cav_power.recuperation=false",)),
