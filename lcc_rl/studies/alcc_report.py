@@ -246,9 +246,9 @@ def _learning(page: Page) -> None:
         return
     training = results.load(page.folder / "train", "training")
     text = (
-        "Rewards are sums per episode of 30 s with exploration noise, mean over the episodes of a "
-        "batch. drop: how far the mean of a tenth of the training ever falls below the best tenth "
-        "before it."
+        "Rewards are sums per episode of 30 s as played in training, where agents other than "
+        "analytic add noise to their actions, mean over the episodes of a batch. drop: how far "
+        "the mean of a tenth of the training ever falls below the best tenth before it."
     )
     tables = [page.table("learning", "Learning curves, every seed", alcc_tables.learning(training))]
     figures = [
@@ -345,9 +345,9 @@ def _followers(page: Page) -> None:
     text = (
         "Total energy is that of the controlled car and of all human drivers behind it. Unless "
         "the study's overrides say otherwise, both controllers learn by the gradient through the "
-        "simulator (agent=analytic), which is more precise than DDPG, have the filter, and are "
-        f"evaluated on every held-out window of 30 s ({_size(episodes)}). Time gaps tell whether a "
-        "saving is bought with distance."
+        "simulator (agent=analytic), which is more precise than DDPG, and are evaluated on every "
+        f"held-out window of 30 s ({_size(episodes)}). Time gaps and times-to-collision tell "
+        "whether a saving is bought with distance or risk."
     )
     table = alcc_tables.comparison(episodes, "followers")
     tables = [page.table("followers", "Against the number of human drivers behind", table)]
