@@ -22,7 +22,7 @@ from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.interrupts import INTERRUPTED, interruptible
 from lcc_rl.precision import set_precision
-from lcc_rl.results.states import Busy, forget, input_error, record
+from lcc_rl.results.states import Busy, forget, input_error, is_finished, record
 from lcc_rl.sweeps import SweepCallback, conclude, run_job
 
 # OSError: Hydra cannot make the run's folder, a disk is full, a file is not ours to read.
@@ -113,16 +113,19 @@ def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
 
 
 def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """Leave ``error.txt`` in the run's folder where it fails."""
+    """Leave ``error.txt`` in the run's folder where it fails; a finished run stays finished."""
 
     def recording(cfg: DictConfig) -> Any:
-        forget(run_folder())
+        folder = run_folder()
+        forget(folder)
         try:
             return function(cfg)
         except (Interrupted, Busy):
             raise
         except Exception as error:
-            record(run_folder(), error)
+            # A command that names a finished run by mistake is no failure of that run.
+            if not is_finished(folder):
+                record(folder, error)
             raise
 
     return recording

@@ -10,6 +10,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
@@ -134,9 +135,19 @@ def register_schemas() -> None:
         store.store(name=name, node=schema)
 
 
+def chosen_folder(resumed: str | None, fresh: str) -> str:
+    """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew.
+
+    Raises:
+        ConfigError: if there is no run to go on with.
+    """
+    if resumed and not (Path(resumed) / "config.yaml").is_file():
+        raise ConfigError(f"resume={resumed}: not a run folder: it has no config.yaml")
+    return str(resumed or fresh)
+
+
 register_schemas()
-# A resumed run goes on in its own folder instead of leaving an empty one behind.
-OmegaConf.register_new_resolver("lcc.folder", lambda resumed, fresh: resumed or fresh, replace=True)
+OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
 
 
 def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:

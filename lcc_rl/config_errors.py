@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, is_dataclass
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from hydra.errors import MissingConfigException
@@ -88,7 +90,9 @@ def _missing_choice(error: MissingConfigException) -> ConfigError:
     if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
         extra = EXTRAS[name]
         return ConfigError(f"{group}/{name} is not installed: pip install -e '.[{extra}]'")
-    return unknown_name(f"choice of {group}" if group else "option", name, error.options or ())
+    shipped = Path(str(files("lcc_rl.conf"))) / group
+    options = error.options or [path.stem for path in shipped.glob("*.yaml")]
+    return unknown_name(f"choice of {group}" if group else "option", name, options)
 
 
 def _what(parent: str) -> str:

@@ -154,6 +154,12 @@ def studied(cfg: DictConfig, policy: Policy | None, inputs: Inputs) -> Strategy:
             f"policy={cfg.policy} was trained with another observation than this: expected "
             f"{trained_with}, got {observed}; say +knowledge=… and observation.… as in its training"
         )
+    remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
+    if remembered != asked:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained with another memory than this: "
+            f"expected scenario.pieces.memory={remembered}, got {asked}"
+        )
     cfg = cfg.copy()
     OmegaConf.set_struct(cfg, False)
     cfg.agent = own.agent

@@ -17,7 +17,7 @@ from lcc_rl.agents.analytic import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.training import Trainer
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
-from lcc_rl.config import TrainConfig, build, is_sweep, load, require
+from lcc_rl.config import TARGET, TrainConfig, build, find_target, is_sweep, load, require
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.factory import (
     Inputs,
@@ -184,6 +184,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     Raises:
         ConfigError: naming the option.
     """
+    check_agent(cfg)
     check_sizes(cfg)
     check_objective(cfg)
     row_logger(cfg)
@@ -202,22 +203,37 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         build_env(trial, profiles, population, 1, 0, cfg.device)
 
 
+def check_agent(cfg: DictConfig) -> None:
+    """Refuse the analytic agent where there is no car of its own to drive.
+
+    Raises:
+        ConfigError: naming the variant.
+    """
+    analytic = find_target(cfg.agent[TARGET], "agent") is Analytic
+    require(
+        not analytic or TARGET in cfg.scenario.pieces.get("cav", {}),
+        f"agent=analytic drives the one car of alcc and reference; variant {cfg.variant} has none",
+    )
+
+
 def check_variant(cfg: DictConfig, learns: bool) -> None:
-    """Refuse an agent that learns nothing under the name of a variant that is learned.
+    """Refuse a learner under the name of a variant that learns nothing, and the reverse.
 
     Raises:
         ConfigError: naming both.
     """
-    if learns:
-        return
     try:
         own = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a variant of the user's own, known to this command line only
         return
-    if learned(own):
+    if learned(own) and not learns:
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, agent {cfg.agent._target_} learns "
             "nothing; for a human driver say variant=idm"
+        )
+    if learns and not learned(own):
+        raise ConfigError(
+            f"variant={cfg.variant} learns nothing: remove agent=…, or choose a learned variant"
         )
 
 

@@ -68,6 +68,25 @@ def test_an_agent_that_learns_nothing_is_no_learned_variant(tmp_path, agent) -> 
 
 
 @pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["variant=idm", "agent=ddpg"], "variant=idm learns nothing: remove agent="),
+        (["variant=direct", "agent=analytic"], "variant direct has none"),
+        (["variant=ddpg", "agent=analytic"], "variant ddpg has none"),
+    ],
+)
+def test_a_learner_is_no_variant_that_learns_nothing(tmp_path, overrides, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        train.run(load("train", [*overrides, "experiment=smoke"]), tmp_path)
+
+
+@pytest.mark.parametrize("given", ["experiment=smok", "experiment=[smok]"])
+def test_a_wrong_recipe_names_those_that_exist(given) -> None:
+    with pytest.raises(ConfigError, match=r"paper_alcc, .*Did you mean 'smoke'"):
+        load("train", [given])
+
+
+@pytest.mark.parametrize(
     "override",
     ["agent.gamma=1.5", "training.episodes=25", "reward.terms.safety.weight=heavy"],
 )

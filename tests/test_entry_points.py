@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.results.files import read_parquet
 from lcc_rl.results.runs import identity, load_config, load_policy
+from lcc_rl.results.states import inspect_run
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -338,7 +340,7 @@ def test_an_interrupted_pipeline_is_completed(tmp_path) -> None:
         (["lcc_rl.train", "data=ngsim"], "data.path"),
         (["lcc_rl.train", "data=ngsim", "data.path=nowhere.csv"], "nowhere.csv"),
         (["lcc_rl.train", "resume=nowhere"], "nowhere"),
-        (["lcc_rl.train", "resume=x", "seed=3"], "remove seed=3"),
+        (["lcc_rl.train", "resume=nowhere", "seed=3"], "resume=nowhere: not a run folder"),
         (["lcc_rl.pipeline", "variants=[]"], "variants is empty"),
     ],
 )
@@ -348,3 +350,15 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> Non
     assert expected in done.stderr
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.parametrize("words", [["hydra.run.dir=run"], ["resume=run", "seed=3"]])
+def test_a_command_that_names_a_finished_run_by_mistake_leaves_it_finished(
+    trained, tmp_path, words
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    done = command("lcc_rl.train", "variant=alcc", *words, cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert inspect_run(run).state == "finished"

@@ -47,8 +47,8 @@ def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
         profiles=arguments.profiles,
         followers=tuple(arguments.followers),
     )
-    note(study.folder, "alcc", command)
-    return concluded(alcc.run(study, arguments.parts), study.folder, alcc_report.write_results)
+    outcomes = alcc.run(study, arguments.parts, command)
+    return concluded(outcomes, study.folder, alcc_report.write_results)
 
 
 def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:

@@ -9,6 +9,7 @@ et al., "Accelerated policy learning with parallel differentiable simulation", I
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,6 +35,8 @@ from lcc_rl.errors import require_positive
 from lcc_rl.pieces.base import as_tuple
 from lcc_rl.pieces.rewards import TERMS, RewardTerm
 from lcc_rl.policies.actor import make_actor, seeded_mlp
+
+log = logging.getLogger("lcc_rl")
 
 # Iterations from which on compiling the simulator pays for itself.
 WORTH_COMPILING = 100
@@ -213,7 +216,7 @@ class GradientTrainer(TrainingLoop):
     it is as long as the horizon.
     """
 
-    advice = "Lower agent.learning_rate or agent.clip_norm"
+    advice = "Lower agent.learning_rate, agent.value_lr or agent.clip_norm"
     watched = "loss_actor"
 
     def __init__(
@@ -228,6 +231,13 @@ class GradientTrainer(TrainingLoop):
         super().__init__(agent, env, settings, seed, folder, identity)
         self.terms = [piece for piece in env.transform if isinstance(piece, RewardTerm)]
         self.objective = agent.objective(self.terms)
+        if not agent.bootstrap and settings.segment < self.horizon:
+            log.warning(
+                "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
+                "say training.segment=%d for the gradient of whole episodes",
+                settings.segment,
+                self.horizon,
+            )
 
     def _source(self) -> Unrolled:
         compiled = self.agent.compiled

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.intervals import Estimate, mean
+from lcc_rl.results.intervals import Estimate, mean, share_saved
 from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
 
 KINDS = {"": "energy_kj", "net_": "net_energy_kj"}  # raw; net of the change in kinetic energy
@@ -68,7 +68,7 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
                 share = savings(episodes, f"total_{column}", strategy, baseline)
                 row |= share.columns(f"{kind}saving_pct", 100.0)
                 values = per_seed(episodes, f"total_{column}")
-                worst = 1.0 - values[strategy].max() / values[baseline].mean()
+                worst = share_saved(values[strategy].max(), values[baseline].mean())
                 row[f"worst_seed_{kind}saving_pct"] = 100.0 * worst
             rows.append(row)
     return pd.DataFrame(rows)
@@ -150,7 +150,7 @@ def table_iv(
         for column in KINDS.values()
     }
     total = by_driver["total_energy_kj"]
-    saved = 1.0 - total[strategy] / total[baseline]
+    saved = share_saved(total[strategy], total[baseline])
     drivers = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
     rows = []
     for label, driver in drivers.items():
@@ -160,7 +160,7 @@ def table_iv(
                 row[column] = _of(table, driver)[name]
             for kind, column in KINDS.items():
                 of = _of(by_driver[f"total_{column}"], driver)
-                share = 100.0 * (1.0 - of[strategy] / of[baseline])
+                share = 100.0 * share_saved(of[strategy], of[baseline])
                 row[f"{kind}saving_pct"] = share if name == strategy else np.nan
             rows += [row, *_paper_row(label, name, strategy)]
     return pd.DataFrame(rows)
@@ -190,7 +190,7 @@ def holistic(
     for kind, column in KINDS.items():
         found = savings(episodes, f"total_{column}", strategy, baseline)
         by_driver = paired(episodes, f"total_{column}").groupby("driver_id").mean()
-        saved = 100.0 * (1.0 - by_driver[strategy] / by_driver[baseline])
+        saved = 100.0 * share_saved(by_driver[strategy], by_driver[baseline])
         rows.append(
             {
                 "from": f"{OURS}, {'net of kinetic energy' if kind else 'raw'}",
@@ -274,7 +274,7 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
         for kind, column in KINDS.items():
             found = savings(episodes, f"hdv_{column}", strategy, "direct")
             by_driver = paired(episodes, f"hdv_{column}").groupby("driver_id").mean()
-            saved = 100.0 * (1.0 - by_driver[strategy] / by_driver["direct"])
+            saved = 100.0 * share_saved(by_driver[strategy], by_driver["direct"])
             rows.append(
                 {
                     "behind": strategy,

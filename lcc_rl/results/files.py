@@ -164,8 +164,12 @@ def read_torch(path: str | Path) -> Any:
     try:
         _check_sums(path)
         return torch.load(path, weights_only=True, map_location="cpu")
+    except ResultsError:
+        raise
     except Exception as error:  # torch raises many kinds for damaged or malicious files
-        raise ResultsError(f"{path}: not a readable weights file: {error}") from error
+        raise ResultsError(
+            f"{path}: not a readable weights file: damaged, or made by something else"
+        ) from error
 
 
 def _check_sums(path: Path) -> None:
@@ -175,4 +179,4 @@ def _check_sums(path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         damaged = archive.testzip()
     if damaged is not None:
-        raise ResultsError(f"{damaged} does not match its checksum")
+        raise ResultsError(f"{path}: not a readable weights file: damaged at {Path(damaged).name}")

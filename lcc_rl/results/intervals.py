@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,8 +53,16 @@ def mean(values: ArrayLike) -> Estimate:
     return Estimate(_mean(numbers), low, high)
 
 
+def share_saved(value: Any, baseline: Any) -> Any:
+    """Return the share of a baseline's energy that is saved.
+
+    Positive where less is drawn, also where the baseline itself gains energy (by recuperation).
+    """
+    return (baseline - value) / abs(baseline)
+
+
 def saving(values: ArrayLike, baseline: ArrayLike, exact: bool = False) -> Estimate:
-    """Estimate the share saved against a baseline, 1 − mean(values)/mean(baseline).
+    """Estimate the share saved against a baseline, of the means, see :func:`share_saved`.
 
     Seeds of two trainings have nothing in common, so each side is resampled on its own.
 
@@ -66,14 +75,15 @@ def saving(values: ArrayLike, baseline: ArrayLike, exact: bool = False) -> Estim
         The share with its interval; without one where a trained side has a single seed.
     """
     own, other = _numbers(values), _numbers(baseline)
-    value = 1.0 - _mean(own) / _mean(other)
+    value = share_saved(_mean(own), _mean(other))
     if len(own) < 2 or (len(other) < 2 and not exact):
         return Estimate(value, np.nan, np.nan)
     if exact:
-        low, high = _interval([own], lambda a, axis: 1.0 - np.mean(a, axis) / _mean(other))
+        low, high = _interval([own], lambda a, axis: share_saved(np.mean(a, axis), _mean(other)))
     else:
         low, high = _interval(
-            [own, other], lambda a, b, axis: 1.0 - np.mean(a, axis) / np.mean(b, axis)
+            [own, other],
+            lambda a, b, axis: share_saved(np.mean(a, axis), np.mean(b, axis)),
         )
     return Estimate(value, low, high)
 

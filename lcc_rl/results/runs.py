@@ -178,7 +178,7 @@ def check_targets(cfg: DictConfig, where: str, trust: Sequence[str] = ()) -> Non
     for key, value in flatten(content):
         if "${" in str(value):
             raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
-        if key.rpartition(".")[2] == TARGET and not is_registered(str(value), trust):
+        if key.rpartition(".")[2] == TARGET and not is_registered(str(value), where, trust):
             module = str(value).rpartition(".")[0]
             raise ResultsError(
                 f"{where}: {key} names {value!r}, which is not part of lcc_rl; if you trust it, "
@@ -186,15 +186,22 @@ def check_targets(cfg: DictConfig, where: str, trust: Sequence[str] = ()) -> Non
             )
 
 
-def is_registered(target: str, trust: Sequence[str] = ()) -> bool:
-    """Whether a target is defined in a room of this package, or in a trusted module."""
+def is_registered(target: str, where: str, trust: Sequence[str] = ()) -> bool:
+    """Whether a target, named in a file, is defined in a room of this package or is trusted.
+
+    Raises:
+        ResultsError: if there is no such thing in a room of this package.
+    """
     module = target.rpartition(".")[0]
     if module in trust:
         return True
     if not module.startswith(REGISTRY):
         return False
     # A room also holds what it imports, which is not its own: import_module, for one.
-    found = find_target(target, "configuration")
+    try:
+        found = find_target(target, where)
+    except ConfigError as error:
+        raise ResultsError(f"{error}; of another release, or damaged") from error
     return str(getattr(found, "__module__", "")).startswith(REGISTRY)
 
 

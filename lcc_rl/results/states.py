@@ -14,6 +14,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from omegaconf.errors import OmegaConfBaseException
+
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.results.files import atomic_path, remove_leftovers
 
@@ -147,7 +149,10 @@ def input_error(error: BaseException) -> LccError | None:
     """Return the error of this package behind one, which says more than what wraps it."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LccError):
-        cause = cause.__cause__
+        # OmegaConf says of its resolvers' errors that they came before its own, not that they
+        # are its cause.
+        resolving = isinstance(cause, OmegaConfBaseException)
+        cause = cause.__cause__ or (cause.__context__ if resolving else None)
     return cause
 
 
@@ -157,6 +162,11 @@ def one_line(error: BaseException) -> str:
     if cause is not None:
         return " ".join(str(cause).split())
     return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a run's folder holds the table that a run writes last."""
+    return any((folder / table).exists() for table in RESULTS)
 
 
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
@@ -170,7 +180,7 @@ def inspect_run(folder: Path, name: str | None = None) -> RunState:
         with suppress(OSError):
             lines = (folder / ERROR).read_text().splitlines()
             return RunState(name, "failed", done, total, error=lines[0] if lines else "")
-    if any((folder / table).exists() for table in RESULTS):
+    if is_finished(folder):
         return RunState(name, "finished", done, total)
     return RunState(name, "stopped", done, total)
 

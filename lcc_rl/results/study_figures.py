@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.files import read_parquet
-from lcc_rl.results.intervals import Estimate, band
+from lcc_rl.results.intervals import Estimate, band, share_saved
 from lcc_rl.results.tables import paired, savings
 
 # Distinct without colour vision and in grey.
@@ -169,7 +169,7 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     left.hist(a, bins, color=colour(strategy), alpha=0.6, label=label)
     style(left, "energy of the human driver [kJ per episode]", "drivers")
     left.legend(frameon=False)
-    _paired_bars(right, 1.0 - a / b, "saving of A against B [%]", colour(strategy))
+    _paired_bars(right, share_saved(a, b), "saving of A against B [%]", colour(strategy))
     found = savings(episodes, "hdv_energy_kj", strategy, "direct")
     figure.suptitle(
         f"Human driver's energy with and without the controlled car ahead (n = {len(a)} drivers)\n"
@@ -182,7 +182,7 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
 def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
     """Saving of the total energy per driver, strategy against baseline (Fig. 10)."""
     by_driver = paired(episodes, "total_energy_kj").groupby("driver_id").mean()
-    saving = 1.0 - by_driver[strategy] / by_driver[baseline]
+    saving = share_saved(by_driver[strategy], by_driver[baseline])
     figure = new_figure(7.0, 3.8)
     axis = figure.subplots()
     label = f"total energy saved by {strategy}\nagainst {baseline} [%]"

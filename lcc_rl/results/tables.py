@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from lcc_rl.results.intervals import Estimate, saving
+from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
 HUMANS = ("direct", "idm")  # nothing was trained: one value, known exactly
@@ -95,8 +95,8 @@ def _against(
         zip(
             names,
             (
-                1.0 - total[strategy].mean() / total[baseline].mean(),
-                1.0 - net[strategy].mean() / net[baseline].mean(),
+                share_saved(total[strategy].mean(), total[baseline].mean()),
+                share_saved(net[strategy].mean(), net[baseline].mean()),
                 float((by_driver[strategy] > by_driver[baseline]).mean()),
             ),
             strict=True,

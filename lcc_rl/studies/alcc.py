@@ -22,6 +22,7 @@ from lcc_rl.studies.runner import (
     Outcome,
     Run,
     differences,
+    note,
     note_problems,
     quoted,
     run_all,
@@ -177,12 +178,13 @@ def chosen_ablation(item: str) -> tuple[str, Change]:
     return name, ABLATIONS[name]
 
 
-def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
+def run(study: Study, parts: Sequence[str] = PARTS, command: str = "") -> list[Outcome]:
     """Calibrate, train and evaluate; whatever is finished is skipped.
 
     Args:
         study: what to run.
         parts: ``main``, and what goes with it: ``filter`` needs its policies, all others none.
+        command: what was typed, to be kept in the folder.
 
     Returns:
         What became of every training.
@@ -201,6 +203,11 @@ def run(study: Study, parts: Sequence[str] = PARTS) -> list[Outcome]:
         )
     if "followers" in parts:
         followers_study(study).runs(study.folder, followers_change(study, 1))[0].compose()
+    if "ablations" in parts:
+        for _, change in map(chosen_ablation, study.ablations or ()):
+            study.runs(study.folder, change)[0].compose()
+    if command:
+        note(study.folder, "alcc", command)
     calibrate(study)
     steps = {
         "main": _main,

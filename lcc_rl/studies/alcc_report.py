@@ -246,7 +246,7 @@ def _learning(page: Page) -> None:
         return
     training = results.load(page.folder / "train", "training")
     text = (
-        "Rewards are sums per episode of 30 s as played in training, where agents other than "
+        "Rewards are sums per episode as played in training, where agents other than "
         "analytic add noise to their actions, mean over the episodes of a batch. drop: how far "
         "the mean of a tenth of the training ever falls below the best tenth before it."
     )
@@ -325,7 +325,7 @@ def _single(page: Page) -> None:
     episodes = pd.concat(frames, ignore_index=True)
     episodes["study_profile"] = episodes["study_profile"].astype(int)
     text = (
-        "The paper's probable protocol: the same 30 s of one leader in training and evaluation. "
+        "The paper's probable protocol: the same stretch of one leader in training and evaluation. "
         "Each profile has its own controllers, trained on nothing else."
     )
     table = alcc_tables.single_profile(episodes)
@@ -346,7 +346,7 @@ def _followers(page: Page) -> None:
         "Total energy is that of the controlled car and of all human drivers behind it. Unless "
         "the study's overrides say otherwise, both controllers learn by the gradient through the "
         "simulator (agent=analytic), which is more precise than DDPG, and are evaluated on every "
-        f"held-out window of 30 s ({_size(episodes)}). Time gaps and times-to-collision tell "
+        f"held-out window ({_size(episodes)}). Time gaps and times-to-collision tell "
         "whether a saving is bought with distance or risk."
     )
     table = alcc_tables.comparison(episodes, "followers")

@@ -68,6 +68,9 @@ def quoted(path: str | Path) -> str:
     return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
+GIVEN = ("seed=", "variant=")  # what a study gives each of its runs
+
+
 def check_overrides(words: Sequence[str]) -> None:
     """Check that what is left of a command line are overrides.
 
@@ -76,6 +79,12 @@ def check_overrides(words: Sequence[str]) -> None:
     """
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
+    for word in words:
+        if word.startswith(GIVEN):
+            raise ConfigError(
+                f"{word}: every run has its own; say --seeds, how many, counted from 0, "
+                "and which variants by the options of this command"
+            )
 
 
 def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> list[str]:

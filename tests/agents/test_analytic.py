@@ -124,6 +124,13 @@ def test_impossible_settings(tmp_path, overrides, words) -> None:
         make(tmp_path, *overrides)
 
 
+def test_what_no_segment_sees_is_said(tmp_path, caplog) -> None:
+    make(tmp_path, *WHOLE)
+    assert not caplog.records
+    make(tmp_path, *WHOLE, "training.segment=10")
+    assert "say training.segment=20" in caplog.text
+
+
 def test_divergence_is_named(tmp_path) -> None:
     trainer = make(tmp_path)
     with torch.no_grad():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lcc_rl.results.intervals import band, mean, saving
+from lcc_rl.results.intervals import band, mean, saving, share_saved
 
 
 def test_one_seed_has_no_interval() -> None:
@@ -60,3 +60,10 @@ def test_band_holds_the_mean_of_every_point() -> None:
 def test_columns_are_scaled_and_named() -> None:
     columns = mean([1.0, 3.0]).columns("x_pct", 100.0)
     assert columns == {"x_pct": 200.0, "x_pct_low": 100.0, "x_pct_high": 300.0}
+
+
+def test_less_drawn_is_saved_also_where_the_baseline_gains() -> None:
+    assert share_saved(90.0, 100.0) == pytest.approx(0.1)
+    assert share_saved(-110.0, -100.0) == pytest.approx(0.1)  # recuperates more
+    assert share_saved(-90.0, -100.0) == pytest.approx(-0.1)
+    assert saving([-110.0], [-100.0]).value == pytest.approx(0.1)

@@ -109,6 +109,13 @@ def test_every_ablation_can_be_built(tmp_path, name) -> None:
     assert cfg.training.episodes % cfg.training.environments == 0
 
 
+def test_a_typo_in_an_ablation_costs_no_calibration(tmp_path) -> None:
+    study = alcc.Study(tmp_path, ablations=("mine:reward.terms.safty.weight=0",))
+    with pytest.raises(ConfigError, match="'safty'"):
+        alcc.run(study, ["ablations"], "typed")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_filter_is_put_on_once(tmp_path) -> None:
     with pytest.raises(ConfigError, match="not both"):
         alcc.run(alcc.Study(tmp_path, overrides=("+filter=barrier",)))

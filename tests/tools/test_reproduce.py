@@ -70,6 +70,7 @@ def test_from_data_to_page_and_on_from_where_it_stopped(tool, tmp_path, monkeypa
         (["alcc", "--recipe", "smok"], "smok"),
         (["alcc", "--parts", "mian"], "Did you mean 'main'?"),
         (["alcc", "data"], "expected overrides"),
+        (["alcc", "seed=3"], "say --seeds"),
         (["report", "nowhere"], "no evaluation/episodes.parquet"),
     ],
 )
@@ -98,7 +99,7 @@ def test_another_agent_comes_with_its_own_length(
     class SeenError(Exception):
         pass
 
-    def run(study, parts):
+    def run(study, parts, command):
         raise SeenError(study.recipe, study.runs(study.folder)[0].compose().training.episodes)
 
     monkeypatch.setattr(tool.alcc, "run", run)
