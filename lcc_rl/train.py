@@ -203,6 +203,11 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         build_env(trial, profiles, population, 1, 0, cfg.device)
 
 
+def has_car(cfg: DictConfig) -> bool:
+    """Whether the scenario has one controlled car; overrides of it alone make none."""
+    return TARGET in cfg.scenario.pieces.get("cav", {})
+
+
 def check_agent(cfg: DictConfig) -> None:
     """Refuse the analytic agent where there is no car of its own to drive.
 
@@ -211,7 +216,7 @@ def check_agent(cfg: DictConfig) -> None:
     """
     analytic = find_target(cfg.agent[TARGET], "agent") is Analytic
     require(
-        not analytic or TARGET in cfg.scenario.pieces.get("cav", {}),
+        not analytic or has_car(cfg),
         f"agent=analytic drives the one car of alcc and reference; variant {cfg.variant} has none",
     )
 
@@ -266,7 +271,7 @@ def check_sizes(cfg: DictConfig) -> None:
         require(value is None or value >= 1, f"{name} must be at least 1, got {value}")
     pieces = cfg.scenario.pieces
     require(
-        pieces.get("barrier") is None or "_target_" in pieces.get("cav", {}),
+        pieces.get("barrier") is None or has_car(cfg),
         f"+filter=barrier belongs to a car of its own (alcc, reference, idm), not to {cfg.variant}",
     )
     measured = [name for name in MEASURED if "cav" in pieces and name not in pieces]

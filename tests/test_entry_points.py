@@ -353,12 +353,19 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> Non
     assert not (tmp_path / "nowhere").exists()
 
 
-@pytest.mark.parametrize("words", [["hydra.run.dir=run"], ["resume=run", "seed=3"]])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["hydra.run.dir=run"], "run already holds a training"),
+        (["resume=run", "seed=3"], "remove variant=alcc seed=3"),
+    ],
+)
 def test_a_command_that_names_a_finished_run_by_mistake_leaves_it_finished(
-    trained, tmp_path, words
+    trained, tmp_path, words, expected
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(trained, run)
     done = command("lcc_rl.train", "variant=alcc", *words, cwd=tmp_path, check=False)
     assert done.returncode == 2
+    assert expected in done.stderr
     assert inspect_run(run).state == "finished"

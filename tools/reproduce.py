@@ -24,8 +24,7 @@ from typing import Any
 
 from lcc_rl.cli import main_guard
 from lcc_rl.studies import alcc, alcc_report, hcfs, hcfs_report
-from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, note, read_notes
-from lcc_rl.sweeps import key_of
+from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, read_notes
 
 log = logging.getLogger("lcc_rl")
 
@@ -35,10 +34,10 @@ REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
     """Run the ALCC study and write its page; 1 if a training failed."""
-    another = any(key_of(item) == "agent" for item in arguments.overrides)
+    usual = None if alcc.chooses_agent(arguments.overrides) else "paper_alcc"
     study = alcc.Study(
         folder=arguments.out,
-        recipe=arguments.recipe or (None if another else "paper_alcc"),
+        recipe=arguments.recipe or usual,
         seeds=arguments.seeds,
         overrides=tuple(arguments.overrides),
         jobs=arguments.jobs,
@@ -61,8 +60,7 @@ def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
         jobs=arguments.jobs,
         accept=tuple(arguments.accept),
     )
-    note(study.folder, "hcfs", command)
-    return concluded(hcfs.run(study), study.folder, hcfs_report.write_results)
+    return concluded(hcfs.run(study, command), study.folder, hcfs_report.write_results)
 
 
 def concluded(
@@ -111,7 +109,7 @@ def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser
     one.add_argument("--out", type=Path, default=folder, help="the study's folder")
     one.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
     one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
-    text = f"experiment: paper_{name} unless agent=… is given, quickstart …"
+    text = f"experiment: paper_{name}, quickstart …; in alcc with agent=… that agent's own length"
     one.add_argument("--recipe", help=text)
     listing(one, "--accept", (), "settings in which runs found in the folder may differ: data,…")
     return one

@@ -7,7 +7,7 @@ import platform
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -118,18 +118,23 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
     Raises:
         ResultsError: if the file is missing, damaged or of a newer schema.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ResultsError(f"{path}: no such file")
-    try:
-        table = pq.read_table(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError) as error:
-        raise ResultsError(f"{path}: not a readable parquet file: {error}") from error
+    table = _read(path, partial(pq.read_table, page_checksum_verification=True))
     # Tables from elsewhere say nothing of a schema: they are read as they are.
     version = (table.schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
     if not version.isdigit() or int(version) > int(SCHEMA_VERSION):
         raise ResultsError(f"{path}: schema version {version}; this package reads {SCHEMA_VERSION}")
     return migrated(table.to_pandas(), int(version))
+
+
+def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
+    """Read a parquet file, or say in one line why that cannot be."""
+    path = Path(path)
+    if not path.is_file():
+        raise ResultsError(f"{path}: no such file")
+    try:
+        return reader(path)
+    except (pa.ArrowException, OSError) as error:
+        raise ResultsError(f"{path}: not a readable parquet file: {error}") from error
 
 
 def migrated(frame: pd.DataFrame, version: int) -> pd.DataFrame:
@@ -140,8 +145,12 @@ def migrated(frame: pd.DataFrame, version: int) -> pd.DataFrame:
 
 
 def parquet_metadata(path: str | Path) -> dict[str, str]:
-    """Return the text metadata of a parquet file, without pandas' own entry."""
-    raw = pq.read_schema(path).metadata or {}
+    """Return the text metadata of a parquet file, without pandas' own entry.
+
+    Raises:
+        ResultsError: if the file is missing or damaged.
+    """
+    raw = _read(path, pq.read_schema).metadata or {}
     return {key.decode(): value.decode() for key, value in raw.items() if key != b"pandas"}
 
 

@@ -283,13 +283,18 @@ def _followers(study: Study, wanted: DictConfig) -> list[Outcome]:
     return _each(followers_study(study), changes)
 
 
+def chooses_agent(overrides: Iterable[str]) -> bool:
+    """Whether the user asks for an agent other than the recipe's."""
+    return any(key_of(item) == "agent" for item in overrides)
+
+
 def followers_study(study: Study) -> Study:
     """Return the study as its part ``followers`` learns, with an agent of its own.
 
     Recipes (but smoke) and overrides of agent and training are DDPG's and do not count there,
     unless the user chooses the agent.
     """
-    if any(key_of(item) == "agent" for item in study.overrides):
+    if chooses_agent(study.overrides):
         return study
     kept = [item for item in study.overrides if root_key(item) not in ("agent", "training")]
     recipe = SMOKE if study.recipe == SMOKE else None

@@ -24,7 +24,7 @@ from lcc_rl.evaluation.platoon_cases import (
 )
 from lcc_rl.pipeline import known_settings
 from lcc_rl.results.runs import identity, load_config, save_config
-from lcc_rl.studies.runner import FINISHED, Outcome, Run, note_problems, run_all
+from lcc_rl.studies.runner import FINISHED, Outcome, Run, note, note_problems, run_all
 from lcc_rl.train import EPISODES
 
 log = logging.getLogger("lcc_rl")
@@ -75,8 +75,12 @@ class Study:
         return load("evaluate", [f"experiment={self.recipe}", "variant=hcfs", *shared, *own])
 
 
-def run(study: Study) -> list[Outcome]:
+def run(study: Study, command: str = "") -> list[Outcome]:
     """Train the DDPG parents and evaluate every strategy; whatever is finished is skipped.
+
+    Args:
+        study: what to run.
+        command: what was typed, to be kept in the folder.
 
     Returns:
         What became of every training.
@@ -85,6 +89,8 @@ def run(study: Study) -> list[Outcome]:
         LccError: one clear error for wrong settings or files.
     """
     cfg = study.evaluation()
+    if command:
+        note(study.folder, "hcfs", command)
     outcomes = run_all(study.runs(), study.jobs, study.accept)
     note_problems(study.folder, outcomes)
     prepare_torch(cfg)

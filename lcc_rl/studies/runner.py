@@ -24,6 +24,7 @@ from lcc_rl.interrupts import interruptible
 from lcc_rl.progress import clock
 from lcc_rl.results.files import atomic_path
 from lcc_rl.results.runs import CONFIG, NOT_IDENTITY, flatten, load_config
+from lcc_rl.sweeps import key_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -68,19 +69,19 @@ def quoted(path: str | Path) -> str:
     return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-GIVEN = ("seed=", "variant=")  # what a study gives each of its runs
+GIVEN = ("seed", "variant")  # what a study gives each of its runs
 
 
 def check_overrides(words: Sequence[str]) -> None:
     """Check that what is left of a command line are overrides.
 
     Raises:
-        ConfigError: if a word is an option or nothing.
+        ConfigError: if a word is an option or nothing, or sets what every run gets from the study.
     """
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
     for word in words:
-        if word.startswith(GIVEN):
+        if key_of(word) in GIVEN:
             raise ConfigError(
                 f"{word}: every run has its own; say --seeds, how many, counted from 0, "
                 "and which variants by the options of this command"

@@ -90,6 +90,15 @@ def test_parquet_round_trip_with_metadata(tmp_path) -> None:
     assert metadata["lcc_rl.processor"].strip()
 
 
+@pytest.mark.parametrize("read", [read_parquet, parquet_metadata])
+def test_what_is_no_table_is_named(tmp_path, read) -> None:
+    with pytest.raises(ResultsError, match=r"a\.parquet: no such file"):
+        read(tmp_path / "a.parquet")
+    (tmp_path / "a.parquet").write_bytes(b"PAR1 cut off")
+    with pytest.raises(ResultsError, match=r"a\.parquet: not a readable parquet file"):
+        read(tmp_path / "a.parquet")
+
+
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
