@@ -222,7 +222,8 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
     for key in given:
         if key not in signature:
-            raise unknown_name(f"setting of {where}", key, signature)
+            own = set(signature) - set(resources)
+            raise unknown_name(f"setting of {where} ({target.__name__})", key, own)
         if given[key] == "???":
             raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
     _check_types(target, given, where)

@@ -52,6 +52,9 @@ def explain(error: Exception, valid: Any) -> Exception:
         return error
     if not OmegaConf.is_dict(node):
         return unknown_at(parent, valid) or error
+    if not parent and name in node:  # other variants have it
+        variant = OmegaConf.select(valid, "variant")
+        return ConfigError(f"variant {variant} has no {name} to choose; leave {name}=… out")
     names = {*map(str, node), *(() if parent else ("experiment",))}
     return unknown_name(_what(parent), name, names)
 

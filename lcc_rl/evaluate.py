@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
-from lcc_rl.config import load
+from lcc_rl.config import TARGET, load
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation import platoon_cases
@@ -64,6 +66,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     strategies += [trained(cfg, path, compared[path], inputs) for path in cfg.compare]
     if own and cfg.variant not in BASELINES:
         strategies.append(studied(cfg, policy, inputs))
+    strategies = named_apart(strategies)
     check_distinct(strategies)
     # The rows of an earlier evaluation must never stand beside the configuration of this one.
     (folder / EPISODES).unlink(missing_ok=True)
@@ -72,6 +75,23 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     if not quiet:
         write_study_figures(folder)
     return episodes
+
+
+def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Add its agent to the name of a variant that more than one kind of agent has learned."""
+    kinds = {(strategy.name, agent_name(strategy)) for strategy in strategies}
+    learned_by = Counter(name for name, _ in kinds)
+    return [
+        replace(strategy, name=f"{strategy.name} {agent_name(strategy)}")
+        if learned_by[strategy.name] > 1
+        else strategy
+        for strategy in strategies
+    ]
+
+
+def agent_name(strategy: Strategy) -> str:
+    """Return what kind of agent a strategy's configuration names."""
+    return str(strategy.cfg.agent[TARGET]).rpartition(".")[2].lower()
 
 
 def check_distinct(strategies: Sequence[Strategy]) -> None:

@@ -36,6 +36,7 @@ from lcc_rl.results.runs import check_targets, load_config, load_policy, save_po
         ("+evaluation.driver=3", r"Did you mean 'drivers'"),
         ("seed=abc", r"seed=abc: Value 'abc' .* Integer"),
         ("hydra.swep.dir=x", r"Did you mean 'sweep'"),
+        ("leader=udds", r"variant alcc has no leader to choose; leave leader=… out"),
         ("hydra/launcher=cluster", r"unknown choice of hydra/launcher 'cluster'"),
     ],
 )
@@ -56,6 +57,12 @@ def test_what_the_schema_knows_passes() -> None:
 def test_a_filter_for_a_platoon_is_refused(tmp_path) -> None:
     cfg = load("train", ["variant=ddpg", "+filter=barrier", "experiment=smoke"])
     with pytest.raises(ConfigError, match=r"\+filter=barrier .* not to ddpg"):
+        train.run(cfg, tmp_path)
+
+
+def test_a_recipe_of_another_agent_names_the_agent_and_its_own_settings(tmp_path) -> None:
+    cfg = load("train", ["experiment=quickstart", "agent=analytic"])
+    with pytest.raises(ConfigError, match=r"agent \(Analytic\) 'batch_size'; valid: bootstrap, "):
         train.run(cfg, tmp_path)
 
 
@@ -172,6 +179,18 @@ def test_two_policies_that_rows_cannot_tell_apart(tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={folder}", f"compare=[{folder}]")
     with pytest.raises(ConfigError, match="two policies of variant alcc with training seed 0"):
         evaluate.run(cfg, tmp_path / "b")
+
+
+def test_policies_of_two_agents_stand_side_by_side(tmp_path) -> None:
+    for agent in ("ddpg", "analytic"):
+        cfg = tiny("train", "variant=alcc", f"agent={agent}", agent=False)
+        train.run(cfg, tmp_path / agent, quiet=True)
+    compared = f"compare=[{tmp_path / 'analytic'}]"
+    cfg = tiny("evaluate", "variant=alcc", f"policy={tmp_path / 'ddpg'}", compared, agent=False)
+    rows = evaluate.run(cfg, tmp_path / "both", quiet=True)
+    assert list(rows["strategy"].unique()) == ["direct", "idm", "alcc analytic", "alcc ddpg"]
+    energies = rows.groupby("strategy")["total_energy_kj"].mean()
+    assert energies["alcc analytic"] != energies["alcc ddpg"]
 
 
 # -- files ----------------------------------------------------------------------------------------

@@ -35,6 +35,11 @@ def test_specs(variant, batch_size) -> None:
     check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
 
 
+def test_an_empty_batch_is_refused() -> None:
+    with pytest.raises(ConfigError, match="at least one episode, got 0"):
+        small_env("alcc", 0)
+
+
 @pytest.mark.parametrize("followers", [1, 4])
 def test_number_of_followers_is_a_dimension(followers) -> None:
     env = small_env("alcc", 3, [f"scenario.followers={followers}"])
