@@ -148,6 +148,7 @@ def chosen_folder(resumed: str | None, fresh: str) -> str:
 
 register_schemas()
 OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
+OmegaConf.register_new_resolver("lcc.add", lambda *numbers: float(sum(numbers)), replace=True)
 
 
 def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:

@@ -127,8 +127,8 @@ def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
         other.scenario[key] = cfg.scenario[key]
     for name, node in other.scenario.pieces.items():
         for key, value in (cfg.scenario.pieces.get(name) or {}).items():
-            number = isinstance(value, (int, float)) and (name, key) not in OWN_SETTINGS
-            if node is not None and number:
+            number = isinstance(value, (int, float)) or key == "event_shape"
+            if node is not None and number and (name, key) not in OWN_SETTINGS:
                 node[key] = value
 
 

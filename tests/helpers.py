@@ -14,7 +14,7 @@ from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.factory import build_env
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
-VARIANTS = ("alcc", "reference", "barrier", "idm", "direct", *PLATOON)
+VARIANTS = ("alcc", "reference", "own_energy", "barrier", "idm", "direct", *PLATOON)
 POPULATION = bootstrap()
 
 

@@ -99,7 +99,8 @@ def test_constructor_arguments_and_yaml_are_in_parity() -> None:
         "leader",
     }
     for variant in VARIANTS:
-        filtered = ["+filter=barrier"] if variant in ("alcc", "reference", "idm") else []
+        one_car = variant in ("alcc", "reference", "own_energy", "idm")
+        filtered = ["+filter=barrier"] if one_car else []
         cfg = compose(variant, *filtered)
         nodes = {**cfg.scenario.pieces, **cfg.reward.terms}
         if variant in PLATOON:

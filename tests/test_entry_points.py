@@ -369,3 +369,18 @@ def test_a_command_that_names_a_finished_run_by_mistake_leaves_it_finished(
     assert done.returncode == 2
     assert expected in done.stderr
     assert inspect_run(run).state == "finished"
+
+
+def test_a_policy_drives_before_more_drivers_than_it_was_trained_with(tmp_path) -> None:
+    # What the reference learns does not depend on their number; nor may what it is measured with.
+    runs = [tmp_path / str(followers) for followers in (1, 3)]
+    for folder in runs:
+        cfg = tiny("train", "variant=reference", f"scenario.followers={folder.name}")
+        train.run(cfg, folder, quiet=True)
+    energies = []
+    for folder in runs:
+        cfg = tiny("evaluate", "variant=idm", "scenario.followers=3", agent=False)
+        cfg.compare = [str(folder)]
+        rows = evaluate.run(cfg, tmp_path / f"evaluation {folder.name}", quiet=True)
+        energies.append(rows[rows["strategy"] == "reference"]["total_energy_kj"].to_numpy())
+    assert (energies[0] == energies[1]).all()

@@ -241,21 +241,25 @@ def followers_figure(episodes: pd.DataFrame) -> Figure:
     """What regard for the human drivers behind saves, against their number (no counterpart).
 
     Args:
-        episodes: rows of the evaluations of both trained strategies, with the column
+        episodes: rows of the evaluations of all trained strategies, with the column
             ``followers``.
     """
     table = comparison(episodes, "followers")
-    table = table[table["strategy"] == "alcc"]
+    table = table[table["strategy"] != "reference"]
     column = "saving_against_reference_pct"
     figure = new_figure(6.5, 3.8)
     axis = figure.subplots()
-    axis.plot(table["followers"], table[column], "o-", color=colour("alcc"))
-    _whiskers(axis, table["followers"].to_numpy(), table, column, colour("alcc"), upright=True)
-    for number, value, seeds in table[["followers", column, "seeds"]].itertuples(index=False):
-        text = f"{seeds} seeds" if seeds != "1" else "1 seed"
-        axis.annotate(text, (number, value), (6, -12), textcoords="offset points", fontsize=8)
+    names = list(dict.fromkeys(table["strategy"]))
+    for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
+        part = table[table["strategy"] == name]
+        seeds = sorted({int(count) for count in part["seeds"]})
+        label = f"{name}, {' or '.join(map(str, seeds))} {'seed' if seeds == [1] else 'seeds'}"
+        places = part["followers"].to_numpy(float) + offset
+        axis.plot(places, part[column], "o-", color=colour(name), label=label)
+        _whiskers(axis, places, part, column, colour(name), upright=True)
     axis.axhline(0.0, color=INK, lw=0.8)
-    words = "total energy saved by alcc\nagainst reference [%]"
+    axis.legend(frameon=False)
+    words = "total energy saved\nagainst reference [%]"
     style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
     return figure
 

@@ -13,6 +13,7 @@ from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
 
 KINDS = {"": "energy_kj", "net_": "net_energy_kj"}  # raw; net of the change in kinetic energy
 PAPER, OURS = "paper", "this study"
+BASELINES = ("idm", "reference")
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
 PAPER_TABLE_IV = {"reference": (214.85, 193.89, 408.74), "alcc": (226.46, 164.38, 390.84)}
 PAPER_IMPROVEMENT = {"mean": 4.38, "best": 14.43, "worst": -4.92}
@@ -59,7 +60,7 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
     found = per_seed(episodes, "total_energy_kj")
     rows = []
     for strategy in (name for name in found if name not in HUMANS):
-        for baseline in (name for name in ("idm", "reference") if name in found):
+        for baseline in (name for name in (*BASELINES, "own_energy") if name in found):
             if baseline == strategy:
                 continue
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
@@ -353,7 +354,7 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
             row["seeds"] = _seeds(part, strategy)
             row |= mean(energy).columns("total_energy_kj")
             row["worst_seed_energy_kj"] = energy.max()
-            for baseline in ("idm", "reference"):
+            for baseline in BASELINES:
                 found = savings(part, "total_energy_kj", strategy, baseline)
                 if baseline == strategy:
                     found = Estimate(np.nan, np.nan, np.nan)

@@ -15,8 +15,14 @@ from lcc_rl.results.intervals import Estimate, band, share_saved
 from lcc_rl.results.tables import paired, savings
 
 # Distinct without colour vision and in grey.
-COLOURS = {"alcc": "#0072b2", "reference": "#d55e00", "idm": "#6b6b6b", "direct": "#222222"}
-OTHERS = ("#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+COLOURS = {
+    "alcc": "#0072b2",
+    "reference": "#d55e00",
+    "own_energy": "#009e73",
+    "idm": "#6b6b6b",
+    "direct": "#222222",
+}
+OTHERS = ("#cc79a7", "#e69f00", "#56b4e9")
 VEHICLES = {
     "leader": ("leader", "#222222"),
     "cav": ("controlled car", "#0072b2"),

@@ -32,6 +32,7 @@ from lcc_rl.sweeps import key_of
 log = logging.getLogger("lcc_rl")
 
 VARIANTS = ("alcc", "reference")
+CONTROL = "own_energy"  # is it regard for others, or only that energy counts more?
 PARTS = ("main", "filter", "ablations", "single", "followers")
 DRIVERS = Path("calibration/drivers.parquet")
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
@@ -61,13 +62,12 @@ class Change:
     evaluation: tuple[str, ...] = ()
 
 
+MAIN = Change(variants=(*VARIANTS, CONTROL))
 ABLATIONS = {
     "no_safety": Change(("reward.terms.safety.weight=0",)),
     "no_efficiency": Change(("reward.terms.efficiency.weight=0",)),
     "no_cav_energy": Change(("reward.terms.cav_energy.weight=0",)),
     "no_hdv_energy": Change(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
-    # Is it regard for others, or only that energy counts twice?
-    "own_energy_twice": Change(("reward.terms.cav_energy.weight=2",), ("reference",)),
     "true_acceleration": Change(("reward.terms.hdv_energy.power=power",), ("alcc",)),
     "population_mean": Change(("scenario.pieces.estimator.learning_time=inf",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.cav_power.recuperation=false",)),
@@ -241,8 +241,8 @@ def _main(study: Study, wanted: DictConfig) -> list[Outcome]:
 def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
     """Train what is left of the main part; return its outcomes, and those with earlier seeds."""
     folder = study.folder / "train"
-    outcomes = run_all(study.runs(folder), study.jobs, study.accept)
-    return outcomes, outcomes + study.earlier(folder)
+    outcomes = run_all(study.runs(folder, MAIN), study.jobs, study.accept)
+    return outcomes, outcomes + study.earlier(folder, MAIN)
 
 
 def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
@@ -278,9 +278,14 @@ def _single(study: Study, wanted: DictConfig) -> list[Outcome]:
 
 
 def _followers(study: Study, wanted: DictConfig) -> list[Outcome]:
-    folder = study.folder / "followers"
-    changes = {folder / str(n): followers_change(study, n) for n in study.followers}
-    return _each(followers_study(study), changes)
+    folder, numbers = study.folder / "followers", sorted(set(study.followers))
+    changes = {folder / str(n): followers_change(study, n) for n in numbers}
+    # What the reference learns does not depend on how many drive behind it: it learns once.
+    shared = "reference"
+    for path in list(changes)[1:]:
+        others = tuple(name for name in changes[path].variants if name != shared)
+        changes[path] = replace(changes[path], variants=others)
+    return _each(followers_study(study), changes, folder / str(numbers[0]) / shared)
 
 
 def chooses_agent(overrides: Iterable[str]) -> bool:
@@ -308,16 +313,32 @@ def followers_change(study: Study, number: int) -> Change:
         tuple(item for item in items if key_of(item) not in given)
         for items in (PRECISE, EVERY_WINDOW)
     )
-    return Change((*learner, f"scenario.followers={number}"), evaluation=windows)
+    own = (*learner, f"scenario.followers={number}")
+    return Change(own, MAIN.variants, evaluation=windows)
 
 
-def _each(study: Study, changes: Mapping[Path, Change]) -> list[Outcome]:
-    """Train and evaluate every change of the recipe in a folder of its own."""
+def _each(
+    study: Study, changes: Mapping[Path, Change], shared: Path | None = None
+) -> list[Outcome]:
+    """Train and evaluate every change of the recipe in a folder of its own.
+
+    Args:
+        study: what to run.
+        changes: by folder.
+        shared: folder of a variant of one of them whose trainings all are compared with.
+
+    Returns:
+        What became of every training.
+    """
     runs = [run for folder, change in changes.items() for run in study.runs(folder, change)]
     outcomes = run_all(runs, study.jobs, study.accept)
+    before = [x for folder, change in changes.items() for x in study.earlier(folder, change)]
     for folder, change in changes.items():
-        of_it = [outcome for outcome in outcomes if folder in outcome.run.folder.parents]
-        of_it += study.earlier(folder, change)
+        of_it = [
+            outcome
+            for outcome in outcomes + before
+            if {folder, shared} & set(outcome.run.folder.parents)
+        ]
         own = (*change.overrides, *change.evaluation)
         settings = study.settings("evaluate", "alcc", *own, recipes=change.recipes)
         evaluate_all(settings, of_it, folder / "evaluation")

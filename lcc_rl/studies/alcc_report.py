@@ -121,7 +121,9 @@ def _headline(page: Page, episodes: pd.DataFrame, size: str) -> None:
     )
     text = (
         "alcc saves energy for itself and for the human driver behind; reference is the same "
-        "without regard for the driver behind; idm is a human in the car's place; direct is the "
+        "without regard for the driver behind; own_energy is reference whose own energy counts "
+        "as often as alcc's reward has terms of energy: what it saves is due to that weight, not "
+        "to regard for others; idm is a human in the car's place; direct is the "
         "human driver directly behind the leader, without the car.\n\n"
         f"All meet the same {size} with the same noise. Energies are means per episode, over all "
         "seeds; savings are positive where energy is saved. Raw trip energy rewards ending slower "
@@ -344,7 +346,7 @@ def _followers(page: Page) -> None:
     episodes = episodes.sort_values("followers", kind="stable")
     text = (
         "Total energy is that of the controlled car and of all human drivers behind it. Unless "
-        "the study's overrides say otherwise, both controllers learn by the gradient through the "
+        "the study's overrides say otherwise, the controllers learn by the gradient through the "
         "simulator (agent=analytic), which is more precise than DDPG, and are evaluated on every "
         f"held-out window ({_size(episodes)}). Time gaps and times-to-collision tell "
         "whether a saving is bought with distance or risk."
@@ -353,7 +355,10 @@ def _followers(page: Page) -> None:
     tables = [page.table("followers", "Against the number of human drivers behind", table)]
     figures = []
     if {"alcc", "reference"} <= set(episodes["strategy"]):
-        caption = "Energy that regard for the human drivers behind saves, against their number."
+        caption = (
+            "Energy saved by regard for the human drivers behind (alcc) and by counting one's own "
+            "energy as often (own_energy), against their number."
+        )
         figure = alcc_figures.followers_figure(episodes)
         figures = [page.figure("followers", caption, figure)]
     page.add("More human drivers behind", text, tables, figures)

@@ -129,22 +129,24 @@ def test_the_whole_study_in_small(small) -> None:
     settings = {"overrides": (*TINY, "evaluation.profiles=2"), "followers": (1, 2)}
     strings = alcc.Study(**{**vars(study), **settings})
     outcomes += alcc.run(strings, ["followers"])
-    assert [outcome.status for outcome in outcomes] == [FINISHED] * (4 + 2 + 2 + 4)
+    assert [outcome.status for outcome in outcomes] == [FINISHED] * (6 + 2 + 2 + 5)
     page = alcc_report.write_results(study.folder)
     episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
     counts = episodes.groupby("strategy")["training_seed"].nunique()
-    assert counts.to_dict() == {"alcc": 2, "direct": 0, "idm": 0, "reference": 2}
+    learned = {"alcc": 2, "own_energy": 2, "reference": 2}
+    assert counts.to_dict() == {**learned, "direct": 0, "idm": 0}
     tables = {path.stem for path in (study.folder / "tables").iterdir()}
     assert {"headline", "table_iv", "ablations", "single_profile", "learning"} <= tables
     filtered = read_parquet(study.folder / "tables" / "filter.parquet")
-    assert len(filtered) == 2 + 3 * len(alcc.FILTERS)
+    assert len(filtered) == 3 + 4 * len(alcc.FILTERS)
     with_filter = filtered[filtered["filter"] == "full_speed_0"]
-    assert set(with_filter["strategy"]) == {"alcc", "reference", "barrier"}
-    assert not with_filter["total_energy_kj"].isin(filtered["total_energy_kj"][:2]).any()
+    assert set(with_filter["strategy"]) == {"alcc", "reference", "own_energy", "barrier"}
+    assert not with_filter["total_energy_kj"].isin(filtered["total_energy_kj"][:3]).any()
     more = read_parquet(study.folder / "tables" / "followers.parquet")
     assert more[["followers", "strategy"]].to_numpy().tolist() == [
-        [number, name] for number in (1, 2) for name in ("alcc", "reference")
+        [number, name] for number in (1, 2) for name in ("alcc", "own_energy", "reference")
     ]
+    assert not (study.folder / "followers" / "2" / "reference").exists()  # that of 1 is taken
     ablated = read_parquet(study.folder / "tables" / "ablations.parquet")
     assert set(ablated["ablation"]) == {alcc_report.ITSELF, "late"}
     html = page.read_text()
@@ -191,7 +193,7 @@ def test_foreign_and_broken_runs_do_not_stop_the_others(small) -> None:
     assert outcomes[other].status == FOREIGN
     assert outcomes[other].note == "agent.tau: 0.5 → 0.005"
     episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
-    assert set(episodes["strategy"]) == {"direct", "idm", "reference"}
+    assert set(episodes["strategy"]) == {"direct", "idm", "reference", "own_energy"}
     alcc_report.write_results(study.folder)  # without alcc, some sections are left out
     problems = json.loads((study.folder / runner.NOTES).read_text())["problems"]
     assert set(problems) == {"train/alcc/seed_0", "train/alcc/seed_1"}
@@ -201,7 +203,7 @@ def test_foreign_and_broken_runs_do_not_stop_the_others(small) -> None:
     assert {outcome.status for outcome in alcc.run(accepting, ["main"])} == {FINISHED}
     assert json.loads((study.folder / runner.NOTES).read_text())["problems"] == {}
     episodes = read_parquet(study.folder / "evaluation" / "episodes.parquet")
-    assert episodes["strategy"].nunique() == 4
+    assert episodes["strategy"].nunique() == 5
 
 
 @pytest.mark.parametrize(
