@@ -85,7 +85,7 @@ class Analytic:
         learning_rate: float = 3e-3,
         final_share: float = 0.05,
         clip_norm: float = 1.0,
-        gamma: float = 0.99,
+        gamma: float = 0.998,
         surrogates: dict[str, Any] | None = None,
         regularizers: dict[str, Any] | None = None,
         bootstrap: bool = True,
