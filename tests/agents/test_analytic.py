@@ -151,6 +151,7 @@ EARLY = (
     "agent.surrogates.efficiency.weight=3.0",
     "agent.surrogates.efficiency.threshold=2.25",
     "agent.surrogates.efficiency.width=0.3",
+    "agent.surrogates.safety.weight=1.0",
     "agent.gamma=0.95",
 )
 
