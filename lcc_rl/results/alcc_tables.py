@@ -13,7 +13,7 @@ from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
 
 KINDS = {"": "energy_kj", "net_": "net_energy_kj"}  # raw; net of the change in kinetic energy
 PAPER, OURS = "paper", "this study"
-BASELINES = ("idm", "reference")
+BASELINES = ("idm", "reference", "own_energy")
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
 PAPER_TABLE_IV = {"reference": (214.85, 193.89, 408.74), "alcc": (226.46, 164.38, 390.84)}
 PAPER_IMPROVEMENT = {"mean": 4.38, "best": 14.43, "worst": -4.92}
@@ -60,7 +60,7 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
     found = per_seed(episodes, "total_energy_kj")
     rows = []
     for strategy in (name for name in found if name not in HUMANS):
-        for baseline in (name for name in (*BASELINES, "own_energy") if name in found):
+        for baseline in (name for name in BASELINES if name in found):
             if baseline == strategy:
                 continue
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
@@ -340,10 +340,11 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
         by: the column that names the change.
 
     Returns:
-        One row per change and trained strategy: total energy [kJ], savings against ``idm`` and
-        ``reference`` [%] with intervals over seeds, collisions, shares of time [%], and RMS jerk
-        [m/s³]; energy and jerk also of the worst seed.
+        One row per change and trained strategy: total energy [kJ], savings against each of
+        :data:`BASELINES` [%] with intervals over seeds, collisions, shares of time [%], and RMS
+        jerk [m/s³]; energy and jerk also of the worst seed.
     """
+    baselines = [name for name in BASELINES if (episodes["strategy"] == name).any()]
     rows = []
     for change, part in episodes.groupby(by, sort=False):
         for strategy, energy in per_seed(part, "total_energy_kj").items():
@@ -354,7 +355,7 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
             row["seeds"] = _seeds(part, strategy)
             row |= mean(energy).columns("total_energy_kj")
             row["worst_seed_energy_kj"] = energy.max()
-            for baseline in BASELINES:
+            for baseline in baselines:
                 found = savings(part, "total_energy_kj", strategy, baseline)
                 if baseline == strategy:
                     found = Estimate(np.nan, np.nan, np.nan)

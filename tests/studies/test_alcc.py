@@ -147,6 +147,9 @@ def test_the_whole_study_in_small(small) -> None:
         [number, name] for number in (1, 2) for name in ("alcc", "own_energy", "reference")
     ]
     assert not (study.folder / "followers" / "2" / "reference").exists()  # that of 1 is taken
+    saved = more.set_index("strategy")["saving_against_own_energy_pct"]
+    assert saved["alcc"].notna().all()
+    assert saved["own_energy"].isna().all()
     ablated = read_parquet(study.folder / "tables" / "ablations.parquet")
     assert set(ablated["ablation"]) == {alcc_report.ITSELF, "late"}
     html = page.read_text()
