@@ -92,7 +92,7 @@ def parser() -> argparse.ArgumentParser:
     listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
     listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(alcc.ABLATIONS))
     one.add_argument("--profiles", type=int, default=4, help="profiles of the part single")
-    numbers = "numbers of human drivers behind the car, of the part followers"
+    numbers = "numbers of human drivers behind the car, of the part followers: 1,2,5,10"
     one.add_argument("--followers", type=whole_numbers, default=[1, 2, 5, 10], help=numbers)
     two = study_parser(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     two.set_defaults(run=reproduce_hcfs)

@@ -42,7 +42,7 @@ class Clock(EnvBase):
         if horizon < 1:
             raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
         batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
-        if 0 in batch:
+        if any(size < 1 for size in batch):
             raise ConfigError(f"batch_size must hold at least one episode, got {batch_size}")
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon

@@ -35,9 +35,10 @@ def test_specs(variant, batch_size) -> None:
     check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
 
 
-def test_an_empty_batch_is_refused() -> None:
-    with pytest.raises(ConfigError, match="at least one episode, got 0"):
-        small_env("alcc", 0)
+@pytest.mark.parametrize("size", [0, -1])
+def test_an_empty_batch_is_refused(size) -> None:
+    with pytest.raises(ConfigError, match=f"at least one episode, got {size}"):
+        small_env("alcc", size)
 
 
 @pytest.mark.parametrize("followers", [1, 4])
