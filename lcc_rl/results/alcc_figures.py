@@ -258,7 +258,7 @@ def followers_figure(episodes: pd.DataFrame) -> Figure:
         axis.plot(places, part[column], "o-", color=colour(name), label=label)
         _whiskers(axis, places, part, column, colour(name), upright=True)
     axis.axhline(0.0, color=INK, lw=0.8)
-    axis.legend(frameon=False)
+    axis.legend(frameon=False, loc="lower left")
     words = "total energy saved\nagainst reference [%]"
     style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
     return figure
