@@ -28,7 +28,7 @@ class Clock(EnvBase):
         device: where the tensors live.
 
     Raises:
-        ConfigError: if the horizon is not positive or the batch is empty.
+        ConfigError: if the horizon is not positive, or the batch is empty or no whole numbers.
     """
 
     def __init__(
@@ -41,7 +41,10 @@ class Clock(EnvBase):
     ) -> None:
         if horizon < 1:
             raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
-        batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
+        try:
+            batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
+        except TypeError:
+            raise ConfigError(f"batch_size must be whole numbers, got {batch_size!r}") from None
         if any(size < 1 for size in batch):
             raise ConfigError(f"batch_size must hold at least one episode, got {batch_size}")
         super().__init__(device=device, batch_size=batch)

@@ -35,9 +35,12 @@ def test_specs(variant, batch_size) -> None:
     check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
 
 
-@pytest.mark.parametrize("size", [0, -1])
-def test_an_empty_batch_is_refused(size) -> None:
-    with pytest.raises(ConfigError, match=f"at least one episode, got {size}"):
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [(0, "one episode, got 0"), (-1, "got -1"), (2.5, "whole numbers, got 2.5"), ("8", "got '8'")],
+)
+def test_no_batch_of_episodes_is_refused(size, words) -> None:
+    with pytest.raises(ConfigError, match=words):
         small_env("alcc", size)
 
 
