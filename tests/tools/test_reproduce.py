@@ -55,7 +55,7 @@ def test_from_data_to_page_and_on_from_where_it_stopped(tool, tmp_path, monkeypa
     # One training lost its end: it goes on from its checkpoint, the other is skipped.
     (study / "train" / "alcc" / "seed_0" / "episodes.parquet").unlink()
     said = reproduce("alcc", "--out", "study", *TINY, cwd=tmp_path)
-    assert "2 runs: 1 to do, 1 finished before" in said
+    assert "3 runs: 1 to do, 2 finished before" in said
     assert "study/train/alcc/seed_0: going on" in said
     assert read_parquet(study / "evaluation" / "episodes.parquet").equals(episodes)
     (study / "report.html").unlink()
