@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.drawing import new_figure, save
@@ -44,6 +47,13 @@ def page(tmp_path) -> Path:
         made(["python tools/reproduce.py alcc"], [("Configuration", "seed: 0")]),
     ]
     return write_report(tmp_path, "A study", sections)
+
+
+def test_pictures_keep_every_pixel(page) -> None:
+    found = re.findall(r"data:image/(\w+);base64,([^\"]+)", page.read_text())
+    (data,) = (data for kind, data in found if kind == "webp")
+    shown, drawn = Image.open(BytesIO(base64.b64decode(data))), Image.open(page.parent / "line.png")
+    assert shown.convert("RGBA").tobytes() == drawn.convert("RGBA").tobytes()
 
 
 class Outline(HTMLParser):
