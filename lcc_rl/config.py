@@ -255,6 +255,11 @@ def find_target(target: str, where: str) -> Any:
         raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}") from error
 
 
+def short_name(target: object) -> str:
+    """Return what tables call the class that a ``_target_`` names: ``ddpg`` of the agent DDPG."""
+    return str(target).rpartition(".")[2].lower()
+
+
 SIMPLE: dict[Any, tuple[type, ...]] = {float: (float, int), int: (int,), bool: (bool,), str: (str,)}
 
 

@@ -13,7 +13,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
-from lcc_rl.config import TARGET, load
+from lcc_rl.config import TARGET, load, short_name
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation import platoon_cases
@@ -79,19 +79,12 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
 
 def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     """Add its agent to the name of a variant that more than one kind of agent has learned."""
-    kinds = {(strategy.name, agent_name(strategy)) for strategy in strategies}
-    learned_by = Counter(name for name, _ in kinds)
+    named = [(strategy.name, short_name(strategy.cfg.agent[TARGET])) for strategy in strategies]
+    learned_by = Counter(name for name, _ in set(named))
     return [
-        replace(strategy, name=f"{strategy.name} {agent_name(strategy)}")
-        if learned_by[strategy.name] > 1
-        else strategy
-        for strategy in strategies
+        replace(strategy, name=f"{name} {agent}") if learned_by[name] > 1 else strategy
+        for strategy, (name, agent) in zip(strategies, named, strict=True)
     ]
-
-
-def agent_name(strategy: Strategy) -> str:
-    """Return what kind of agent a strategy's configuration names."""
-    return str(strategy.cfg.agent[TARGET]).rpartition(".")[2].lower()
 
 
 def check_distinct(strategies: Sequence[Strategy]) -> None:
@@ -127,8 +120,9 @@ def share_scenario(cfg: DictConfig, other: DictConfig) -> None:
         other.scenario[key] = cfg.scenario[key]
     for name, node in other.scenario.pieces.items():
         for key, value in (cfg.scenario.pieces.get(name) or {}).items():
-            number = isinstance(value, (int, float)) or key == "event_shape"
-            if node is not None and number and (name, key) not in OWN_SETTINGS:
+            # The shape of an entry follows the number of followers.
+            shared = isinstance(value, (int, float)) or key == "event_shape"
+            if node is not None and shared and (name, key) not in OWN_SETTINGS:
                 node[key] = value
 
 

@@ -217,7 +217,8 @@ def check_agent(cfg: DictConfig) -> None:
     analytic = find_target(cfg.agent[TARGET], "agent") is Analytic
     require(
         not analytic or has_car(cfg),
-        f"agent=analytic drives the one car of alcc and reference; variant {cfg.variant} has none",
+        f"agent=analytic drives the one car of alcc, reference and own_energy; variant "
+        f"{cfg.variant} has none",
     )
 
 
@@ -272,7 +273,8 @@ def check_sizes(cfg: DictConfig) -> None:
     pieces = cfg.scenario.pieces
     require(
         pieces.get("barrier") is None or has_car(cfg),
-        f"+filter=barrier belongs to a car of its own (alcc, reference, idm), not to {cfg.variant}",
+        f"+filter=barrier belongs to a car of its own (alcc, reference, own_energy, idm), "
+        f"not to {cfg.variant}",
     )
     measured = [name for name in MEASURED if "cav" in pieces and name not in pieces]
     require(not measured, f"scenario.pieces lacks {measured}, which the evaluation measures")

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl import results
 from lcc_rl.cli import main_guard, prepare_torch
-from lcc_rl.config import load, require
+from lcc_rl.config import load, require, short_name
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluate import trained
@@ -134,7 +134,7 @@ def table_of_agents(folder: Path) -> pd.DataFrame:
         row = {
             "run": str(path.parent.relative_to(folder)),
             "variant": first["strategy"],
-            "agent": str(first["agent._target_"]).rpartition(".")[2].lower(),
+            "agent": short_name(first["agent._target_"]),
             "seed": first["seed"],
             **{name: episodes[name].mean() for name in (ENERGY, UNSAFE, LONG)},
             "net_energy_kj": episodes["total_net_energy_kj"].mean(),

@@ -225,11 +225,15 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
     axes[0].set_ylim(len(names) - 0.4, -0.6)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
-    counts = sorted({int(seeds) for seeds in table["seeds"] if str(seeds).isdigit()})
-    seeds = f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
-    note = f"n = {seeds}; lines: 95 % interval; dashed: the study's limit"
+    note = f"n = {_how_many(table['seeds'])}; lines: 95 % interval; dashed: the study's limit"
     figure.supxlabel(note, fontsize=8, color=SOFT)
     return figure
+
+
+def _how_many(seeds: pd.Series) -> str:
+    """Write the numbers of seeds of a column, each once, leaving out what was not trained."""
+    counts = sorted({int(count) for count in seeds if str(count).isdigit()})
+    return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
 
 
 def _abreast(count: int, reach: float) -> np.ndarray:
@@ -252,8 +256,7 @@ def followers_figure(episodes: pd.DataFrame) -> Figure:
     names = list(dict.fromkeys(table["strategy"]))
     for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
         part = table[table["strategy"] == name]
-        seeds = sorted({int(count) for count in part["seeds"]})
-        label = f"{name}, {' or '.join(map(str, seeds))} {'seed' if seeds == [1] else 'seeds'}"
+        label = f"{name}, {_how_many(part['seeds'])}"
         places = part["followers"].to_numpy(float) + offset
         axis.plot(places, part[column], "o-", color=colour(name), label=label)
         _whiskers(axis, places, part, column, colour(name), upright=True)

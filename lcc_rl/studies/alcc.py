@@ -278,14 +278,15 @@ def _single(study: Study, wanted: DictConfig) -> list[Outcome]:
 
 
 def _followers(study: Study, wanted: DictConfig) -> list[Outcome]:
-    folder, numbers = study.folder / "followers", sorted(set(study.followers))
-    changes = {folder / str(n): followers_change(study, n) for n in numbers}
+    changes = {
+        study.folder / "followers" / str(number): followers_change(study, number)
+        for number in sorted(set(study.followers))
+    }
+    first, *others = changes
     # What the reference learns does not depend on how many drive behind it: it learns once.
-    shared = "reference"
-    for path in list(changes)[1:]:
-        others = tuple(name for name in changes[path].variants if name != shared)
-        changes[path] = replace(changes[path], variants=others)
-    return _each(followers_study(study), changes, folder / str(numbers[0]) / shared)
+    for folder in others:
+        changes[folder] = replace(changes[folder], variants=("alcc", CONTROL))
+    return _each(followers_study(study), changes, shared=first / "reference")
 
 
 def chooses_agent(overrides: Iterable[str]) -> bool:
@@ -332,13 +333,9 @@ def _each(
     """
     runs = [run for folder, change in changes.items() for run in study.runs(folder, change)]
     outcomes = run_all(runs, study.jobs, study.accept)
-    before = [x for folder, change in changes.items() for x in study.earlier(folder, change)]
+    found = outcomes + [x for item in changes.items() for x in study.earlier(*item)]
     for folder, change in changes.items():
-        of_it = [
-            outcome
-            for outcome in outcomes + before
-            if {folder, shared} & set(outcome.run.folder.parents)
-        ]
+        of_it = [x for x in found if {folder, shared} & set(x.run.folder.parents)]
         own = (*change.overrides, *change.evaluation)
         settings = study.settings("evaluate", "alcc", *own, recipes=change.recipes)
         evaluate_all(settings, of_it, folder / "evaluation")
