@@ -65,50 +65,60 @@ class Unrolled:
         self.plain = self._advance
         self.advance = torch.compile(self._advance) if compiled else self._advance
 
-    def start(self) -> State:
-        """Reset the environment and return the first moment of a batch of episodes."""
-        td = self.env.reset()
+    def start(self, given: TensorDictBase | None = None) -> State:
+        """Reset the environment, to given choices or drawn ones; return the first moment."""
+        td = self.env.reset(given)
         return {key: td.get(key) for key in sorted(self.carried)}
 
-    def _advance(self, network: Network, state: State) -> tuple[State, Tensor]:
+    def _advance(
+        self, network: Network, state: State, shift: Tensor | None = None
+    ) -> tuple[State, Tensor]:
         """Return the moment reached and the action taken."""
         action = network(state[OBSERVATION])
+        if shift is not None:
+            action = (action + shift).clamp(-1.0, 1.0)
         before = {**state, ACTION: action}
         reached: State = {SEED: state[SEED], STEP: state[STEP] + 1}
         for piece in self.steps:
             piece(before, reached)
         return {key: reached[key] for key in state}, action
 
-    def play(self, state: State, network: Network, steps: int) -> tuple[State, list[list[Tensor]]]:
+    def play(
+        self, state: State, network: Network, steps: int, shifts: Tensor | None = None
+    ) -> tuple[State, list[list[Tensor]]]:
         """Let a policy drive for some steps.
 
         Args:
             state: the moment to begin at.
             network: from observation ``[batch, observations]`` to action in [−1, 1].
             steps: how many.
+            shifts: added to the actions, which stay in [−1, 1], ``[steps, batch, 1]``.
 
         Returns:
             The last moment, and for each moment (``steps`` + 1) the :attr:`recorded` entries,
             those of the last one with action zero.
         """
         record = []
-        for _ in range(steps):
-            reached, action = self._attempt(network, state)
+        for step in range(steps):
+            shift = None if shifts is None else shifts[step]
+            reached, action = self._attempt(network, state, shift)
             record.append(self._entries(state, action))
             state = reached
         record.append(self._entries(state, torch.zeros_like(action)))
         return state, record
 
-    def _attempt(self, network: Network, state: State) -> tuple[State, Tensor]:
+    def _attempt(
+        self, network: Network, state: State, shift: Tensor | None
+    ) -> tuple[State, Tensor]:
         """Take a compiled step, or a plain one where there is no compiler."""
         if self.advance is self.plain:
-            return self.plain(network, state)
+            return self.plain(network, state, shift)
         try:
-            return self.advance(network, state)
+            return self.advance(network, state, shift)
         except COMPILER_ERRORS as error:
             log.info("not compiling the simulator: %s", str(error).strip().splitlines()[0])
             self.advance = self.plain
-            return self.plain(network, state)
+            return self.plain(network, state, shift)
 
     def assemble(self, record: Sequence[Sequence[Tensor]]) -> TensorDictBase:
         """Make the record of a play a rollout ``[batch, steps]`` and apply the remaining pieces."""

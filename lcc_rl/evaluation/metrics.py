@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.power import kinetic_energy
+from lcc_rl.functional.power import acceleration_loss, kinetic_energy, steady_power
 
 KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
@@ -27,13 +27,25 @@ def energy_measures(
 
     Returns:
         ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
-        that it did not draw) and ``distance_m``, each ``[*batch]``.
+        that it did not draw), what the speeds driven take without accelerating
+        (``steady_energy_kj``), what accelerating loses (``acceleration_loss_kj``, see
+        :func:`lcc_rl.functional.power.acceleration_loss`) and ``distance_m``, each ``[*batch]``.
     """
-    energy = (power * alive).sum(0) * time_step * KILO
+
+    def total(rate: Tensor) -> Tensor:
+        return (rate * alive).sum(0) * time_step
+
+    energy = total(power) * KILO
     last = speed.gather(0, alive.sum(0, keepdim=True).long()).squeeze(0)
     stored = (kinetic_energy(last) - kinetic_energy(speed[0])) * KILO
-    distance = (0.5 * (speed[:-1] + speed[1:]) * alive).sum(0) * time_step
-    return {"energy_kj": energy, "net_energy_kj": energy - stored, "distance_m": distance}
+    acceleration = speed.diff(dim=0) / time_step
+    return {
+        "energy_kj": energy,
+        "net_energy_kj": energy - stored,
+        "steady_energy_kj": total(steady_power(speed[:-1])) * KILO,
+        "acceleration_loss_kj": total(acceleration_loss(speed[:-1], acceleration)) * KILO,
+        "distance_m": total(0.5 * (speed[:-1] + speed[1:])),
+    }
 
 
 def safety_measures(

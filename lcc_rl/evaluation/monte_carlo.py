@@ -190,7 +190,7 @@ def measure(series: Series, alive: Tensor, time_step: float) -> pd.DataFrame:
     if ("cav", "gap") in series:
         own = {entry: series["cav", entry] for entry in ("gap", "ttc", "time_gap", "jerk")}
         columns |= safety_measures(own, alive, time_step)
-        for key in ("energy_kj", "net_energy_kj"):
+        for key in ("energy_kj", "net_energy_kj", "steady_energy_kj", "acceleration_loss_kj"):
             columns[f"total_{key}"] = columns[f"cav_{key}"] + columns[f"hdv_{key}"]
     gap = series["hdv", "gap"].amin(-2)
     columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -60,6 +61,30 @@ def motor_power(speed: Tensor, acceleration: Tensor, recuperation: bool = True) 
     quadratic = p02 + speed * p12
     result = constant + acceleration * (linear + acceleration * quadratic)
     return result if recuperation else result.clamp(min=0.0)
+
+
+def steady_power(speed: Tensor) -> Tensor:
+    """Power at a constant speed [W], same shape: A2 without acceleration."""
+    return motor_power(speed, torch.zeros_like(speed))
+
+
+def acceleration_loss(speed: Tensor, acceleration: Tensor) -> Tensor:
+    """Power that accelerating and braking lose for good, the part of A2 with a².
+
+    Over a trip A2 is a sum of three: the :func:`steady_power` of the speeds driven, what the last
+    speed stores more than the first (the part with a, the derivative of a function of the speed,
+    which braking returns), and this. Of the three only this is left to a controller that follows
+    the same leader over the same distance.
+
+    Args:
+        speed: speed at the start of the step, any shape [m/s].
+        acceleration: executed acceleration, same shape [m/s²].
+
+    Returns:
+        Power [W], same shape, at least zero.
+    """
+    (_, _, p02), (_, _, p12), _, _ = POWER_COEFFICIENTS
+    return (p02 + p12 * speed) * acceleration * acceleration
 
 
 def kinetic_energy(speed: Tensor, vehicle: Vehicle = PAPER_VEHICLE) -> Tensor:

@@ -12,6 +12,7 @@ from lcc_rl.results.intervals import Estimate, mean, share_saved
 from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
 
 KINDS = {"": "energy_kj", "net_": "net_energy_kj"}  # raw; net of the change in kinetic energy
+PARTS = ("steady_energy_kj", "acceleration_loss_kj")  # studies of earlier releases lack them
 PAPER, OURS = "paper", "this study"
 BASELINES = ("idm", "reference", "own_energy")
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
@@ -33,7 +34,8 @@ def energies(episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         One row per strategy: seeds, energy of the CAV, the HDV and both [kJ], the latter also net
-        of the change in kinetic energy; totals with 95 % bootstrap intervals over seeds.
+        of the change in kinetic energy, with 95 % bootstrap intervals over seeds; what the speeds
+        driven take without accelerating, and what accelerating loses.
     """
     rows = []
     for strategy in dict.fromkeys(episodes["strategy"]):
@@ -43,7 +45,8 @@ def energies(episodes: pd.DataFrame) -> pd.DataFrame:
         for kind, column in KINDS.items():
             energy = part.groupby("training_seed", dropna=False)[f"total_{column}"].mean()
             row |= mean(energy).columns(f"total_{kind}energy_kj")
-        rows.append(row)
+        parts = [f"total_{name}" for name in PARTS if f"total_{name}" in part]
+        rows.append(row | part[parts].mean().to_dict())
     return pd.DataFrame(rows)
 
 

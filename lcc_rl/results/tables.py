@@ -13,10 +13,12 @@ from rich.table import Table
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
+LOST = "total_acceleration_loss_kj"  # tables of earlier releases lack it
 HUMANS = ("direct", "idm")  # nothing was trained: one value, known exactly
 
 CAR_COLUMNS = (
     *(f"{v}_{kind}" for v in ("cav", "total") for kind in ("energy_kj", "net_energy_kj")),
+    LOST,
     "cav_distance_m",
     "min_ttc_s",
     "share_ttc_unsafe",
@@ -55,7 +57,8 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of one or more evaluations on the same profiles and drivers.
 
     Returns:
-        One row per strategy: mean energies (raw, net of kinetic energy, per kilometre), saving
+        One row per strategy: mean energies (raw, net of kinetic energy, lost to accelerating, per
+        kilometre), saving
         against the human baseline ``idm`` and against ``reference``, share of drivers worse off
         than with each, and the safety measures. Savings are positive where energy is saved;
         entries that do not exist for a strategy are missing.
@@ -70,6 +73,7 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = group[f"{vehicle}_{kind}"].mean()
+        row[LOST] = group[LOST].mean()
         kilometres = (group["cav_distance_m"].fillna(0) + group["hdv_distance_m"]).sum() / 1e3
         energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
         row["kj_per_km"] = energy.sum() / kilometres
@@ -109,6 +113,7 @@ ROWS = (
     ("HDV energy [kJ]", "hdv_energy_kj", "{:.1f}"),
     ("total energy [kJ]", "total_energy_kj", "{:.1f}"),
     ("  net of kinetic energy [kJ]", "total_net_energy_kj", "{:.1f}"),
+    ("  of it lost to accelerating [kJ]", LOST, "{:.1f}"),
     ("  per vehicle-kilometre [kJ/km]", "kj_per_km", "{:.0f}"),
     ("saving against idm", "saving_vs_idm", "{:+.1%}"),
     ("  net of kinetic energy", "net_saving_vs_idm", "{:+.1%}"),

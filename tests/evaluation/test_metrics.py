@@ -17,6 +17,10 @@ def test_energy_counts_only_the_running_steps() -> None:
     torch.testing.assert_close(measures["net_energy_kj"], torch.tensor([0.4, 0.2]) - 22.5522)
     # (10.5 + 11.5)·0.1 = 2.2 m; 11·0.1 = 1.1 m.
     torch.testing.assert_close(measures["distance_m"], torch.tensor([2.2, 1.1]))
+    # (2911 + 25.19 v)·a² at 10 and 11 m/s with 10 m/s²; the second with 20 m/s² at 10 m/s.
+    first = ((2911 + 251.9) * 100 + (2911 + 277.09) * 100) * 0.1 / 1e3
+    second = (2911 + 251.9) * 400 * 0.1 / 1e3
+    torch.testing.assert_close(measures["acceleration_loss_kj"], torch.tensor([first, second]))
 
 
 def test_safety() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 import torch
 from helpers import POPULATION, compose, wavy_profiles
@@ -18,7 +20,7 @@ from lcc_rl.functional.idm import (
     idm_acceleration,
     simulate_follower,
 )
-from lcc_rl.functional.power import traction_force
+from lcc_rl.functional.power import motor_power, traction_force
 
 QUICK = settings(
     max_examples=5, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
@@ -125,6 +127,23 @@ def test_net_energy_of_the_traction_force_is_the_work_of_the_resistances(speeds)
     resistance = traction_force(middle, torch.zeros_like(middle)) * middle
     work = float(resistance.sum()) * STEP / 1e3
     assert measures["net_energy_kj"].item() == pytest.approx(work, rel=1e-9, abs=1e-9)
+
+
+@QUICK
+@given(st.lists(st.floats(0.5, 30.0), min_size=3, max_size=40))
+def test_energy_is_steady_driving_and_loss_and_what_the_last_speed_stores(speeds) -> None:
+    """A2's account: the part with a is the derivative of a function of the speed alone."""
+    fine = 1e-3  # [s]; the parts add up in the limit of short steps
+    ramp = [torch.linspace(a, b, 2001, dtype=torch.float64)[:-1] for a, b in pairwise(speeds)]
+    speed = torch.cat([*ramp, torch.tensor(speeds[-1:], dtype=torch.float64)]).view(-1, 1, 1)
+    power = motor_power(speed[:-1], speed.diff(dim=0) / fine)
+    alive = torch.ones(len(speed) - 1, 1, 1, dtype=torch.bool)
+    found = {k: v.item() for k, v in energy_measures(power, speed, alive, fine).items()}
+    first, last = speeds[0], speeds[-1]
+    stored = 1213 * (last - first) + 2484 / 2 * (last**2 - first**2)
+    stored += 1.374 / 3 * (last**3 - first**3)
+    parts = found["steady_energy_kj"] + found["acceleration_loss_kj"] + stored / 1e3
+    assert found["energy_kj"] == pytest.approx(parts, rel=1e-2, abs=0.1)
 
 
 def slopes(speed, time_gap, constants: IDMConstants):

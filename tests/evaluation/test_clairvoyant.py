@@ -1,0 +1,112 @@
+"""Knowing everything must pay, and not at the price of the limits."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION, compose, wavy_profiles
+from tensordict import TensorDict
+
+from lcc_rl.evaluate import trained
+from lcc_rl.evaluation.clairvoyant import clairvoyant, misses, path_energy
+from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
+from lcc_rl.results.runs import load_policy
+
+STEPS = 60
+BOTH = ["total_steady_energy_kj", "total_acceleration_loss_kj"]
+
+
+class Given:
+    """As much of a study's inputs as a strategy needs."""
+
+    population = POPULATION
+
+
+def learned() -> Strategy:
+    cfg = compose("alcc", f"scenario.horizon={STEPS}")
+    return trained(cfg, "pretrained", load_policy("pretrained", "alcc"), Given())  # type: ignore[arg-type]
+
+
+def played(strategy: Strategy) -> pd.DataFrame:
+    return evaluate(strategy, wavy_profiles(2), POPULATION, 2, 10_000, seed=1)[0]
+
+
+def test_who_knows_the_profile_saves() -> None:
+    start, told = learned(), []
+    best = clairvoyant(
+        start,
+        wavy_profiles(2),
+        POPULATION,
+        drivers=2,
+        seed=1,
+        iterations=30,
+        compiled=False,
+        report=lambda iteration, values: told.append((iteration, values["kJ"], values["missed"])),
+    )
+    before, after = played(start), played(best)
+    assert after["strategy"].unique().tolist() == ["clairvoyant"]
+    saved = 1.0 - after[BOTH].to_numpy().sum() / before[BOTH].to_numpy().sum()
+    assert saved > 0.01
+    assert after["share_time_gap_long"].mean() <= before["share_time_gap_long"].mean()
+    assert after["share_ttc_unsafe"].mean() <= before["share_ttc_unsafe"].mean()
+    # What was minimised is what is measured: the plan was evaluated as it was made.
+    assert [number for number, *_ in told] == list(range(1, 31))
+    assert told[0][1] == pytest.approx(before[BOTH].sum(axis=1).mean(), rel=1e-4)
+    assert told[-1][1] == pytest.approx(after[BOTH].sum(axis=1).mean(), rel=0.01)
+
+
+def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
+    """One episode of one step, the car as given and a driver at rest behind it."""
+
+    def number(value: float) -> torch.Tensor:
+        return torch.full((1, 1, 1), value)
+
+    time_gap = gap / max(speed, 1.0)
+    cav = {"gap": gap, "relative_speed": relative_speed, "time_gap": time_gap, "speed": speed}
+    entries = {key: number(value) for key, value in cav.items()}
+    hdv = {"speed": torch.zeros(1, 1, 1, 1)}
+    one = {"cav": entries, "hdv": hdv}
+    return TensorDict({**one, "next": one}, batch_size=[1, 1])
+
+
+@pytest.mark.parametrize(
+    ("gap", "relative_speed", "speed", "missed"),
+    [
+        (10.0, 0.0, 5.0, 0.0),
+        (10.0, -2.0, 5.0, 0.0),  # 5 s to collision
+        (10.0, -3.0, 5.0, (2.12 + 0.3 * 2.12**2)),  # 4.04·3 − 10
+        (15.0, 0.0, 5.0, 15.0 - 12.5 / 1.01 + 0.3 * (15.0 - 12.5 / 1.01) ** 2),
+        (0.3, 0.0, 5.0, 2.0),  # 10·(0.5 − 0.3)
+    ],
+)
+def test_misses(gap, relative_speed, speed, missed) -> None:
+    assert float(misses(moment(gap, relative_speed, speed))) == pytest.approx(missed, abs=1e-4)
+
+
+def test_path_energy_at_constant_speed() -> None:
+    # 0.1 s of A2 at 5 and 0 m/s, without acceleration.
+    watts = 110.3 + 422.9 * 5 - 0.0279 * 25 + 0.3557 * 125 + 110.3
+    assert float(path_energy(moment(10.0, 0.0, 5.0), 0.1)) == pytest.approx(watts * 1e-4)
+
+
+def test_the_command(tmp_path, capsys) -> None:
+    path = Path(__file__).parents[2] / "tools" / "clairvoyant.py"
+    spec = importlib.util.spec_from_file_location("clairvoyant_tool", path)
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    short = ["scenario.horizon=30", "evaluation.profiles=1", "evaluation.drivers=2"]
+    own = ["--iterations", "2", "--no-compile", "--out", str(tmp_path)]
+    assert tool.main([*own, *short]) == 0
+    assert "clairvoyant" in capsys.readouterr().out
+    rows = pd.read_parquet(tmp_path / "episodes.parquet")
+    assert rows["strategy"].value_counts().to_dict() == {"idm": 2, "alcc": 2, "clairvoyant": 2}
+    with pytest.raises(SystemExit) as stop:
+        tool.main_guard(tool.main)(["--iterations", "0", "--out", str(tmp_path / "none")])
+    assert stop.value.code == 2
+    assert "iterations must be at least 1, got 0" in capsys.readouterr().err

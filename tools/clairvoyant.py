@@ -1,0 +1,83 @@
+"""How much could be saved at all: the best drive for somebody who knows the whole profile.
+
+    python tools/clairvoyant.py data=ngsim data.path=...          # beside idm and the policy
+    python tools/clairvoyant.py --policy outputs/train/<run> --iterations 100 evaluation.drivers=3
+
+Plans every held-out episode by the gradient through the simulator, beginning with a learned
+policy's drive, and evaluates the plan as any other strategy. Whatever is no option is an
+override, as of lcc_rl.evaluate; by default 12 drivers stand behind each of 20 profiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+import pandas as pd
+from rich.console import Console
+
+from lcc_rl.cli import main_guard, prepare_torch
+from lcc_rl.config import load, require
+from lcc_rl.envs.factory import load_inputs
+from lcc_rl.evaluate import baseline, trained
+from lcc_rl.evaluation.clairvoyant import clairvoyant
+from lcc_rl.evaluation.monte_carlo import evaluate
+from lcc_rl.progress import ProgressReporter
+from lcc_rl.results.files import write_parquet
+from lcc_rl.results.runs import load_policy
+from lcc_rl.results.tables import as_rich, summary
+from lcc_rl.studies.runner import check_overrides
+
+DRIVERS = 12
+
+
+def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
+    """Return the episodes of a human, the policy and the clairvoyant, and write them."""
+    own = ["variant=alcc", f"evaluation.drivers={DRIVERS}"]
+    cfg = load("evaluate", [*own, *overrides])
+    require(cfg.device == "cpu", "tools/clairvoyant.py runs on device=cpu")
+    prepare_torch(cfg)
+    inputs, size = load_inputs(cfg), cfg.evaluation
+    policy = load_policy(options.policy, cfg.variant, tuple(cfg.trust))
+    learned = trained(cfg, options.policy, policy, inputs)
+    with ProgressReporter("clairvoyant", options.iterations, folder=options.out) as progress:
+        best = clairvoyant(
+            learned,
+            inputs.evaluation,
+            inputs.population,
+            size.drivers,
+            size.seed,
+            options.iterations,
+            not options.no_compile,
+            progress.update,
+        )
+    batch = len(inputs.evaluation) * len(inputs.population.time_gap)
+    rows = [
+        evaluate(strategy, inputs.evaluation, inputs.population, size.drivers, batch, size.seed)[0]
+        for strategy in (baseline(cfg, "idm", inputs), learned, best)
+    ]
+    episodes = pd.concat(rows, ignore_index=True)
+    write_parquet(episodes, options.out / "episodes.parquet")
+    return episodes
+
+
+def main(arguments: list[str]) -> int:
+    """Plan and print the table."""
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser.add_argument("--policy", default="pretrained", help="where a plan begins")
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--no-compile", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
+    options, overrides = parser.parse_known_args(arguments)
+    check_overrides(overrides)
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    table = summary(plan(options, overrides))
+    Console().print(as_rich(table, "the whole profile known"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_guard(main)(sys.argv[1:]))
