@@ -12,7 +12,7 @@ from torchrl.data import Unbounded
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.safety import time_gap, time_to_collision
-from lcc_rl.pieces.base import Feature, Transition, following
+from lcc_rl.pieces.base import Feature, Transition, as_tuple, following
 
 
 class TimeToCollision(Feature):
@@ -96,10 +96,13 @@ class Observation(Feature):
         strings: namespaces of strings of followers.
         widths: for namespaces whose entries are wider than one number their width, or a list as
             long as they are wide, e.g. the horizons of a preview.
+        relative_to: for namespaces whose entries are seen as differences, from what, dotted:
+            ``{"preview": "leader.speed"}``, or one for each of as many equal parts. What matters
+            is then not hidden in a small difference of large numbers.
         name: entry written.
 
     Raises:
-        ConfigError: if there is no entry or a scale is zero.
+        ConfigError: if there is no entry, a scale is zero or a difference is that of no entry.
     """
 
     constants: Tensor
@@ -110,6 +113,7 @@ class Observation(Feature):
         visible: int = 1,
         strings: Sequence[str] = ("hdv",),
         widths: Mapping[str, int | Sequence[float]] | None = None,
+        relative_to: Mapping[str, str | Sequence[str]] | None = None,
         name: str = "observation",
     ) -> None:
         flat = {(space, key): x for space, keys in scales.items() for key, x in keys.items()}
@@ -122,7 +126,11 @@ class Observation(Feature):
             for space, width in (widths or {}).items()
         }
         counts = [visible if space in strings else wide.get(space, 1) for space, _ in flat]
-        super().__init__(list(flat), [name], (sum(counts),))
+        bases = _bases(relative_to or {}, flat, counts, strings)
+        reads = list(dict.fromkeys([*flat, *(key for keys in bases for key in keys)]))
+        super().__init__(reads, [name], (sum(counts),))
+        self.bases = [[reads.index(key) for key in keys] for keys in bases]
+        self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
         self.name, self.visible = name, visible
         self.strings = [space in strings for space, _ in flat]
         values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]
@@ -132,10 +140,37 @@ class Observation(Feature):
         """Return the scaled observation, shape ``[*batch, entries]``."""
         seen = [
             entry[..., : self.visible, 0] if string else entry
-            for entry, string in zip(entries, self.strings, strict=True)
+            for entry, string in zip(entries, self.strings, strict=False)
         ]
-        return torch.cat(seen, dim=-1) * self.constants
+        for place, (bases, repeat) in enumerate(zip(self.bases, self.repeats, strict=True)):
+            if bases:
+                base = torch.cat([entries[i] for i in bases], -1)
+                seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
+        return torch.cat(seen[: len(self.bases)], dim=-1) * self.constants
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
         shape = (*batch, *self.event_shape)
         return {(self.name,): Unbounded(shape=shape, device=device)}
+
+
+def _bases(
+    relative_to: Mapping[str, str | Sequence[str]],
+    flat: Mapping[tuple[str, str], float],
+    counts: Sequence[int],
+    strings: Sequence[str],
+) -> list[list[tuple[str, ...]]]:
+    """Return what is subtracted from each entry, in equal parts; nothing from most."""
+    for space in relative_to:
+        if space in strings or space not in {namespace for namespace, _ in flat}:
+            where = f"observation.relative_to.{space}"
+            raise ConfigError(f"{where}: expected a namespace of observation.scales, no string")
+    found = []
+    for (space, _), count in zip(flat, counts, strict=True):
+        given = relative_to.get(space, ())
+        keys = [as_tuple(key) for key in ([given] if isinstance(given, str) else given)]
+        if keys and count % len(keys):
+            raise ConfigError(
+                f"observation.relative_to.{space}: {len(keys)} entries do not divide its {count}"
+            )
+        found.append(keys)
+    return found

@@ -10,7 +10,7 @@ from helpers import POPULATION, compose, small_env, wavy_profiles
 
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.pieces import LeaderPreview, ObservationMemory
+from lcc_rl.pieces import LeaderPreview, Observation, ObservationMemory
 
 FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1")
 
@@ -25,8 +25,19 @@ def test_preview_is_what_the_leader_will_do() -> None:
     seen, leader = data["preview", "speed"][0], data["leader", "speed"][0, :, 0]
     assert torch.equal(seen[:, 0], leader)
     assert torch.equal(seen[:-5, 1], leader[5:])
-    # It is part of the observation, scaled.
-    assert torch.allclose(data["observation"][0, :, -2:], 0.1 * seen)
+    # It is part of the observation: the difference from the present, scaled.
+    difference = seen - leader.unsqueeze(-1)
+    assert torch.allclose(data["observation"][0, :, -2:], 0.5 * difference)
+
+
+def test_differences_are_taken_in_equal_parts() -> None:
+    two = ["scenario.pieces.memory.sources=[leader.speed,cav.gap]", "observation.widths.memory=4"]
+    memory = ["+knowledge=memory", "scenario.pieces.memory.seconds=[1.0,2.0]", *two]
+    data = played(*memory)
+    present = torch.cat([data["leader", "speed"], data["cav", "gap"]], -1)
+    difference = data["memory", "entries"] - present.repeat_interleave(2, -1)
+    assert torch.allclose(data["observation"][..., -4:], 0.5 * difference, atol=1e-5)
+    assert difference.abs().max() > 0.1
 
 
 def test_a_delayed_preview_is_an_older_one() -> None:
@@ -101,6 +112,15 @@ def test_every_agent_can_use_it(agent, knowledge, variant) -> None:
         (lambda: ObservationMemory(0.1, kind="remembered"), "remembered"),
         (lambda: ObservationMemory(0.1, seconds=[0.0]), "shorter than a step"),
         (lambda: ObservationMemory(0.1, sources=[]), "sources"),
+        (lambda: Observation({"cav": {"speed": 1}}, relative_to={"hdv": "cav.speed"}), "to.hdv"),
+        (
+            lambda: Observation(
+                {"memory": {"entries": 1}},
+                widths={"memory": 3},
+                relative_to={"memory": ["cav.gap", "cav.speed"]},
+            ),
+            "2 entries do not divide its 3",
+        ),
     ],
 )
 def test_impossible_settings(make, words) -> None:
