@@ -31,7 +31,7 @@ from lcc_rl.pipeline import root_key
 from lcc_rl.results.drawing import new_figure, save
 from lcc_rl.results.files import read_parquet, write_parquet
 from lcc_rl.results.runs import load_policy
-from lcc_rl.results.study_figures import colour, style
+from lcc_rl.results.study_figures import style
 from lcc_rl.studies.runner import FINISHED, Run, check_overrides, run_all
 from lcc_rl.sweeps import key_of
 from lcc_rl.train import POLICIES
@@ -39,10 +39,14 @@ from lcc_rl.train import POLICIES
 log = logging.getLogger("lcc_rl")
 
 AGENTS = ("analytic", "ddpg", "td3", "sac")
-PREVIEWS = (1.0, 2.0, 5.0, 10.0)  # [s]; five speeds, evenly spread up to there
-EPISODES, KEPT = "episodes.parquet", "kept.parquet"
+PREVIEWS = (1.0, 2.0, 5.0, 10.0)  # [s]; ten speeds, evenly spread up to there
+KNOWN = ("none", "memory", *(f"preview_{seconds:g}s" for seconds in PREVIEWS))
+EPISODES, KEPT, FILTERED = "episodes.parquet", "kept.parquet", "filtered.parquet"
+POLICY = "policy.pt"
 HUES = {"analytic": "#0072b2", "ddpg": "#d55e00", "td3": "#009e73", "sac": "#cc79a7"}
 ENERGY, UNSAFE, LONG = "total_energy_kj", "share_ttc_unsafe", "share_time_gap_long"
+LOST = "total_acceleration_loss_kj"
+MEANS = (ENERGY, LOST, UNSAFE, LONG)
 
 
 def runs_of_agents(options: argparse.Namespace) -> list[Run]:
@@ -60,13 +64,13 @@ def runs_of_agents(options: argparse.Namespace) -> list[Run]:
 
 
 def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
-    """Return a training without, with memory and with previews of several lengths, per seed."""
+    """Return trainings without, with memory and with previews of several lengths, and idm."""
     kinds: dict[str, list[str]] = {"none": [], "memory": ["+knowledge=memory"]}
     for seconds in PREVIEWS:
-        ahead = ",".join(f"{seconds * part / 5:g}" for part in range(1, 6))
+        ahead = ",".join(f"{seconds * part / 10:g}" for part in range(1, 11))
         horizons = f"scenario.pieces.preview.horizons=[{ahead}]"
         kinds[f"preview_{seconds:g}s"] = ["+knowledge=preview", horizons]
-    return [
+    runs = [
         Run(
             options.out / kind / f"seed_{seed}",
             (f"agent={options.agent}", f"seed={seed}", *changes, *options.overrides),
@@ -74,6 +78,7 @@ def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
         for kind, changes in kinds.items()
         for seed in range(options.seeds)
     ]
+    return [*runs, Run(options.out / "idm", ("variant=idm", *data_overrides(options.overrides)))]
 
 
 def data_overrides(overrides: Iterable[str]) -> list[str]:
@@ -87,31 +92,56 @@ def data_overrides(overrides: Iterable[str]) -> list[str]:
 
 def evaluate_kept(options: argparse.Namespace) -> None:
     """Evaluate the policies that each finished training kept on its way: kept.parquet beside."""
-    folders = [path.parent for path in sorted(options.out.rglob(EPISODES))]
-    kept = {folder: sorted((folder / POLICIES).glob("*.pt")) for folder in folders}
+    kept = {folder: sorted((folder / POLICIES).glob("*.pt")) for folder in finished(options.out)}
     todo = {folder: paths for folder, paths in kept.items() if paths and outdated(folder, paths)}
-    if not todo:
-        return
-    cfg = load("evaluate", data_overrides(options.overrides))
-    prepare_torch(cfg)
-    inputs, size, trust = load_inputs(cfg), cfg.evaluation, tuple(cfg.trust)
+    judge = evaluator(options.overrides) if todo else None
     for folder, paths in todo.items():
         log.info("%s: evaluating the policies kept on the way", folder)
-        rows = []
-        for path in paths:
-            strategy = trained(cfg, str(path), load_policy(path, trust=trust), inputs)
-            episodes, _ = evaluate(
-                strategy,
-                inputs.evaluation,
-                inputs.population,
-                size.drivers,
-                size.batch_size,
-                size.seed,
-                device=cfg.device,
-            )
-            means = episodes[[ENERGY, UNSAFE, LONG, "collided"]].mean().to_dict()
-            rows.append({"iteration": float(path.stem), **means})
+        assert judge is not None
+        rows = [{"iteration": float(path.stem), **judge(path)} for path in paths]
         write_parquet(pd.DataFrame(rows), folder / KEPT)
+
+
+def evaluate_filtered(options: argparse.Namespace) -> None:
+    """Evaluate what was trained behind the filter: filtered.parquet beside."""
+    todo = [
+        folder
+        for folder in finished(options.out)
+        if (folder / POLICY).exists()
+        and not ((folder / FILTERED).exists() and newer(folder / FILTERED, folder / POLICY))
+    ]
+    judge = evaluator([*options.overrides, "+filter=barrier"]) if todo else None
+    for folder in todo:
+        log.info("%s: evaluating the policy behind the filter", folder)
+        assert judge is not None
+        write_parquet(pd.DataFrame([judge(folder)]), folder / FILTERED)
+
+
+def finished(folder: Path) -> list[Path]:
+    """Return the folders of all runs below that were evaluated."""
+    return [path.parent for path in sorted(folder.rglob(EPISODES))]
+
+
+def newer(path: Path, than: Path) -> bool:
+    """Whether a file was written after another one."""
+    return path.stat().st_mtime >= than.stat().st_mtime
+
+
+def evaluator(overrides: Iterable[str]) -> Callable[[Path], dict[str, float]]:
+    """Return what evaluates a policy's file or folder on the held-out profiles, to its means."""
+    overrides = list(overrides)
+    filtered = [item for item in overrides if item == "+filter=barrier"]
+    cfg = load("evaluate", [*data_overrides(overrides), *filtered])
+    prepare_torch(cfg)
+    inputs, size, trust = load_inputs(cfg), cfg.evaluation, tuple(cfg.trust)
+
+    def judge(path: Path) -> dict[str, float]:
+        strategy = trained(cfg, str(path), load_policy(path, trust=trust), inputs)
+        who = (inputs.evaluation, inputs.population, size.drivers, size.batch_size, size.seed)
+        episodes, _ = evaluate(strategy, *who, device=cfg.device)
+        return {name: float(episodes[name].mean()) for name in (*MEANS, "collided")}
+
+    return judge
 
 
 def outdated(folder: Path, policies: list[Path]) -> bool:
@@ -136,7 +166,7 @@ def table_of_agents(folder: Path) -> pd.DataFrame:
             "variant": first["strategy"],
             "agent": short_name(first["agent._target_"]),
             "seed": first["seed"],
-            **{name: episodes[name].mean() for name in (ENERGY, UNSAFE, LONG)},
+            **{name: episodes[name].mean() for name in MEANS if name in episodes},
             "net_energy_kj": episodes["total_net_energy_kj"].mean(),
             "collisions": int(episodes["collided"].sum()),
             "episodes": len(episodes),
@@ -202,29 +232,63 @@ def course(folder: Path) -> pd.DataFrame:
 
 
 def table_of_knowledge(folder: Path) -> pd.DataFrame:
-    """Return one row per kind of knowledge: what it is worth.
+    """Return one row per kind of knowledge: what it is worth, without and behind the filter.
 
     Raises:
         ResultsError: if no training is finished.
     """
     runs = table_of_agents(folder)
-    runs["knowledge"] = [Path(run).parent.name for run in runs["run"]]
+    runs["knowledge"] = [knowledge_of(run) for run in runs["run"]]
+    filtered = [folder / run / FILTERED for run in runs["run"]]
+    behind = pd.concat([read_parquet(p) if p.exists() else pd.DataFrame([{}]) for p in filtered])
+    behind = behind.reset_index(drop=True).reindex(columns=[*MEANS, "collided"])
+    runs = runs.join(behind.add_prefix("filtered_"))
     grouped = runs.groupby("knowledge")
-    table = grouped[[ENERGY, "net_energy_kj", UNSAFE, LONG, "collisions"]].mean()
+    numbers = [name for name in MEANS if name in runs]
+    table = grouped[[*numbers, "net_energy_kj", "collisions"]].mean()
+    table = table.join(grouped[[f"filtered_{name}" for name in MEANS]].mean())
     table["energy_sd"], table["seeds"] = grouped[ENERGY].std(), grouped.size()
-    if "none" in table.index:
-        table["saving"] = 1.0 - table[ENERGY] / float(grouped[ENERGY].mean()["none"])
+    for base in ("none", "idm"):
+        if base in table.index:
+            for prefix in ("", "filtered_"):
+                own = f"{prefix}{ENERGY}"
+                compared = float(table[ENERGY if base == "idm" else own][base])
+                table[f"{prefix}saving_vs_{base}"] = 1.0 - table[own] / compared
     return table.reset_index()
 
 
+def knowledge_of(run: str) -> str:
+    """Return what the car of a run knows; a run is ``<knowledge>/seed_<n>`` or ``idm``."""
+    return Path(run).parts[0]
+
+
 def figure_of_knowledge(folder: Path) -> Figure:
-    """Total energy against what the car knows."""
-    table = table_of_knowledge(folder).sort_values(ENERGY, ascending=False)
-    figure = new_figure(6.5, 3.6)
-    axis = figure.subplots()
-    error = table["energy_sd"].fillna(0.0)
-    axis.errorbar(table["knowledge"], table[ENERGY], error, fmt="o", color=colour("alcc"))
-    style(axis, "what the car knows besides the present", "total energy [kJ per episode]")
+    """Savings and limits against what the car knows; a point per training, a line of means."""
+    table = table_of_knowledge(folder).set_index("knowledge")
+    kinds = [kind for kind in KNOWN if kind in table.index]
+    human = float(table[ENERGY]["idm"]) if "idm" in table.index else float("nan")
+    runs = table_of_agents(folder)
+    learned = table.loc[kinds]
+    figure = new_figure(7.0, 5.2)
+    axes = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    looks = {"": ("#0072b2", "as trained"), "filtered_": ("#d55e00", "behind the filter")}
+    for prefix, (hue, label) in looks.items():
+        look = {"color": hue, "marker": "o", "lw": 1.2}
+        saving = 100.0 * (1.0 - learned[f"{prefix}{ENERGY}"] / human)
+        axes[0].plot(kinds, saving, label=label, **look)
+        axes[1].plot(kinds, 100.0 * learned[f"{prefix}{LONG}"], **look)
+    axes[1].plot(kinds, 100.0 * learned[UNSAFE], color="#0072b2", marker="o", lw=1.2, ls=":")
+    for run in runs[runs["run"] != "idm"].to_dict("records"):
+        if (kind := knowledge_of(run["run"])) in kinds:
+            saving = 100.0 * (1.0 - run[ENERGY] / human)
+            axes[0].plot([kind], [saving], marker=".", color="#0072b2", alpha=0.5, ls="")
+    axes[0].set_ylim(bottom=0.0)
+    axes[1].set_ylim(bottom=0.0)
+    style(axes[0], "", "energy saved against\na human driver [%]")
+    style(axes[1], "what the car knows besides the present", "share of time [%]")
+    axes[0].legend(frameon=False, loc="lower right")
+    words = "lower panel: solid, time gap > 2.5 s; dotted, TTC < 4 s as trained"
+    figure.supxlabel(words, fontsize=8)
     return figure
 
 
@@ -250,6 +314,8 @@ def perform(part: str, options: argparse.Namespace) -> int:
             log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
         failed = int(bool(wrong))
         evaluate_kept(options)
+        if part == "knowledge":
+            evaluate_filtered(options)
     table = tabulate(options.out)
     write_parquet(table, options.out / f"{part}.parquet")
     save(draw(options.out), options.out / f"{part}.png")

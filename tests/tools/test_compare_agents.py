@@ -86,8 +86,30 @@ def test_what_knowledge_is_worth(tmp_path) -> None:
     fabricate(tmp_path / "preview_5s" / "seed_0", "alcc", 90.0, "agent=analytic")
     assert tool.main(["knowledge", "--draw", "--out", str(tmp_path)]) == 0
     table = read_parquet(tmp_path / "knowledge.parquet").set_index("knowledge")
-    assert table.loc["preview_5s", "saving"] == pytest.approx(0.1)
+    assert table.loc["preview_5s", "saving_vs_none"] == pytest.approx(0.1)
+    assert table["filtered_total_energy_kj"].isna().all()
     assert (tmp_path / "knowledge.png").stat().st_size > 1000
+
+
+def test_policies_are_put_behind_the_filter_once(tmp_path, monkeypatch) -> None:
+    data = ["data.platoons=4", "data.recordings=2", "scenario.horizon=40", "experiment=smoke"]
+    small = ["agent.batch_size=64", "agent.hidden=[16,16]"]
+    folder = tmp_path / "none" / "seed_0"
+    train.run(load("train", [*data, *small]), folder, quiet=True)
+    fabricate(tmp_path / "idm", "idm", 120.0)
+    options = argparse.Namespace(out=tmp_path, overrides=[*data, *small])
+    tool.evaluate_filtered(options)
+    behind = read_parquet(folder / "filtered.parquet")
+    assert behind["share_ttc_unsafe"].tolist() == [0.0]
+    assert behind["total_energy_kj"].notna().all()
+    assert not (tmp_path / "idm" / "filtered.parquet").exists()
+    monkeypatch.setattr(tool, "load_policy", None)  # nothing is read again
+    tool.evaluate_filtered(options)
+    assert tool.main(["knowledge", "--draw", "--out", str(tmp_path)]) == 0
+    table = read_parquet(tmp_path / "knowledge.parquet").set_index("knowledge")
+    own = table.loc["none", "filtered_total_energy_kj"]
+    assert own == behind["total_energy_kj"].item()
+    assert table.loc["none", "filtered_saving_vs_idm"] == pytest.approx(1 - own / 120.0)
 
 
 @pytest.mark.parametrize("part", ["agents", "knowledge"])
@@ -96,7 +118,7 @@ def test_every_run_it_would_start_composes(part, tmp_path) -> None:
     options, overrides = tool.parser().parse_known_args(words)
     options.overrides = overrides
     runs = tool.PARTS[part][0](options)
-    assert len(runs) == {"agents": 4 * 2 + 1, "knowledge": 6}[part]
+    assert len(runs) == {"agents": 4 * 2 + 1, "knowledge": 7}[part]
     assert len({run.folder for run in runs}) == len(runs)
     for run in runs:
         assert run.compose().scenario.horizon == 60
