@@ -263,32 +263,39 @@ def knowledge_of(run: str) -> str:
 
 
 def figure_of_knowledge(folder: Path) -> Figure:
-    """Savings and limits against what the car knows; a point per training, a line of means."""
+    """Energy, losses and limits against what the car knows; a point per training, lines of means.
+
+    What accelerating loses is left out where an earlier release evaluated.
+    """
     table = table_of_knowledge(folder).set_index("knowledge")
-    kinds = [kind for kind in KNOWN if kind in table.index]
-    human = float(table[ENERGY]["idm"]) if "idm" in table.index else float("nan")
+    learned = table.loc[[kind for kind in KNOWN if kind in table.index]]
     runs = table_of_agents(folder)
-    learned = table.loc[kinds]
-    figure = new_figure(7.0, 5.2)
-    axes = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    runs["knowledge"] = [knowledge_of(run) for run in runs["run"]]
+    runs = runs[runs["knowledge"].isin(learned.index)]
+    human = table.loc["idm"] if "idm" in table.index else None
+    shown = [name for name in (ENERGY, LOST) if name in table]
+    figure = new_figure(7.0, 2.2 + 2.0 * len(shown))
+    axes = figure.subplots(len(shown) + 1, 1, sharex=True)
     looks = {"": ("#0072b2", "as trained"), "filtered_": ("#d55e00", "behind the filter")}
     for prefix, (hue, label) in looks.items():
         look = {"color": hue, "marker": "o", "lw": 1.2}
-        saving = 100.0 * (1.0 - learned[f"{prefix}{ENERGY}"] / human)
-        axes[0].plot(kinds, saving, label=label, **look)
-        axes[1].plot(kinds, 100.0 * learned[f"{prefix}{LONG}"], **look)
-    axes[1].plot(kinds, 100.0 * learned[UNSAFE], color="#0072b2", marker="o", lw=1.2, ls=":")
-    for run in runs[runs["run"] != "idm"].to_dict("records"):
-        if (kind := knowledge_of(run["run"])) in kinds:
-            saving = 100.0 * (1.0 - run[ENERGY] / human)
-            axes[0].plot([kind], [saving], marker=".", color="#0072b2", alpha=0.5, ls="")
-    axes[0].set_ylim(bottom=0.0)
-    axes[1].set_ylim(bottom=0.0)
-    style(axes[0], "", "energy saved against\na human driver [%]")
-    style(axes[1], "what the car knows besides the present", "share of time [%]")
-    axes[0].legend(frameon=False, loc="lower right")
-    words = "lower panel: solid, time gap > 2.5 s; dotted, TTC < 4 s as trained"
-    figure.supxlabel(words, fontsize=8)
+        for axis, name in zip(axes, shown, strict=False):
+            axis.plot(learned.index, learned[prefix + name], label=label, **look)
+        axes[-1].plot(learned.index, 100.0 * learned[prefix + LONG], **look)
+    dots = {"color": "#0072b2", "marker": ".", "alpha": 0.5, "ls": ""}
+    for axis, name in zip(axes, shown, strict=False):
+        axis.plot(runs["knowledge"], runs[name], **dots)
+        if human is not None:
+            axis.axhline(human[name], color="#222222", lw=0.8, ls="--", label="human driver")
+    axes[-1].plot(learned.index, 100.0 * learned[UNSAFE], "o:", color="#0072b2", lw=1.2)
+    words = {ENERGY: "total energy\n[kJ per episode]", LOST: "lost to accelerating\n[kJ]"}
+    for axis, name in zip(axes, shown, strict=False):
+        style(axis, "", words[name])
+    axes[0].legend(frameon=False, fontsize=8)
+    axes[-1].set_ylim(bottom=0.0)
+    style(axes[-1], "what the car knows besides the present", "share of time [%]")
+    note = "bottom: solid, time gap > 2.5 s; dotted, TTC < 4 s as trained"
+    figure.supxlabel(note, fontsize=8)
     return figure
 
 

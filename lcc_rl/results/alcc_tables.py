@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.results.intervals import Estimate, mean, share_saved
-from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
+from lcc_rl.results.tables import BASELINES, HUMANS, paired, per_seed, savings
 
 KINDS = {"": "energy_kj", "net_": "net_energy_kj"}  # raw; net of the change in kinetic energy
 PARTS = ("steady_energy_kj", "acceleration_loss_kj")  # studies of earlier releases lack them
 PAPER, OURS = "paper", "this study"
-BASELINES = ("idm", "reference", "own_energy")
+COMPARED = (*BASELINES, "own_energy")
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
 PAPER_TABLE_IV = {"reference": (214.85, 193.89, 408.74), "alcc": (226.46, 164.38, 390.84)}
 PAPER_IMPROVEMENT = {"mean": 4.38, "best": 14.43, "worst": -4.92}
@@ -63,7 +63,7 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
     found = per_seed(episodes, "total_energy_kj")
     rows = []
     for strategy in (name for name in found if name not in HUMANS):
-        for baseline in (name for name in BASELINES if name in found):
+        for baseline in (name for name in COMPARED if name in found):
             if baseline == strategy:
                 continue
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
@@ -344,10 +344,10 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
 
     Returns:
         One row per change and trained strategy: total energy [kJ], savings against each of
-        :data:`BASELINES` [%] with intervals over seeds, collisions, shares of time [%], and RMS
+        :data:`COMPARED` [%] with intervals over seeds, collisions, shares of time [%], and RMS
         jerk [m/s³]; energy and jerk also of the worst seed.
     """
-    baselines = [name for name in BASELINES if (episodes["strategy"] == name).any()]
+    baselines = [name for name in COMPARED if (episodes["strategy"] == name).any()]
     rows = []
     for change, part in episodes.groupby(by, sort=False):
         for strategy, energy in per_seed(part, "total_energy_kj").items():

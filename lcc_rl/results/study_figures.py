@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.files import read_parquet
 from lcc_rl.results.intervals import Estimate, band, share_saved
-from lcc_rl.results.tables import paired, savings
+from lcc_rl.results.tables import BASELINES, paired, savings
 
 # Distinct without colour vision and in grey.
 COLOURS = {
@@ -256,7 +256,7 @@ def write_study_figures(folder: str | Path) -> list[Path]:
         if "direct" in names:
             figure = human_energy(episodes, name)
             paths.append(save(figure, target / f"human_energy_{name}.png"))
-        for baseline in ("idm", "reference"):
+        for baseline in BASELINES:
             if baseline in names and baseline != name and name != "idm":
                 figure = paired_improvement(episodes, name, baseline)
                 path = target / f"improvement_{name}_vs_{baseline}.png"

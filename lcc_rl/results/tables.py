@@ -14,6 +14,7 @@ from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
 LOST = "total_acceleration_loss_kj"  # tables of earlier releases lack it
+BASELINES = ("idm", "reference")  # what savings are told against
 HUMANS = ("direct", "idm")  # nothing was trained: one value, known exactly
 
 CAR_COLUMNS = (
@@ -77,7 +78,7 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         kilometres = (group["cav_distance_m"].fillna(0) + group["hdv_distance_m"]).sum() / 1e3
         energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
         row["kj_per_km"] = energy.sum() / kilometres
-        for baseline in ("idm", "reference"):
+        for baseline in BASELINES:
             row |= _against(total, net, str(strategy), baseline)
         row["collisions"] = int(group["collided"].sum())
         row["min_ttc_s"] = group["min_ttc_s"].min()
