@@ -148,6 +148,7 @@ def chosen_folder(resumed: str | None, fresh: str) -> str:
 
 register_schemas()
 OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
+OmegaConf.register_new_resolver("lcc.pairs", lambda a, b: len(a) * len(b), replace=True)
 OmegaConf.register_new_resolver("lcc.add", lambda *numbers: float(sum(numbers)), replace=True)
 
 

@@ -13,12 +13,12 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.cli import entry_point, prepare_torch, run_folder
-from lcc_rl.config import TARGET, load, short_name
+from lcc_rl.config import TARGET, load, plain, short_name
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
-from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
+from lcc_rl.results.runs import PRETRAINED, flatten, load_policy, save_config
 from lcc_rl.results.study_figures import write_study_figures
 from lcc_rl.train import EPISODES, check_sizes, evaluate_and_write
 
@@ -58,7 +58,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust = tuple(cfg.trust)
     policy = None if cfg.policy is None else load_policy(cfg.policy, cfg.variant, trust)
-    compared = {path: load_policy(path, trust=trust) for path in cfg.compare}
+    compared = {path: load_policy(path, cfg.variant, trust) for path in cfg.compare}
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
@@ -161,12 +161,17 @@ def studied(cfg: DictConfig, policy: Policy | None, inputs: Inputs) -> Strategy:
             f"say variant={own.variant}"
         )
     trained_with, observed = (
-        OmegaConf.to_container(node, resolve=True) for node in (own.observation, cfg.observation)
+        dict(flatten(plain(node))) for node in (own.observation, cfg.observation)
     )
-    if trained_with != observed:
+    differing = [
+        f"observation.{key}: {trained_with.get(key)}, got {observed.get(key)}"
+        for key in sorted(trained_with.keys() | observed.keys())
+        if trained_with.get(key) != observed.get(key)
+    ]
+    if differing:
         raise ConfigError(
             f"policy={cfg.policy} was trained with another observation than this: expected "
-            f"{trained_with}, got {observed}; say +knowledge=… and observation.… as in its training"
+            f"{'; '.join(differing)}; say +knowledge=… and observation.… as in its training"
         )
     remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
     if remembered != asked:

@@ -5,7 +5,8 @@
 
 Plans every held-out episode by the gradient through the simulator, beginning with a learned
 policy's drive, and evaluates the plan as any other strategy. Whatever is no option is an
-override, as of lcc_rl.evaluate; by default 12 drivers stand behind each of 20 profiles.
+override of the evaluation (data, drivers, split, evaluation, scenario, +filter); by default 12
+drivers stand behind each of 20 profiles.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from rich.console import Console
 from lcc_rl.cli import main_guard, prepare_torch
 from lcc_rl.config import load, require
 from lcc_rl.envs.factory import load_inputs
+from lcc_rl.errors import ConfigError
 from lcc_rl.evaluate import baseline, trained
 from lcc_rl.evaluation.clairvoyant import clairvoyant
 from lcc_rl.evaluation.monte_carlo import evaluate
+from lcc_rl.pipeline import root_key
 from lcc_rl.progress import ProgressReporter
 from lcc_rl.results.files import write_parquet
 from lcc_rl.results.runs import load_policy
@@ -31,6 +34,7 @@ from lcc_rl.results.tables import as_rich, summary
 from lcc_rl.studies.runner import check_overrides
 
 DRIVERS = 12
+OWN = ("variant", "policy", "compare", "seed", "knowledge", "agent", "observation", "reward")
 
 
 def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
@@ -41,6 +45,11 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
     prepare_torch(cfg)
     inputs, size = load_inputs(cfg), cfg.evaluation
     policy = load_policy(options.policy, cfg.variant, tuple(cfg.trust))
+    if "hdv" not in policy[1].scenario.pieces:
+        raise ConfigError(
+            f"--policy {options.policy} was trained as variant {policy[1].variant}, which has no "
+            "human drivers; expected that of a car with a human behind, such as alcc"
+        )
     learned = trained(cfg, options.policy, policy, inputs)
     with ProgressReporter("clairvoyant", options.iterations, folder=options.out) as progress:
         best = clairvoyant(
@@ -72,6 +81,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
+    for word in overrides:
+        if root_key(word) in OWN:
+            raise ConfigError(f"{word}: the controller is that of --policy, as it was trained")
     check_overrides(overrides)
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     table = summary(plan(options, overrides))

@@ -97,8 +97,8 @@ class Observation(Feature):
         widths: for namespaces whose entries are wider than one number their width, or a list as
             long as they are wide, e.g. the horizons of a preview.
         relative_to: for namespaces whose entries are seen as differences, from what, dotted:
-            ``{"preview": "leader.speed"}``, or one for each of as many equal parts. What matters
-            is then not hidden in a small difference of large numbers.
+            ``{"preview": "leader.speed"}``, or one for each of as many equal parts; None: as they
+            are. What matters is then not hidden in a small difference of large numbers.
         name: entry written.
 
     Raises:
@@ -113,7 +113,7 @@ class Observation(Feature):
         visible: int = 1,
         strings: Sequence[str] = ("hdv",),
         widths: Mapping[str, int | Sequence[float]] | None = None,
-        relative_to: Mapping[str, str | Sequence[str]] | None = None,
+        relative_to: Mapping[str, str | Sequence[str] | None] | None = None,
         name: str = "observation",
     ) -> None:
         flat = {(space, key): x for space, keys in scales.items() for key, x in keys.items()}
@@ -154,7 +154,7 @@ class Observation(Feature):
 
 
 def _bases(
-    relative_to: Mapping[str, str | Sequence[str]],
+    relative_to: Mapping[str, str | Sequence[str] | None],
     flat: Mapping[tuple[str, str], float],
     counts: Sequence[int],
     strings: Sequence[str],
@@ -166,7 +166,7 @@ def _bases(
             raise ConfigError(f"{where}: expected a namespace of observation.scales, no string")
     found = []
     for (space, _), count in zip(flat, counts, strict=True):
-        given = relative_to.get(space, ())
+        given = relative_to.get(space) or ()
         keys = [as_tuple(key) for key in ([given] if isinstance(given, str) else given)]
         if keys and count % len(keys):
             raise ConfigError(

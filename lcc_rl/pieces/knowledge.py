@@ -54,6 +54,7 @@ class LeaderPreview(Feature):
         leader: str = "leader",
         name: str = "preview",
     ) -> None:
+        _check_numbers(f"{name}.horizons", horizons)
         if not horizons or min(horizons) < 0 or noise < 0 or delay < 0:
             raise ConfigError(
                 f"{name}: horizons {list(horizons)} must be given, and horizons, noise {noise} "
@@ -112,6 +113,7 @@ class ObservationMemory(Transition):
     ) -> None:
         if kind not in KINDS:
             raise ConfigError(f"{name}.kind must be one of {', '.join(KINDS)}, got {kind!r}")
+        _check_numbers(f"{name}.seconds", seconds)
         if not sources or not seconds or min(seconds) < time_step:
             raise ConfigError(
                 f"{name}: sources {list(sources)} and seconds {list(seconds)} must be given, and "
@@ -149,3 +151,8 @@ class ObservationMemory(Transition):
         now = torch.cat([start.get(source) for source in self.sources], -1)
         for key, repeat in zip(self._arrival_keys, (self.repeat, self.depth), strict=False):
             start.set(key, now.repeat_interleave(repeat, -1))
+
+
+def _check_numbers(where: str, values: Sequence[float]) -> None:
+    if not all(isinstance(value, (int, float)) for value in values):
+        raise ConfigError(f"{where} must be numbers, got {list(values)}")

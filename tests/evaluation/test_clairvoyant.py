@@ -106,7 +106,15 @@ def test_the_command(tmp_path, capsys) -> None:
     assert "clairvoyant" in capsys.readouterr().out
     rows = pd.read_parquet(tmp_path / "episodes.parquet")
     assert rows["strategy"].value_counts().to_dict() == {"idm": 2, "alcc": 2, "clairvoyant": 2}
-    with pytest.raises(SystemExit) as stop:
-        tool.main_guard(tool.main)(["--iterations", "0", "--out", str(tmp_path / "none")])
-    assert stop.value.code == 2
-    assert "iterations must be at least 1, got 0" in capsys.readouterr().err
+    out = ["--out", str(tmp_path / "none")]
+    for wrong, words in (
+        (["--iterations", "0"], "iterations must be at least 1, got 0"),
+        (["--policy", "pretrained/ddpg"], "trained as variant ddpg, which has no human drivers"),
+        (["policy=nowhere"], "policy=nowhere: the controller is that of --policy"),
+        (["variant=reference"], "variant=reference: the controller is that of --policy"),
+        (["+knowledge=preview"], "+knowledge=preview: the controller is that of --policy"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            tool.main_guard(tool.main)([*out, *wrong])
+        assert stop.value.code == 2
+        assert words in capsys.readouterr().err

@@ -31,9 +31,8 @@ def test_preview_is_what_the_leader_will_do() -> None:
 
 
 def test_differences_are_taken_in_equal_parts() -> None:
-    two = ["scenario.pieces.memory.sources=[leader.speed,cav.gap]", "observation.widths.memory=4"]
-    memory = ["+knowledge=memory", "scenario.pieces.memory.seconds=[1.0,2.0]", *two]
-    data = played(*memory)
+    two = "scenario.pieces.memory.sources=[leader.speed,cav.gap]"
+    data = played("+knowledge=memory", "scenario.pieces.memory.seconds=[1.0,2.0]", two)
     present = torch.cat([data["leader", "speed"], data["cav", "gap"]], -1)
     difference = data["memory", "entries"] - present.repeat_interleave(2, -1)
     assert torch.allclose(data["observation"][..., -4:], 0.5 * difference, atol=1e-5)
@@ -93,6 +92,11 @@ def test_filtered_memory_is_the_exponential_average() -> None:
     assert torch.allclose(average, torch.tensor(expected), atol=1e-4)
 
 
+def test_plain_values_on_request() -> None:
+    data = played("+knowledge=preview", "observation.relative_to.preview=null")
+    assert torch.allclose(data["observation"][..., -5:], 0.5 * data["preview", "speed"])
+
+
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac", "analytic"])
 @pytest.mark.parametrize("knowledge", ["memory", "preview"])
 @pytest.mark.parametrize("variant", ["alcc", "reference"])
@@ -109,6 +113,8 @@ def test_every_agent_can_use_it(agent, knowledge, variant) -> None:
         (lambda: LeaderPreview(wavy_profiles(), 0.1, []), "horizons"),
         (lambda: LeaderPreview(wavy_profiles(), 0.1, [1.0], noise=-1.0), "noise"),
         (lambda: LeaderPreview(wavy_profiles(), 0.1, [1.0], delay=-1.0), "delay"),
+        (lambda: LeaderPreview(wavy_profiles(), 0.1, ["a"]), "horizons must be numbers"),  # type: ignore[list-item]
+        (lambda: ObservationMemory(0.1, seconds=["a"]), "seconds must be numbers"),  # type: ignore[list-item]
         (lambda: ObservationMemory(0.1, kind="remembered"), "remembered"),
         (lambda: ObservationMemory(0.1, seconds=[0.0]), "shorter than a step"),
         (lambda: ObservationMemory(0.1, sources=[]), "sources"),
