@@ -108,7 +108,7 @@ def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
     network = make_actor(7, 1, (8,), 0).module
     _, expected = unrolled.play(unrolled.start(), network, 3)
 
-    def no_compiler(network, state):
+    def no_compiler(network, state, shift):
         raise torch._dynamo.exc.TorchDynamoException("no C++ compiler found\nmore")
 
     fallback = Unrolled(small_env("alcc", 4), WANTED)
