@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from lcc_rl import interrupts
+from lcc_rl.runs import interrupts
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "make_env", "results"]

@@ -13,15 +13,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from lcc_rl.calibration.idm_fit import COLUMNS, Calibration
-from lcc_rl.calibration.population import from_table
-from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import build, config_hash, plain
+from lcc_rl.drivers.idm_fit import COLUMNS, Calibration
+from lcc_rl.drivers.population import from_table
 from lcc_rl.errors import ConfigError
+from lcc_rl.io.files import write_parquet
 from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 from lcc_rl.results.drawing import save
-from lcc_rl.results.files import write_parquet
 from lcc_rl.results.runs import save_config
+from lcc_rl.runs.cli import entry_point, prepare_torch, run_folder
 
 
 def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:

@@ -12,14 +12,14 @@ from typing import Any
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import TARGET, load, plain, short_name
 from lcc_rl.envs.factory import Inputs, build_agent, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy
-from lcc_rl.results.runs import PRETRAINED, flatten, load_policy, save_config
-from lcc_rl.results.study_figures import write_study_figures
+from lcc_rl.results.figures import write_study_figures
+from lcc_rl.results.runs import PRETRAINED, differing, flatten, load_policy, save_config
+from lcc_rl.runs.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.train import EPISODES, check_sizes, evaluate_and_write
 
 log = logging.getLogger("lcc_rl")
@@ -163,15 +163,14 @@ def studied(cfg: DictConfig, policy: Policy | None, inputs: Inputs) -> Strategy:
     trained_with, observed = (
         dict(flatten(plain(node))) for node in (own.observation, cfg.observation)
     )
-    differing = [
+    changes = [
         f"observation.{key}: {trained_with.get(key)}, got {observed.get(key)}"
-        for key in sorted(trained_with.keys() | observed.keys())
-        if trained_with.get(key) != observed.get(key)
+        for key in differing(trained_with, observed)
     ]
-    if differing:
+    if changes:
         raise ConfigError(
             f"policy={cfg.policy} was trained with another observation than this: expected "
-            f"{'; '.join(differing)}; say +knowledge=… and observation.… as in its training"
+            f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
         )
     remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
     if remembered != asked:

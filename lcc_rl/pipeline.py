@@ -15,15 +15,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl import calibrate, evaluate, results, train
-from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import build, load, plain, require
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.errors import ConfigError, Interrupted
-from lcc_rl.progress import watch
+from lcc_rl.io.files import atomic_path
 from lcc_rl.results.drawing import save
-from lcc_rl.results.files import atomic_path
+from lcc_rl.results.figures import learning_curve
 from lcc_rl.results.runs import save_config
-from lcc_rl.results.study_figures import learning_curve
+from lcc_rl.runs.cli import entry_point, prepare_torch, run_folder
+from lcc_rl.runs.progress import watch
 
 log = logging.getLogger("lcc_rl")
 
@@ -66,7 +66,7 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
             "path": str(folder / TRAJECTORIES),
         },
         "drivers": {
-            "_target_": "lcc_rl.calibration.population.bootstrap",
+            "_target_": "lcc_rl.drivers.population.bootstrap",
             "path": str(drivers),
         },
     }

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lcc_rl.cli import main_guard
 from lcc_rl.errors import ConfigError
-from lcc_rl.interrupts import interruptible
-from lcc_rl.overview import counts, draw, headline, live, note, progress
-from lcc_rl.results.states import survey
-from lcc_rl.sweeps import read_plan
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.runs.interrupts import interruptible
+from lcc_rl.runs.overview import counts, draw, headline, live, note, progress
+from lcc_rl.runs.states import survey
+from lcc_rl.runs.sweeps import read_plan
 
 
 def show(root: Path, console: Console) -> None:

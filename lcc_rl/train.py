@@ -16,7 +16,6 @@ from lcc_rl.agents import Analytic
 from lcc_rl.agents.analytic import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.training import Trainer
-from lcc_rl.cli import entry_point, prepare_torch, run_folder
 from lcc_rl.config import TARGET, TrainConfig, build, find_target, is_sweep, load, require
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.factory import (
@@ -31,13 +30,14 @@ from lcc_rl.envs.factory import learns as learned
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation import platoon_cases
 from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
+from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers, write_parquet
 from lcc_rl.pieces.vehicles import Population
-from lcc_rl.results.files import parquet_metadata, read_parquet, remove_leftovers, write_parquet
-from lcc_rl.results.loggers import Silent
-from lcc_rl.results.platoon_tables import case_table
 from lcc_rl.results.runs import identity, load_config, save_config, save_policy
-from lcc_rl.results.states import working
+from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, show, summary
+from lcc_rl.runs.cli import entry_point, prepare_torch, run_folder
+from lcc_rl.runs.loggers import Silent
+from lcc_rl.runs.states import working
 
 log = logging.getLogger("lcc_rl")
 

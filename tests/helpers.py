@@ -8,9 +8,9 @@ import torch
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.calibration.population import bootstrap
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
+from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")

@@ -15,8 +15,8 @@ from lcc_rl import calibrate, evaluate, results, train
 from lcc_rl.config import load, plain
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.results import files
-from lcc_rl.results.files import read_parquet, read_torch, write_parquet, write_torch
+from lcc_rl.io import files
+from lcc_rl.io.files import read_parquet, read_torch, write_parquet, write_torch
 from lcc_rl.results.runs import check_targets, load_config, load_policy, save_policy
 
 
@@ -136,7 +136,7 @@ def policy_file(path, **changes) -> None:
         "subprocess.Popen",
         "lcc_rl.config.import_module",
         "lcc_rl.data.sources.Path",
-        "lcc_rl.results.files.write_parquet",
+        "lcc_rl.io.files.write_parquet",
         "mine.Comfort",
     ],
 )

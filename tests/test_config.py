@@ -229,7 +229,7 @@ def test_hash_ignores_order_and_sees_values() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["pieces", "envs", "policies", "agents", "evaluation", "results", "data.stream"]
+    "module", ["pieces", "envs", "policies", "agents", "evaluation", "results", "synthetic.stream"]
 )
 def test_every_room_can_be_entered_first(module) -> None:
     # A circular import shows only in a fresh interpreter that begins with the wrong room.

@@ -20,9 +20,9 @@ from omegaconf import DictConfig, OmegaConf
 from lcc_rl import evaluate, pipeline, results, train
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.files import read_parquet
+from lcc_rl.io.files import read_parquet
 from lcc_rl.results.runs import identity, load_config, load_policy
-from lcc_rl.results.states import inspect_run
+from lcc_rl.runs.states import inspect_run
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (

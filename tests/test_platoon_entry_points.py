@@ -16,9 +16,10 @@ from lcc_rl.agents.training import Trainer, transitions
 from lcc_rl.config import load
 from lcc_rl.envs.factory import build_agent, build_env, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.results.files import read_parquet
+from lcc_rl.io.files import read_parquet
 from lcc_rl.results.runs import identity, load_policy
-from lcc_rl.studies import hcfs, hcfs_report
+from lcc_rl.studies.hcfs import report as hcfs_report
+from lcc_rl.studies.hcfs import study as hcfs
 
 TINY = ("experiment=smoke", "scenario.horizon=40", "evaluation.profiles=3")
 AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")

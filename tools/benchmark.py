@@ -31,7 +31,7 @@ from benchmarks.update import update
 from rich.console import Console
 
 from lcc_rl.errors import LccError, unknown_name
-from lcc_rl.results.files import processor, write_parquet
+from lcc_rl.io.files import processor, write_parquet
 
 LISTED = (
     read,

@@ -19,18 +19,18 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from lcc_rl.cli import main_guard, prepare_torch
 from lcc_rl.config import load, require
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluate import baseline, trained
 from lcc_rl.evaluation.clairvoyant import clairvoyant
 from lcc_rl.evaluation.monte_carlo import evaluate
+from lcc_rl.io.files import write_parquet
 from lcc_rl.pipeline import root_key
-from lcc_rl.progress import ProgressReporter
-from lcc_rl.results.files import write_parquet
 from lcc_rl.results.runs import load_policy
 from lcc_rl.results.tables import as_rich, summary
+from lcc_rl.runs.cli import main_guard, prepare_torch
+from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.studies.runner import check_overrides
 
 DRIVERS = 12

@@ -21,19 +21,19 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl import results
-from lcc_rl.cli import main_guard, prepare_torch
 from lcc_rl.config import load, require, short_name
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluate import trained
 from lcc_rl.evaluation.monte_carlo import evaluate
+from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pipeline import root_key
 from lcc_rl.results.drawing import new_figure, save
-from lcc_rl.results.files import read_parquet, write_parquet
+from lcc_rl.results.figures import style
 from lcc_rl.results.runs import load_policy
-from lcc_rl.results.study_figures import style
+from lcc_rl.runs.cli import main_guard, prepare_torch
+from lcc_rl.runs.sweeps import key_of
 from lcc_rl.studies.runner import FINISHED, Run, check_overrides, run_all
-from lcc_rl.sweeps import key_of
 from lcc_rl.train import POLICIES
 
 log = logging.getLogger("lcc_rl")
@@ -94,10 +94,11 @@ def evaluate_kept(options: argparse.Namespace) -> None:
     """Evaluate the policies that each finished training kept on its way: kept.parquet beside."""
     kept = {folder: sorted((folder / POLICIES).glob("*.pt")) for folder in finished(options.out)}
     todo = {folder: paths for folder, paths in kept.items() if paths and outdated(folder, paths)}
-    judge = evaluator(options.overrides) if todo else None
+    if not todo:
+        return
+    judge = evaluator(options.overrides)
     for folder, paths in todo.items():
         log.info("%s: evaluating the policies kept on the way", folder)
-        assert judge is not None
         rows = [{"iteration": float(path.stem), **judge(path)} for path in paths]
         write_parquet(pd.DataFrame(rows), folder / KEPT)
 
@@ -110,10 +111,11 @@ def evaluate_filtered(options: argparse.Namespace) -> None:
         if (folder / POLICY).exists()
         and not ((folder / FILTERED).exists() and newer(folder / FILTERED, folder / POLICY))
     ]
-    judge = evaluator([*options.overrides, "+filter=barrier"]) if todo else None
+    if not todo:
+        return
+    judge = evaluator(options.overrides, "+filter=barrier")
     for folder in todo:
         log.info("%s: evaluating the policy behind the filter", folder)
-        assert judge is not None
         write_parquet(pd.DataFrame([judge(folder)]), folder / FILTERED)
 
 
@@ -127,11 +129,9 @@ def newer(path: Path, than: Path) -> bool:
     return path.stat().st_mtime >= than.stat().st_mtime
 
 
-def evaluator(overrides: Iterable[str]) -> Callable[[Path], dict[str, float]]:
+def evaluator(overrides: Iterable[str], *further: str) -> Callable[[Path], dict[str, float]]:
     """Return what evaluates a policy's file or folder on the held-out profiles, to its means."""
-    overrides = list(overrides)
-    filtered = [item for item in overrides if item == "+filter=barrier"]
-    cfg = load("evaluate", [*data_overrides(overrides), *filtered])
+    cfg = load("evaluate", [*data_overrides(overrides), *further])
     prepare_torch(cfg)
     inputs, size, trust = load_inputs(cfg), cfg.evaluation, tuple(cfg.trust)
 
@@ -237,8 +237,7 @@ def table_of_knowledge(folder: Path) -> pd.DataFrame:
     Raises:
         ResultsError: if no training is finished.
     """
-    runs = table_of_agents(folder)
-    runs["knowledge"] = [knowledge_of(run) for run in runs["run"]]
+    runs = runs_by_knowledge(folder)
     filtered = [folder / run / FILTERED for run in runs["run"]]
     behind = pd.concat([read_parquet(p) if p.exists() else pd.DataFrame([{}]) for p in filtered])
     behind = behind.reset_index(drop=True).reindex(columns=[*MEANS, "collided"])
@@ -257,9 +256,11 @@ def table_of_knowledge(folder: Path) -> pd.DataFrame:
     return table.reset_index()
 
 
-def knowledge_of(run: str) -> str:
-    """Return what the car of a run knows; a run is ``<knowledge>/seed_<n>`` or ``idm``."""
-    return Path(run).parts[0]
+def runs_by_knowledge(folder: Path) -> pd.DataFrame:
+    """Return one row per run and what its car knows: ``<knowledge>/seed_<n>``, or ``idm``."""
+    runs = table_of_agents(folder)
+    runs["knowledge"] = [Path(run).parts[0] for run in runs["run"]]
+    return runs
 
 
 def figure_of_knowledge(folder: Path) -> Figure:
@@ -269,8 +270,7 @@ def figure_of_knowledge(folder: Path) -> Figure:
     """
     table = table_of_knowledge(folder).set_index("knowledge")
     learned = table.loc[[kind for kind in KNOWN if kind in table.index]]
-    runs = table_of_agents(folder)
-    runs["knowledge"] = [knowledge_of(run) for run in runs["run"]]
+    runs = runs_by_knowledge(folder)
     runs = runs[runs["knowledge"].isin(learned.index)]
     human = table.loc["idm"] if "idm" in table.index else None
     shown = [name for name in (ENERGY, LOST) if name in table]

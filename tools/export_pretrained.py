@@ -16,7 +16,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from lcc_rl.errors import LccError
-from lcc_rl.results.files import write_torch
+from lcc_rl.io.files import write_torch
 from lcc_rl.results.runs import load_policy
 
 LOCAL = ("data", "drivers", "split", "resume", "policy", "compare")

@@ -28,9 +28,9 @@ from lcc_rl.config import load
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.files import read_parquet, read_torch
+from lcc_rl.io.files import read_parquet, read_torch
 from lcc_rl.results.runs import read_settings
-from lcc_rl.results.states import read_progress, survey
+from lcc_rl.runs.states import read_progress, survey
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 TABLES = ("training", "episodes", "steps")

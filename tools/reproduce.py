@@ -22,8 +22,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.cli import main_guard
-from lcc_rl.studies import alcc, alcc_report, hcfs, hcfs_report
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.studies.alcc import report as alcc_report
+from lcc_rl.studies.alcc import study as alcc
+from lcc_rl.studies.hcfs import report as hcfs_report
+from lcc_rl.studies.hcfs import study as hcfs
 from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, read_notes
 
 log = logging.getLogger("lcc_rl")

@@ -22,9 +22,9 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import TrainingConfig, require
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
-from lcc_rl.interrupts import stop_signal
-from lcc_rl.progress import ProgressReporter
-from lcc_rl.results.files import read_torch, write_parquet, write_torch
+from lcc_rl.io.files import read_torch, write_parquet, write_torch
+from lcc_rl.runs.interrupts import stop_signal
+from lcc_rl.runs.progress import ProgressReporter
 
 # What the record of an iteration is made from.
 REPORTED = (("next", "reward"), ("next", "reward_terms"), ("next", "done"), ("next", "terminated"))
@@ -117,7 +117,7 @@ class TrainingLoop(ABC):
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
         self.times: list[dict[str, float]] = []
-        # Told every row as it appears; see lcc_rl.results.loggers.
+        # Told every row as it appears; see lcc_rl.runs.loggers.
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
         # Told the number of every iteration whose policy is to be kept.
         self.on_keep: Callable[[int], None] = lambda iteration: None

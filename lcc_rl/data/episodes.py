@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.errors import DataError
-from lcc_rl.results.files import read_parquet, write_parquet
+from lcc_rl.io.files import read_parquet, write_parquet
 
 SCHEMA: dict[str, str] = {
     "episode": "int32",

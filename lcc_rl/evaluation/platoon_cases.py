@@ -21,13 +21,13 @@ from lcc_rl.data.cycles import Case
 from lcc_rl.envs.factory import Inputs, build_agent, build_env, build_policy, learns, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.monte_carlo import Strategy
+from lcc_rl.io.files import write_parquet
 from lcc_rl.pieces.base import SEED
 from lcc_rl.policies import CACCPolicy, DeadBeatPolicy
 from lcc_rl.policies.hcfs import COUNTERS, HYBRID
-from lcc_rl.results.files import write_parquet
-from lcc_rl.results.platoon_figures import write_platoon_figures
-from lcc_rl.results.platoon_tables import as_rich, case_table
 from lcc_rl.results.runs import identity, load_policy, save_config
+from lcc_rl.results.string_figures import write_platoon_figures
+from lcc_rl.results.string_tables import as_rich, case_table
 from lcc_rl.results.tables import show
 
 log = logging.getLogger("lcc_rl")

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.config import TARGET, config_hash, find_target, plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.results.files import atomic_path, read_parquet, read_torch, write_torch
+from lcc_rl.io.files import atomic_path, read_parquet, read_torch, write_torch
 
 CONFIG = "config.yaml"
 PRETRAINED = "pretrained"
@@ -22,13 +22,14 @@ REGISTRY = tuple(
     f"lcc_rl.{room}"
     for room in (
         "agents",
-        "calibration",
         "data",
+        "drivers",
         "evaluation",
         "functional",
         "pieces",
         "policies",
-        "results.loggers",
+        "runs.loggers",
+        "synthetic",
     )
 )
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
@@ -236,6 +237,11 @@ def load(root: str | Path = "outputs", table: str = "episodes") -> pd.DataFrame:
     if not frames:
         raise ResultsError(f"{root}: no {table}.parquet in it or below it")
     return pd.concat(frames, ignore_index=True)
+
+
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the keys whose values differ or that only one of two flat mappings has, sorted."""
+    return [key for key in sorted(one.keys() | other.keys()) if one.get(key) != other.get(key)]
 
 
 def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -20,11 +20,11 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import load, plain
 from lcc_rl.errors import ConfigError, Interrupted
-from lcc_rl.interrupts import interruptible
-from lcc_rl.progress import clock
-from lcc_rl.results.files import atomic_path
-from lcc_rl.results.runs import CONFIG, NOT_IDENTITY, flatten, load_config
-from lcc_rl.sweeps import key_of
+from lcc_rl.io.files import atomic_path
+from lcc_rl.results.runs import CONFIG, NOT_IDENTITY, differing, flatten, load_config
+from lcc_rl.runs.interrupts import interruptible
+from lcc_rl.runs.progress import clock
+from lcc_rl.runs.sweeps import key_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -102,9 +102,8 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
     found, asked = (_settings(cfg) for cfg in (load_config(run.folder), wanted))
     return [
         f"{key}: {found.get(key)} → {asked.get(key)}"
-        for key in sorted(found.keys() | asked.keys())
-        if found.get(key) != asked.get(key)
-        and not any(key == item or key.startswith(f"{item}.") for item in accept)
+        for key in differing(found, asked)
+        if not any(key == item or key.startswith(f"{item}.") for item in accept)
     ]
 
 

@@ -15,7 +15,7 @@ from lcc_rl.agents.loop import derived_seed
 from lcc_rl.config import load
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted
-from lcc_rl.results.files import read_parquet
+from lcc_rl.io.files import read_parquet
 from lcc_rl.results.runs import identity
 
 SMALL = (

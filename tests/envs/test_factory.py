@@ -13,12 +13,12 @@ from torchrl.envs.utils import step_mdp
 
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.data.stream import StreamSource
 from lcc_rl.envs.clock import Clock
 from lcc_rl.envs.factory import build_agent, build_env, load_inputs
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.power import motor_power
+from lcc_rl.synthetic.stream import StreamSource
 
 T = 0.1
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lcc_rl.calibration.population import bootstrap
+from lcc_rl.drivers.population import bootstrap
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
 from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration, simulate_follower
 from lcc_rl.functional.random import uniform

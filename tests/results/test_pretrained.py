@@ -11,7 +11,7 @@ import torch
 from lcc_rl import evaluate
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.files import read_torch, write_torch
+from lcc_rl.io.files import read_torch, write_torch
 from lcc_rl.results.runs import load_policy, pretrained_path
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "export_pretrained.py"

@@ -19,8 +19,8 @@ from matplotlib.image import imread
 from PIL import Image
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.io.files import processor, write_parquet
 from lcc_rl.results.drawing import new_figure, save
-from lcc_rl.results.files import processor, write_parquet
 from lcc_rl.results.report import Section, heading, made, write_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

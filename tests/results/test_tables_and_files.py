@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.files import (
+from lcc_rl.io.files import (
     atomic_path,
     parquet_metadata,
     read_parquet,

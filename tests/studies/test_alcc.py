@@ -15,8 +15,10 @@ from lcc_rl import train
 from lcc_rl.data.profiles import SingleProfile, Split
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError, LccError, ResultsError
-from lcc_rl.results.files import read_parquet
-from lcc_rl.studies import alcc, alcc_report, runner
+from lcc_rl.io.files import read_parquet
+from lcc_rl.studies import runner
+from lcc_rl.studies.alcc import report as alcc_report
+from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.runner import FAILED, FINISHED, FOREIGN, Outcome, Run
 
 TINY = (

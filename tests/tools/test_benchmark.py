@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.data.stream import StreamSource
-from lcc_rl.results.files import read_parquet
+from lcc_rl.io.files import read_parquet
+from lcc_rl.synthetic.stream import StreamSource
 
 NAMES = (
     "read",

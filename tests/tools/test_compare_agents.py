@@ -13,7 +13,7 @@ from helpers import compose
 from lcc_rl import train
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.results.files import read_parquet, write_parquet
+from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.runs import save_config
 
 PATH = Path(__file__).parents[2] / "tools" / "compare_agents.py"

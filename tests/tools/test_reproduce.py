@@ -11,7 +11,7 @@ from types import ModuleType
 
 import pytest
 
-from lcc_rl.results.files import read_parquet
+from lcc_rl.io.files import read_parquet
 
 SCRIPT = Path(__file__).resolve().parents[2] / "tools" / "reproduce.py"
 TINY = (

@@ -12,7 +12,7 @@ from benchmarks.plain import study
 from lcc_rl.envs.factory import build_agent
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.evaluation.monte_carlo import evaluate as play
-from lcc_rl.results.files import write_parquet
+from lcc_rl.io.files import write_parquet
 
 
 def evaluate(options: Namespace) -> list[Row]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from rich.table import Table
 
-from lcc_rl.data.stream import StreamSource
+from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
 EXTRA = ("stable_baselines3", "gymnasium", "numba")  # of the optional extra "bench"

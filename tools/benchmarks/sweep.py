@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.harness import Row, installed, rows_of
 from lcc_rl import results
 from lcc_rl.errors import ResultsError
-from lcc_rl.sweeps import parallel_jobs
+from lcc_rl.runs.sweeps import parallel_jobs
 
 RUNS, FEW = 100, 3
 SHORT = ("experiment=smoke", "variant=alcc")

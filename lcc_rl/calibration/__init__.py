@@ -1,1 +1,0 @@
-"""Calibration room: from observed episodes to a population of IDM drivers."""

@@ -1,0 +1,1 @@
+"""Driver models, their calibration and driver populations."""

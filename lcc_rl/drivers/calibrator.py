@@ -1,0 +1,94 @@
+"""Calibration room: the calibration that a configuration describes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import pandas as pd
+import torch
+
+from lcc_rl.drivers.genetic import GeneticSettings, Progress
+from lcc_rl.drivers.idm_fit import DEFAULT_GENETIC, MODES, Calibration, checked_bounds, fit
+from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.functional.idm import IDMConstants
+
+
+@dataclass(frozen=True)
+class Calibrator:
+    """How to calibrate; see :func:`lcc_rl.drivers.idm_fit.fit` for the settings.
+
+    Args:
+        modes: ``local``, ``global`` or both, each once.
+        bounds: bounds by parameter.
+        constants: parameters that the local mode holds.
+        selection: which episodes are used.
+        local_genetic: genetic algorithm of the local mode.
+        global_genetic: genetic algorithm of the global mode.
+        choose_constants: choose the local mode's constants over all drivers first.
+        compiled: compile the simulation.
+
+    Raises:
+        ConfigError: if a mode is unknown, or named twice or not at all, or bounds are crossed.
+    """
+
+    modes: Sequence[str] = ("local",)
+    bounds: Mapping[str, Sequence[float]] | None = None
+    constants: IDMConstants = field(default_factory=IDMConstants)
+    selection: Selection = field(default_factory=Selection)
+    local_genetic: GeneticSettings = DEFAULT_GENETIC["local"]
+    global_genetic: GeneticSettings = DEFAULT_GENETIC["global"]
+    choose_constants: bool = False
+    compiled: bool = False
+
+    def __post_init__(self) -> None:
+        for mode in self.modes:
+            if mode not in MODES:
+                raise unknown_name("calibration mode", mode, MODES)
+        if not self.modes or len(set(self.modes)) < len(self.modes):
+            raise ConfigError(f"calibration modes must be given once each, got {list(self.modes)}")
+
+        checked_bounds(self.bounds)
+
+    def __call__(
+        self,
+        episodes: pd.DataFrame,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        progress: Progress | None = None,
+    ) -> Calibration:
+        """Calibrate the drivers of an episode table in every mode.
+
+        Returns:
+            The drivers of all modes, told apart by the column ``mode``, and one report.
+
+        Raises:
+            ConfigError: if a setting is impossible.
+            DataError: if the table lacks a column or holds no usable episode.
+        """
+        observed = observe(episodes, self.selection)
+        report = list(observed.report)
+        parts = []
+        for mode in self.modes:
+            part = fit(
+                observed,
+                mode,
+                self.bounds,
+                self.constants,
+                self.local_genetic if mode == "local" else self.global_genetic,
+                seed=seed,
+                choose_constants=self.choose_constants and mode == "local",
+                compiled=self.compiled,
+                device=device,
+                progress=progress,
+            )
+            parts.append(part)
+            report += [f"{mode}: {line}" for line in part.report[len(observed.report) :]]
+        return Calibration(
+            drivers=pd.concat([part.drivers for part in parts], ignore_index=True),
+            report=report,
+            constants=parts[0].constants,
+            generations=sum(part.generations for part in parts),
+            evaluations=sum(part.evaluations for part in parts),
+        )

@@ -1,0 +1,287 @@
+"""Calibration room: populations of human drivers, from which episodes draw (v0, T)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from scipy.stats import gaussian_kde
+from torch import Tensor
+
+from lcc_rl.drivers.idm_fit import (
+    BOUND_TOLERANCE,
+    COLUMNS,
+    DEFAULT_BOUNDS,
+    MODES,
+    SHARED,
+    checked_bounds,
+)
+from lcc_rl.errors import ConfigError, DataError, ResultsError, unknown_name
+from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.io.files import read_parquet
+
+SHIPPED = "i80_drivers.parquet"
+
+
+@dataclass(frozen=True)
+class DriverPopulation:
+    """Drivers an episode can draw: each has its own v0 and T, all share the constants.
+
+    Args:
+        desired_speed: v0, ``[drivers]`` [m/s].
+        time_gap: T, ``[drivers]`` [s].
+        constants: the other parameters: numbers where all drivers share them, else tensors
+            ``[drivers]`` (a globally calibrated population).
+        ids: the drivers' identities, one per driver.
+        at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
+    """
+
+    desired_speed: Tensor
+    time_gap: Tensor
+    constants: IDMConstants
+    ids: tuple[str, ...]
+    at_bound: Tensor
+
+    def __len__(self) -> int:
+        """Number of drivers."""
+        return len(self.ids)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw drivers with replacement: indices ``[count]`` on the CPU."""
+        return torch.randint(len(self), (count,), generator=generator)
+
+    def select(self, index: Tensor) -> DriverPopulation:
+        """Return the drivers at ``index`` ``[chosen]``, in that order, repetitions included."""
+        index = index.to(self.desired_speed.device)
+        own = {name: value[index] for name, value in self._own_constants().items()}
+        return replace(
+            self,
+            desired_speed=self.desired_speed[index],
+            time_gap=self.time_gap[index],
+            constants=self.constants.with_(**own),
+            ids=tuple(self.ids[place] for place in index.tolist()),
+            at_bound=self.at_bound[index],
+        )
+
+    def to(self, device: torch.device | str) -> DriverPopulation:
+        """Return the same drivers on another device."""
+        own = {name: value.to(device) for name, value in self._own_constants().items()}
+        return replace(
+            self,
+            desired_speed=self.desired_speed.to(device),
+            time_gap=self.time_gap.to(device),
+            constants=self.constants.with_(**own),
+            at_bound=self.at_bound.to(device),
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Mean, standard deviation and correlation of (v0, T), and the share of v0 at a bound."""
+        speed = self.desired_speed.double().cpu().numpy()
+        gap = self.time_gap.double().cpu().numpy()
+        spread = len(self) > 1 and speed.std() > 0.0 and gap.std() > 0.0
+        return {
+            "drivers": float(len(self)),
+            "desired_speed_mean_mps": float(speed.mean()),
+            "desired_speed_std_mps": float(speed.std()),
+            "time_gap_mean_s": float(gap.mean()),
+            "time_gap_std_s": float(gap.std()),
+            "correlation": float(np.corrcoef(speed, gap)[0, 1]) if spread else float("nan"),
+            "share_at_bound": float(self.at_bound.double().mean()),
+        }
+
+    def _own_constants(self) -> dict[str, Tensor]:
+        """The constants that differ between drivers."""
+        values = vars(self.constants)
+        return {name: value for name, value in values.items() if isinstance(value, Tensor)}
+
+
+def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.DataFrame:
+    """Read a table of calibrated drivers and check it.
+
+    Args:
+        path: a ``drivers.parquet`` written by the calibration; None reads the shipped I-80 drivers.
+        mode: which calibration to keep, ``local`` or ``global``; by default the one that the
+            table has, local where it has both.
+
+    Returns:
+        One row per driver, columns as written by :func:`lcc_rl.drivers.idm_fit.fit`.
+
+    Raises:
+        ConfigError: if the mode is unknown.
+        DataError: naming file, row and column, if the table is missing, empty or not sound.
+    """
+    if mode is not None and mode not in MODES:
+        raise unknown_name("calibration mode", mode, MODES)
+    try:
+        if path is None:
+            with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED) as file:
+                frame = read_parquet(file)
+        else:
+            frame = read_parquet(path)
+    except ResultsError as error:
+        raise DataError(str(error)) from error
+    name = SHIPPED if path is None else str(path)
+    _check(frame, name)
+    return _of_mode(frame, mode, name)
+
+
+def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
+    """Keep one calibration of a table that may hold two."""
+    if "mode" not in frame.columns:
+        return frame
+    held = frame["mode"].unique().tolist()
+    mode = mode or ("local" if "local" in held else held[0])
+    if mode not in held:
+        raise DataError(f"{name}: no drivers of mode {mode!r}; the table holds {', '.join(held)}")
+    return frame[frame["mode"] == mode].reset_index(drop=True)
+
+
+def _check(frame: pd.DataFrame, name: str) -> None:
+    """Raise the first thing that is wrong with a driver table."""
+    if frame.empty:
+        raise DataError(f"{name}: the table holds no drivers")
+    missing = [column for column in COLUMNS.values() if column not in frame.columns]
+    if missing:
+        raise DataError(f"{name}: missing column(s) {', '.join(missing)}")
+    for column in COLUMNS.values():
+        if not pd.api.types.is_numeric_dtype(frame[column]):
+            raise DataError(f"{name}: column {column!r} is not numeric")
+        values = frame[column].to_numpy(np.float64)
+        bad = ~(np.isfinite(values) & (values > 0.0))
+        if bad.any():
+            row = int(bad.argmax())
+            where = f"{name}: row {row}, column {column!r}"
+            raise DataError(f"{where}: must be a positive number, got {values[row]}")
+
+
+def bootstrap(path: str | Path | None = None, mode: str | None = None) -> DriverPopulation:
+    """The empirical joint distribution: the calibrated drivers themselves.
+
+    Args:
+        path: table of calibrated drivers; None takes the shipped I-80 drivers.
+        mode: see :func:`load_drivers`.
+
+    Raises:
+        ConfigError: if the mode is unknown.
+        DataError: if the table is not sound.
+    """
+    return from_table(load_drivers(path, mode))
+
+
+def from_table(table: pd.DataFrame) -> DriverPopulation:
+    """Make a population of a checked driver table, one driver per row.
+
+    Raises:
+        DataError: if the table is not sound.
+    """
+    _check(table, "driver table")
+    own = {name: table[COLUMNS[name]].to_numpy(np.float64) for name in SHARED}
+    constants = IDMConstants(
+        **{name: float(values[0]) for name, values in own.items() if np.ptp(values) == 0.0}
+    )
+    varying = {name: _tensor(values) for name, values in own.items() if np.ptp(values) > 0.0}
+    return DriverPopulation(
+        desired_speed=_tensor(table[COLUMNS["desired_speed"]].to_numpy(np.float64)),
+        time_gap=_tensor(table[COLUMNS["time_gap"]].to_numpy(np.float64)),
+        constants=constants.with_(**varying),
+        ids=_identities(table),
+        at_bound=_flags(table),
+    )
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32)
+
+
+def _identities(table: pd.DataFrame) -> tuple[str, ...]:
+    """``recording/follower/leader`` where known, else the row's number."""
+    columns = ["recording", "follower_id", "leader_id"]
+    if not set(columns) <= set(table.columns):
+        return tuple(str(number) for number in range(len(table)))
+    return tuple("/".join(map(str, row)) for row in table[columns].itertuples(index=False))
+
+
+def _flags(table: pd.DataFrame) -> Tensor:
+    """Which desired speeds lie on a bound, as calibrated, or by the default bounds."""
+    if "desired_speed_at_bound" in table.columns:
+        return torch.tensor(table["desired_speed_at_bound"].to_numpy(bool))
+    low, high = DEFAULT_BOUNDS["desired_speed"]
+    values = table[COLUMNS["desired_speed"]].to_numpy(np.float64)
+    margin = BOUND_TOLERANCE * (high - low)
+    return torch.tensor((values <= low + margin) | (values >= high - margin))
+
+
+def kde(
+    path: str | Path | None = None,
+    drivers: int = 1000,
+    seed: int = 0,
+    bandwidth: float | None = None,
+    bounds: Mapping[str, Sequence[float]] | None = None,
+    mode: str | None = None,
+) -> DriverPopulation:
+    """Drivers resampled from a Gaussian kernel density of the joint distribution.
+
+    Args:
+        path: table of calibrated drivers; None takes the shipped I-80 drivers.
+        drivers: number of drivers to draw.
+        seed: seed of the draw.
+        bandwidth: factor on the data's spread; None takes Scott's rule.
+        bounds: calibration bounds by parameter, to which draws are clipped; those not named keep
+            their default.
+        mode: see :func:`load_drivers`; of globally calibrated drivers all five parameters are
+            drawn jointly.
+
+    Raises:
+        ConfigError: if a setting is out of range or unknown.
+        DataError: if the table is not sound, or too small or degenerate for a density.
+    """
+    if drivers < 1 or (bandwidth is not None and not bandwidth > 0.0):
+        raise ConfigError("kde: 'drivers' and 'bandwidth' must be positive")
+    limits = checked_bounds(bounds)
+    table = load_drivers(path, mode)
+    names = [name for name, column in COLUMNS.items() if np.ptp(table[column].to_numpy()) > 0.0]
+    values = table[[COLUMNS[name] for name in names]].to_numpy(np.float64).T
+    try:
+        density = gaussian_kde(values, bw_method=bandwidth)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DataError(f"kde: {len(table)} drivers do not span a density: {error}") from error
+    draws = density.resample(drivers, seed=np.random.default_rng(seed))
+    drawn = {column: np.full(drivers, table[column].iloc[0]) for column in COLUMNS.values()}
+    for name, row in zip(names, draws, strict=True):
+        drawn[COLUMNS[name]] = row.clip(*limits[name])
+    return from_table(pd.DataFrame(drawn))
+
+
+def fixed(
+    desired_speed: float = 25.0,
+    time_gap: float = 1.2,
+    acceleration: float = 1.0,
+    deceleration: float = 1.5,
+    min_gap: float = 2.0,
+) -> DriverPopulation:
+    """A population of one given driver.
+
+    Args:
+        desired_speed: v0 [m/s].
+        time_gap: T [s].
+        acceleration: a [m/s²].
+        deceleration: b [m/s²].
+        min_gap: s0 [m].
+
+    Raises:
+        ConfigError: if a parameter is not positive.
+    """
+    if not (desired_speed > 0.0 and time_gap > 0.0):
+        raise ConfigError("fixed driver: desired_speed and time_gap must be positive")
+    return DriverPopulation(
+        desired_speed=torch.tensor([float(desired_speed)]),
+        time_gap=torch.tensor([float(time_gap)]),
+        constants=IDMConstants(acceleration, deceleration, min_gap),
+        ids=("fixed",),
+        at_bound=torch.zeros(1, dtype=torch.bool),
+    )

@@ -1,0 +1,264 @@
+"""Figures of a study, each from parquet alone (ALCC Figs. 6, 7, 9 and 10)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.drawing import new_figure, save, unbox
+from lcc_rl.results.intervals import Estimate, band, share_saved
+from lcc_rl.results.tables import BASELINES, paired, savings
+
+# Distinct without colour vision and in grey.
+COLOURS = {
+    "alcc": "#0072b2",
+    "reference": "#d55e00",
+    "own_energy": "#009e73",
+    "idm": "#6b6b6b",
+    "direct": "#222222",
+}
+OTHERS = ("#cc79a7", "#e69f00", "#56b4e9")
+VEHICLES = {
+    "leader": ("leader", "#222222"),
+    "cav": ("controlled car", "#0072b2"),
+    "hdv": ("human follower", "#d55e00"),
+}
+WINDOW = 10  # iterations of the rolling mean
+
+
+def colour(strategy: str) -> str:
+    """Return the colour that a strategy has in every figure."""
+    return COLOURS.get(strategy) or OTHERS[sum(strategy.encode()) % len(OTHERS)]
+
+
+def style(axis: Axes, xlabel: str, ylabel: str) -> None:
+    """Label an axis and take away what carries no information."""
+    axis.set_xlabel(xlabel)
+    axis.set_ylabel(ylabel)
+    unbox(axis)
+
+
+def learning_curve(training: pd.DataFrame) -> Figure:
+    """Episode reward over episodes, with a band (Fig. 6).
+
+    Args:
+        training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
+
+    Returns:
+        With several seeds of a variant the line is their mean and the band its 95 % bootstrap
+        interval; with a single one the rolling mean and the 5th to 95th percentile of the same
+        window.
+    """
+    figure = new_figure(7.0, 4.0)
+    axis = figure.subplots()
+    floor = 0.0
+    for variant, rows in training.groupby("variant", sort=False):
+        mean, label = draw_curve(axis, rows, "episode_reward", str(variant))
+        axis.lines[-1].set_label(label)
+        floor = min(floor, float(mean.iloc[len(mean) // 5 :].min()))
+    # The first, random episodes are far below everything else and would set the scale.
+    axis.set_ylim(bottom=1.6 * floor - 1.0)
+    style(axis, "training episodes", "mean reward per episode")
+    axis.legend(frameon=False)
+    axis.set_title(f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included")
+    axis.title.set_fontsize(10)
+    return figure
+
+
+def draw_curve(axis: Axes, rows: pd.DataFrame, column: str, variant: str) -> tuple[pd.Series, str]:
+    """Draw the rolling mean of one variant's column over its seeds, with its band.
+
+    Returns:
+        The line that was drawn, and what its label should say of the seeds.
+    """
+    # Seeds of different length are compared as far as all of them went.
+    curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
+    smooth = curves.rolling(WINDOW, min_periods=1)
+    line = smooth.mean().mean(axis=1)
+    if curves.shape[1] > 1:
+        low, high = band(smooth.mean().to_numpy(float))
+        label = f"{variant} (n = {curves.shape[1]} seeds, 95 % band)"
+    else:
+        low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
+        label = f"{variant} (1 seed; band: 5–95 % of {WINDOW} batches)"
+    axis.fill_between(line.index, low, high, color=colour(variant), alpha=0.2, lw=0)
+    axis.plot(line.index, line, color=colour(variant))
+    return line, label
+
+
+def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
+    """Speeds, accelerations and gaps of one held-out episode (Fig. 7)."""
+    rows = _one_episode(steps, strategy)
+    first = rows.iloc[0]
+    figure = new_figure(7.0, 6.5)
+    axes = figure.subplots(3, 1, sharex=True)
+    for vehicle, (name, hue) in VEHICLES.items():
+        for axis, entry in zip(axes, ("speed", "acceleration", "gap"), strict=True):
+            column = f"{vehicle}_{entry}"
+            if column in rows and rows[column].notna().any():
+                axis.plot(rows["time_s"], rows[column], color=hue, label=name, lw=1.3)
+    style(axes[0], "", "speed [m/s]")
+    style(axes[1], "", "acceleration [m/s²]")
+    style(axes[2], "time [s]", "gap ahead [m]")
+    axes[0].legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.3))
+    figure.suptitle(
+        f"{strategy}: profile {first['profile']}, driver v0 {first['desired_speed_mps']:.1f} m/s, "
+        f"T {first['time_gap_s']:.2f} s",
+        fontsize=10,
+    )
+    return figure
+
+
+def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
+    """One episode's speeds, and what each strategy's two cars draw: the study at a glance."""
+    figure = new_figure(10.0, 3.8)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    rows = _one_episode(steps, strategy)
+    for vehicle, (name, hue) in VEHICLES.items():
+        left.plot(rows["time_s"], rows[f"{vehicle}_speed"], color=hue, label=name, lw=1.3)
+    style(left, "time [s]", "speed [m/s]")
+    left.set_title(f"One held-out episode of {strategy}", fontsize=10)
+    left.legend(frameon=False, fontsize=9)
+    cars = episodes[episodes["strategy"] != "direct"]
+    means = cars.groupby("strategy", sort=False)[["cav_energy_kj", "hdv_energy_kj"]].mean()
+    base = 0.0 * means["cav_energy_kj"]
+    for vehicle in ("cav", "hdv"):
+        name, hue = VEHICLES[vehicle]
+        right.bar(means.index, means[f"{vehicle}_energy_kj"], bottom=base, color=hue, label=name)
+        base = base + means[f"{vehicle}_energy_kj"]
+    for place, (label, total) in enumerate(base.items()):
+        saving = f" ({100 * (total / base['idm'] - 1):+.1f} %)" if label != "idm" else ""
+        right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
+    right.set_ylim(top=1.2 * base.max())
+    style(right, "", "energy [kJ per episode]")
+    right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
+    right.set_title(
+        f"Mean over {cars['profile_id'].nunique()} held-out profiles × "
+        f"{cars['driver_id'].nunique()} drivers",
+        fontsize=10,
+    )
+    return figure
+
+
+def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
+    """Return the time series of a strategy's liveliest sample episode."""
+    rows = steps[steps["strategy"] == strategy]
+    if "training_seed" in rows and rows["training_seed"].notna().any():
+        rows = rows[rows["training_seed"] == rows["training_seed"].min()]
+    episodes = rows.groupby(["profile", "driver_id"])["leader_speed"]
+    spread = episodes.transform("std")
+    first = rows.iloc[int(spread.to_numpy().argmax())]
+    rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
+    # Of a string of followers the nearest one is shown.
+    nearest = {name: f"hdv{name[4:]}" for name in rows.columns if name.startswith("hdv1_")}
+    return rows.rename(columns=nearest) if "hdv_speed" not in rows else rows
+
+
+def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
+    """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
+    by_driver = (
+        episodes[episodes["strategy"].isin([strategy, "direct"])]
+        .pivot_table(index="driver_id", columns="strategy", values="hdv_energy_kj")
+        .dropna()
+    )
+    a, b = by_driver[strategy], by_driver["direct"]
+    figure = new_figure(9.0, 3.8)
+    left, right = figure.subplots(1, 2)
+    bins = np.histogram_bin_edges(np.concatenate([a, b]), 30)
+    left.hist(b, bins, color=colour("direct"), alpha=0.45, label=f"B: direct, mean {b.mean():.1f}")
+    label = f"A: behind {strategy}, mean {a.mean():.1f}"
+    left.hist(a, bins, color=colour(strategy), alpha=0.6, label=label)
+    style(left, "energy of the human driver [kJ per episode]", "drivers")
+    left.legend(frameon=False)
+    _paired_bars(right, share_saved(a, b), "saving of A against B [%]", colour(strategy))
+    found = savings(episodes, "hdv_energy_kj", strategy, "direct")
+    figure.suptitle(
+        f"Human driver's energy with and without the controlled car ahead (n = {len(a)} drivers)\n"
+        f"mean saving {_with_interval(found)}",
+        fontsize=10,
+    )
+    return figure
+
+
+def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
+    """Saving of the total energy per driver, strategy against baseline (Fig. 10)."""
+    by_driver = paired(episodes, "total_energy_kj").groupby("driver_id").mean()
+    saving = share_saved(by_driver[strategy], by_driver[baseline])
+    figure = new_figure(7.0, 3.8)
+    axis = figure.subplots()
+    label = f"total energy saved by {strategy}\nagainst {baseline} [%]"
+    _paired_bars(axis, saving, label, colour(strategy))
+    found = savings(episodes, "total_energy_kj", strategy, baseline)
+    figure.suptitle(
+        f"{strategy} against {baseline}: saving of the mean energy {_with_interval(found)}\n"
+        f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %, "
+        f"{int((saving < 0).sum())} of {len(saving)} worse off",
+        fontsize=10,
+    )
+    return figure
+
+
+def _with_interval(found: Estimate) -> str:
+    """Write a share and how sure it is."""
+    if np.isnan(found.low):
+        return f"{100 * found.value:+.1f} % (1 training seed: no interval)"
+    bounds = f"{100 * found.low:+.1f} … {100 * found.high:+.1f} %"
+    return f"{100 * found.value:+.1f} % (95 % interval over seeds {bounds})"
+
+
+def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
+    """Draw one bar per driver, sorted; below zero means worse off."""
+    ordered = 100 * np.sort(saving.to_numpy())
+    axis.bar(np.arange(len(ordered)), ordered, width=1.0, color=hue, alpha=0.8)
+    axis.axhline(0.0, color="#222222", lw=0.8)
+    axis.axhline(ordered.mean(), color="#222222", lw=0.8, ls="--")
+    axis.annotate(
+        f"mean of drivers {ordered.mean():+.1f} %",
+        (0.02, ordered.mean()),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 3),
+        textcoords="offset points",
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
+    )
+    style(axis, "drivers, sorted", label)
+
+
+def write_study_figures(folder: str | Path) -> list[Path]:
+    """Draw every figure that the parquet files of an evaluation allow.
+
+    Args:
+        folder: holds episodes.parquet and steps.parquet; figures go to ``figures`` in it.
+
+    Returns:
+        The figures' paths.
+
+    Raises:
+        ResultsError: if a table is missing or a figure cannot be written.
+    """
+    folder = Path(folder)
+    episodes, steps = (
+        read_parquet(folder / "episodes.parquet"),
+        read_parquet(folder / "steps.parquet"),
+    )
+    target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
+    cars = [name for name in names if name != "direct"]
+    paths = []
+    if len(steps) and "idm" in names and cars[-1] != "idm":
+        paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
+    for name in cars:
+        if len(steps) and (steps["strategy"] == name).any():
+            paths.append(save(sample_episode(steps, name), target / f"episode_{name}.png"))
+        if "direct" in names:
+            figure = human_energy(episodes, name)
+            paths.append(save(figure, target / f"human_energy_{name}.png"))
+        for baseline in BASELINES:
+            if baseline in names and baseline != name and name != "idm":
+                figure = paired_improvement(episodes, name, baseline)
+                path = target / f"improvement_{name}_vs_{baseline}.png"
+                paths.append(save(figure, path))
+    return paths

@@ -1,0 +1,132 @@
+"""Figures of the platoon study, each from parquet alone (HCFS Figs. 4–12)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.drawing import new_figure, save, unbox
+from lcc_rl.results.runs import load_config
+
+# The three of the paper come first; the others stand in the tables.
+SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")
+NEAR, FAR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
+LEADER, BOUND = "#222222", "#b00020"
+PARTS = ("#e8e8e8", "#0072b2")
+
+
+def hue(follower: int, followers: int) -> tuple[float, ...]:
+    """Return the colour of a follower: from blue, the first, to orange, the last."""
+    share = (follower - 1) / max(followers - 1, 1)
+    return tuple((1.0 - share) * NEAR + share * FAR)
+
+
+def shown(steps: pd.DataFrame) -> list[str]:
+    """Return the strategies that figures show, of those there are; all where none is known."""
+    names = list(dict.fromkeys(steps["strategy"]))
+    return [name for name in SHOWN if name in names] or names
+
+
+def _panels(steps: pd.DataFrame, names: list[str], title: str) -> tuple[Figure, list[Axes]]:
+    figure = new_figure(8.0, 1.2 + 2.0 * len(names))
+    axes = list(np.atleast_1d(figure.subplots(len(names), 1, sharex=True, sharey=True)))
+    for axis, name in zip(axes, names, strict=True):
+        axis.set_title(name, fontsize=10, loc="left")
+        unbox(axis)
+    axes[-1].set_xlabel("time [s]")
+    figure.suptitle(title, fontsize=11)
+    return figure, axes
+
+
+def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
+    followers = int(rows["follower"].max())
+    for follower in range(1, followers + 1):
+        own = rows[rows["follower"] == follower]
+        label = f"follower {follower}" if follower in (1, followers) else None
+        colour = hue(follower, followers)
+        axis.plot(own["time_s"], own[column], color=colour, lw=1.0, label=label)
+
+
+def velocities(steps: pd.DataFrame, case: str) -> Figure:
+    """Speeds of leader and followers, a panel per strategy (Figs. 4, 7, 10)."""
+    rows = steps[steps["case"] == case]
+    figure, axes = _panels(rows, shown(rows), f"{case}: speed [m/s]")
+    for axis, name in zip(axes, shown(rows), strict=True):
+        own = rows[rows["strategy"] == name]
+        leader = own[own["follower"] == 0]
+        _lines(axis, own, "speed_mps")
+        axis.plot(leader["time_s"], leader["speed_mps"], color=LEADER, ls="--", label="leader")
+    axes[0].legend(frameon=False, fontsize=8, ncols=3)
+    return figure
+
+
+def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
+    """Jerk of the followers with its bound, a panel per strategy (Figs. 5, 8, 11)."""
+    rows = steps[steps["case"] == case]
+    figure, axes = _panels(rows, shown(rows), f"{case}: jerk [m/s³], bound ±{bound:g}")
+    for axis, name in zip(axes, shown(rows), strict=True):
+        _lines(axis, rows[rows["strategy"] == name], "jerk_mps3")
+        for side in (-bound, bound):
+            axis.axhline(side, color=BOUND, lw=0.8, ls=":")
+    axes[0].legend(frameon=False, fontsize=8, ncols=2)
+    return figure
+
+
+def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
+    """Which of its two parents drives each follower at each moment (Figs. 6, 9, 12)."""
+    rows = steps[(steps["case"] == case) & (steps["strategy"] == strategy)]
+    rows = rows[rows["follower"] > 0]
+    raster = rows.pivot_table(index="follower", columns="time_s", values="winner")
+    figure = new_figure(8.0, 1.4 + 0.25 * len(raster))
+    axis = figure.subplots()
+    step = float(raster.columns[0])
+    edges = np.append(raster.columns.to_numpy(float) - step, raster.columns[-1])
+    rims = np.arange(len(raster) + 1) + 0.5
+    for value, colour in enumerate(PARTS):
+        mask = np.where(raster.to_numpy() == value, 1.0, np.nan)
+        axis.pcolormesh(edges, rims, mask, color=colour, edgecolors="none")
+        axis.plot([], [], "s", color=colour, label=("CACC", "DDPG")[value])
+    axis.set_yticks(raster.index)
+    axis.set_xlabel("time [s]")
+    axis.set_ylabel("follower")
+    unbox(axis)
+    share = float(np.nanmean(raster.to_numpy()))
+    axis.set_title(f"{case}: who drives in {strategy} (DDPG {share:.0%})", fontsize=10)
+    axis.legend(frameon=False, fontsize=8, ncols=2, loc="upper left", bbox_to_anchor=(0.7, 1.2))
+    return figure
+
+
+def write_platoon_figures(folder: str | Path, target: Path | None = None) -> list[Path]:
+    """Draw every figure that an evaluation allows: three per case.
+
+    Args:
+        folder: holds config.yaml and steps.parquet.
+        target: where figures go; ``figures`` in the folder by default.
+
+    Returns:
+        The figures' paths, in the paper's order.
+
+    Raises:
+        ResultsError: if a table is missing or a figure cannot be written.
+    """
+    folder = Path(folder)
+    steps, target = read_parquet(folder / "steps.parquet"), target or folder / "figures"
+    if steps.empty:
+        return []
+    controller = load_config(folder).get("controller")
+    bound = float(controller.jerk_bound) if controller is not None else 30.0
+    paths = []
+    for case in dict.fromkeys(steps["case"]):
+        stem = str(case).replace(" ", "_")
+        paths.append(save(velocities(steps, case), target / f"{stem}_velocities.png"))
+        paths.append(save(jerks(steps, case, bound), target / f"{stem}_jerk.png"))
+        for strategy in ("hcfs", "hcfs oracle"):
+            if (steps["strategy"] == strategy).any():
+                path = target / f"{stem}_switching_{strategy.replace(' ', '_')}.png"
+                paths.append(save(switching(steps, case, strategy), path))
+    return paths

@@ -1,0 +1,150 @@
+"""Progress room: a live bar on a terminal, plain lines in a log, one small file for onlookers."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Mapping
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from lcc_rl.config import is_sweep
+from lcc_rl.io.files import atomic_path
+from lcc_rl.runs.states import PROGRESS, read_progress
+
+log = logging.getLogger("lcc_rl")
+
+
+def clock(seconds: float) -> str:
+    """Return a duration as ``m:ss``."""
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def bar(console: Console, shown: bool) -> Progress:
+    """Return a bar for tasks with a ``note``; it draws nothing where it is not to be shown."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
+        TimeElapsedColumn(),
+        console=console,
+        disable=not shown,
+    )
+
+
+class ProgressReporter:
+    """Shows how far a long job is: rate, ETA and current values.
+
+    On a terminal a live bar, except in a sweep, which shows one table of all its runs
+    (:mod:`lcc_rl.runs.sweeps`); elsewhere a plain line at most every ``every`` seconds. The log
+    file gets the plain lines in both cases, and ``folder/progress.json`` always holds the latest state.
+
+    Args:
+        title: what is being done.
+        total: units of work in all.
+        unit: name of a unit.
+        start: units already done (after a resume).
+        folder: where ``progress.json`` is kept; None for nowhere.
+        every: seconds between plain lines.
+        console: where the bar is drawn; the standard error by default.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        total: int,
+        unit: str = "iteration",
+        start: int = 0,
+        folder: Path | None = None,
+        every: float = 20.0,
+        console: Console | None = None,
+    ) -> None:
+        self.title, self.total, self.unit, self.start = title, total, unit, start
+        self.folder, self.every = folder, every
+        self.console = console or Console(stderr=True)
+        self.live = self.console.is_terminal and not is_sweep()
+        self.begun = self.last_line = time.monotonic()
+        self.bar = bar(self.console, self.live)
+        self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note="")
+
+    def __enter__(self) -> ProgressReporter:
+        self.bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.bar.stop()
+
+    def update(self, done: int, values: Mapping[str, float] | None = None) -> None:
+        """Report that ``done`` units are finished, with values worth watching."""
+        elapsed = time.monotonic() - self.begun
+        rate = (done - self.start) / max(elapsed, 1e-9)
+        remaining = (self.total - done) / rate if rate > 0 else 0.0
+        values = dict(values or {})
+        note = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
+        note = f"{note}  {rate:.2f} {self.unit}s/s  ETA {clock(remaining)}"
+        self.bar.update(self.task, completed=done, note=note)
+        self._write_state(done, remaining, values)
+        if time.monotonic() - self.last_line >= self.every or done >= self.total:
+            self.last_line = time.monotonic()
+            self._line(f"{self.title}: {self.unit} {done}/{self.total}  {note}")
+
+    def _line(self, text: str) -> None:
+        if not self.live:
+            log.info(text)
+            return
+        # The bar already says it on the terminal; only the log file is told.
+        record = log.makeRecord(log.name, logging.INFO, "", 0, text, (), None)
+        for handler in logging.getLogger().handlers:
+            if isinstance(handler, logging.FileHandler):
+                handler.emit(record)
+
+    def _write_state(self, done: int, remaining: float, values: Mapping[str, float]) -> None:
+        if self.folder is None:
+            return
+        state = {
+            "title": self.title,
+            "done": done,
+            "total": self.total,
+            "eta_s": round(remaining, 1),
+            **{name: float(f"{value:.6g}") for name, value in values.items()},
+        }
+        with atomic_path(self.folder / PROGRESS, durable=False) as temporary:
+            temporary.write_text(json.dumps(state))
+
+
+def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> None:
+    """Show the progress of jobs in other processes until all are done or one has failed.
+
+    Args:
+        jobs: the folder of each job, where its ``progress.json`` appears, and its future.
+        every: seconds between plain lines where there is no terminal.
+    """
+    console = Console(stderr=True)
+    last = time.monotonic()
+    futures = [future for _, future in jobs.values()]
+    with bar(console, console.is_terminal) as shown:
+        tasks = {name: shown.add_task(name, total=None, note="starting") for name in jobs}
+        while wait(futures, 1.0, FIRST_EXCEPTION).not_done:
+            due = not console.is_terminal and time.monotonic() - last >= every
+            last = time.monotonic() if due else last
+            for name, (folder, future) in jobs.items():
+                state = read_progress(folder)
+                if state is None:
+                    continue
+                note = f"reward {state.get('reward', 0.0):.4g}  ETA {clock(state['eta_s'])}"
+                shown.update(tasks[name], completed=state["done"], total=state["total"], note=note)
+                if due and not future.done():
+                    log.info("%s: iteration %s/%s  %s", name, state["done"], state["total"], note)
+            if any(future.done() and future.exception() for future in futures):
+                return

@@ -1,0 +1,223 @@
+"""State room: whether a run is finished, running, stopped or failed, read from its folder alone.
+
+A run holds a lock on its folder while it works, leaves ``error.txt`` when it fails, and writes its
+main table last. Nothing else is needed to know how it stands, from any process at any time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf.errors import OmegaConfBaseException
+
+from lcc_rl.errors import Interrupted, LccError, ResultsError
+from lcc_rl.io.files import atomic_path, remove_leftovers
+
+try:
+    import fcntl
+except ImportError:  # Windows: runs are not locked there
+    fcntl = None  # type: ignore[assignment]
+
+LOCK, ERROR, PROGRESS = ".lock", "error.txt", "progress.json"
+# The table that a run writes last: a training or evaluation, a calibration.
+RESULTS = ("episodes.parquet", "drivers.parquet")
+MARKS = {"config.yaml", ERROR, LOCK, *RESULTS}
+STATES = ("finished", "running", "stopped", "failed")
+
+
+class Busy(LccError):
+    """Another process works on this run."""
+
+
+@dataclass(frozen=True)
+class RunState:
+    """How a run stands.
+
+    Args:
+        name: its folder, relative to where one looked.
+        state: one of ``STATES``.
+        done: iterations done.
+        total: iterations in all; 0 where nothing is known yet.
+        eta_s: remaining seconds as the run itself estimates them, where it is running.
+        error: why it failed.
+    """
+
+    name: str
+    state: str
+    done: int = 0
+    total: int = 0
+    eta_s: float | None = None
+    error: str = ""
+
+
+@contextmanager
+def claim(folder: Path) -> Iterator[None]:
+    """Hold a run's folder for this process; the system lets go of it however the process ends.
+
+    Raises:
+        Busy: if another process holds it.
+        ResultsError: if the folder cannot be written.
+    """
+    path = folder / LOCK
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = _locked(path)
+    except BlockingIOError:
+        raise Busy(f"{folder}: another process is working on this run") from None
+    except OSError as error:
+        raise ResultsError(f"{folder}: cannot be written: {error}") from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
+        os.close(file)
+
+
+def _locked(path: Path) -> int:
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Whoever held it before may have removed the file between the two calls.
+            if os.path.samestat(os.fstat(file), os.stat(path)):
+                return file
+        except FileNotFoundError:
+            pass
+        except OSError:
+            os.close(file)
+            raise
+        os.close(file)
+
+
+def is_claimed(folder: Path) -> bool:
+    """Whether a process on this machine holds a run's folder."""
+    try:
+        file = os.open(folder / LOCK, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(file)
+
+
+@contextmanager
+def working(folder: Path) -> Iterator[None]:
+    """Claim a folder, and record why the work in it failed, where it does."""
+    with claim(folder):
+        forget(folder)
+        remove_leftovers(folder)
+        try:
+            yield
+        except Interrupted:
+            raise
+        except Exception as error:
+            record(folder, error)
+            raise
+
+
+def forget(folder: Path) -> None:
+    """Remove the record of an earlier failure."""
+    with suppress(OSError):
+        (folder / ERROR).unlink(missing_ok=True)
+
+
+def record(folder: Path, error: Exception) -> None:
+    """Write ``error.txt``: one line that names the error, and the traceback of what is a bug."""
+    text = one_line(error) + "\n"
+    if not isinstance(input_error(error) or error, (LccError, OSError)):
+        text += "\n" + "".join(traceback.format_exception(error))
+    with suppress(ResultsError), atomic_path(folder / ERROR) as temporary:
+        temporary.write_text(text)
+
+
+def input_error(error: BaseException) -> LccError | None:
+    """Return the error of this package behind one, which says more than what wraps it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, LccError):
+        # OmegaConf says of its resolvers' errors that they came before its own, not that they
+        # are its cause.
+        resolving = isinstance(cause, OmegaConfBaseException)
+        cause = cause.__cause__ or (cause.__context__ if resolving else None)
+    return cause
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error as one line: its own words where it is the input's fault, else its kind."""
+    cause = input_error(error)
+    if cause is not None:
+        return " ".join(str(cause).split())
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a run's folder holds the table that a run writes last."""
+    return any((folder / table).exists() for table in RESULTS)
+
+
+def inspect_run(folder: Path, name: str | None = None) -> RunState:
+    """Say how the run in a folder stands."""
+    progress = read_progress(folder) or {}
+    done, total = int(progress.get("done", 0)), int(progress.get("total", 0))
+    name = folder.name if name is None else name
+    if is_claimed(folder):
+        return RunState(name, "running", done, total, float(progress.get("eta_s", 0.0)))
+    if (folder / ERROR).exists():
+        with suppress(OSError):
+            lines = (folder / ERROR).read_text().splitlines()
+            return RunState(name, "failed", done, total, error=lines[0] if lines else "")
+    if is_finished(folder):
+        return RunState(name, "finished", done, total)
+    return RunState(name, "stopped", done, total)
+
+
+def read_progress(folder: Path) -> dict[str, float] | None:
+    """Return what ``progress.json`` of a run folder says, or None where there is none yet."""
+    try:
+        return dict(json.loads((folder / PROGRESS).read_text()))
+    except (OSError, ValueError):
+        return None
+
+
+def run_folders(root: Path) -> list[Path]:
+    """Return the run folders at or below a folder, sorted; those that only hold runs are none.
+
+    Raises:
+        ResultsError: if there is no such folder.
+    """
+    if not root.is_dir():
+        raise ResultsError(f"{root}: no such folder")
+    found = []
+    for place, folders, files in os.walk(root):
+        is_run = bool(MARKS.intersection(files)) or ".hydra" in folders
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if is_run:
+            found.append(Path(place))
+    parents = {parent for folder in found for parent in folder.parents}
+    return sorted(folder for folder in found if folder not in parents)
+
+
+def survey(root: Path) -> list[RunState]:
+    """Say how every run at or below a folder stands.
+
+    Raises:
+        ResultsError: if there is no such folder.
+    """
+    return [
+        inspect_run(folder, str(folder.relative_to(root)) if folder != root else root.name)
+        for folder in run_folders(root)
+    ]

@@ -1,0 +1,233 @@
+"""Sweep room: folders that the same command finds again, and what a sweep says when it ends."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import configure_log
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf, read_write
+from rich.console import Console
+from rich.live import Live
+
+from lcc_rl.errors import Interrupted, LccError
+from lcc_rl.io.files import atomic_path
+from lcc_rl.results.runs import NOT_IDENTITY, identity
+from lcc_rl.runs.overview import live
+from lcc_rl.runs.search import go_on
+from lcc_rl.runs.states import Busy, one_line, record, survey
+
+log = logging.getLogger("lcc_rl")
+
+PLAN = "sweep.json"
+LONGEST_NAME = 100  # characters of a folder's name that say what is in it
+SILENT = logging.CRITICAL + 1
+WAITING = None  # what a run returns to a sweeper that has no result of it; Optuna refuses NaN
+
+
+def register_resolvers() -> None:
+    """Make the names of a sweep's folders known to the configuration files."""
+    # Cached: every job must get the folder that the whole command was given.
+    OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
+    OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
+    OmegaConf.register_new_resolver("lcc.jobs", parallel_jobs, replace=True)
+
+
+def sweep_name(given: str | None, typed: Sequence[str]) -> str:
+    """Return the name of a sweep's folder: the one given, or one made from what was typed.
+
+    The same command gets the same name, whatever the order of its overrides.
+    """
+    if given:
+        return str(given)
+    kept = sorted(that_matter(typed))
+    return f"sweep_{hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]}"
+
+
+def run_name(*, _root_: DictConfig) -> str:
+    """Return the name of a run's folder: what the sweep varies, on one level, and the config hash.
+
+    A folder of the same hash is found again whatever its name says.
+    """
+    settings = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
+    mark, sweep = identity(settings)[:8], Path(_root_.hydra.sweep.dir)
+    for folder in sorted(sweep.glob(f"*{mark}")):
+        return folder.name
+    typed, varied = that_matter(_root_.hydra.overrides.task), read_plan(sweep).varied
+    shown = ",".join(item for item in typed if key_of(item) in varied)
+    text = re.sub(r"[^\w.=,+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
+    return f"{text}_{mark}".lstrip("_")
+
+
+def that_matter(typed: Sequence[str]) -> list[str]:
+    """Return the overrides that change a result."""
+    return [item for item in typed if key_of(item) not in NOT_IDENTITY]
+
+
+def key_of(override: str) -> str:
+    """Return the dotted key that an override changes."""
+    return override.lstrip("+~").split("=")[0]
+
+
+def parallel_jobs(threads: int) -> int:
+    """Return how many jobs of so many threads this machine's cores can hold."""
+    usable = getattr(os, "sched_getaffinity", None)
+    cores = len(usable(0)) if usable else os.cpu_count() or 1
+    return max(1, cores // max(1, int(threads)))
+
+
+register_resolvers()
+
+
+class SweepCallback(Callback):
+    """Says at the start where a sweep's runs go, keeps their number for onlookers, draws them."""
+
+    # Of the sweep of this process; Hydra tells nobody else where it is.
+    folder: Path | None = None
+    table: Live | None = None
+    lines: ClassVar[Any] = None  # how log lines are shown where there is no table
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write the plan and announce the folder."""
+        limit_batches(config)
+        folder = Path(config.hydra.sweep.dir)
+        plan = make_plan(config)
+        type(self).folder = folder
+        with atomic_path(folder / PLAN) as temporary:
+            temporary.write_text(json.dumps(asdict(plan)))
+        words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
+        log.info(words, plan.runs, folder, shlex.quote(str(folder)))
+        go_on(config, alone=not any(state.state == "running" for state in survey(folder)))
+        if sys.stdout.isatty():
+            self._draw(config, plan.runs)
+
+    @classmethod
+    def _draw(cls, config: DictConfig, planned: int) -> None:
+        """Show one table instead of lines; Hydra sets its lines up anew after every run."""
+        hydra = config.hydra
+        cls.lines = hydra.hydra_logging.copy()
+        with read_write(config):
+            OmegaConf.update(hydra.hydra_logging, "root.handlers", [], force_add=True)
+        mute()
+        cls.table = live(Path(hydra.sweep.dir), lambda: planned, Console(highlight=False))
+        cls.table.start(refresh=True)
+
+    @classmethod
+    def end(cls) -> Path | None:
+        """Finish the table and forget the sweep; return its folder, if there was one."""
+        if cls.table is not None:
+            cls.table.stop()
+            configure_log(cls.lines)
+        folder, cls.folder, cls.table = cls.folder, None, None
+        return folder
+
+
+def mute() -> None:
+    """Keep log lines from the terminal, where they would cut the table up; files keep them."""
+    for handler in logging.getLogger().handlers:
+        if type(handler) is logging.StreamHandler:
+            handler.setLevel(SILENT)
+
+
+def limit_batches(config: DictConfig) -> None:
+    """Let submitit on one machine start only as many runs at once as its cores hold."""
+    hydra = config.hydra
+    if not str(hydra.launcher.get("_target_")).endswith(".LocalLauncher"):
+        return
+    if "max_batch_size" in hydra.sweeper and hydra.sweeper.max_batch_size is None:
+        with read_write(config):
+            hydra.sweeper.max_batch_size = parallel_jobs(config.threads)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep is to do.
+
+    Args:
+        runs: how many runs it has; 0 where that is unknown.
+        varied: the dotted keys that differ between its runs.
+    """
+
+    runs: int = 0
+    varied: list[str] = field(default_factory=list)
+
+
+def make_plan(config: DictConfig) -> Plan:
+    """Read off a sweep's configuration what it is to do."""
+    sweeper = config.hydra.sweeper
+    typed = [str(item) for item in config.hydra.overrides.task]
+    typed += [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
+    parsed = OverridesParser.create().parse_overrides(that_matter(typed))
+    swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
+    varied = [key_of(key) for key in swept]
+    if "n_trials" in sweeper:
+        return Plan(int(sweeper.n_trials), varied)
+    grid = [list(item.sweep_string_iterator()) for item in swept.values()]
+    return Plan(math.prod(map(len, grid)), varied)
+
+
+def read_plan(folder: Path) -> Plan:
+    """Return what the sweep in a folder is to do; nothing is known where it holds none."""
+    try:
+        return Plan(**json.loads((folder / PLAN).read_text()))
+    except (OSError, ValueError, TypeError):
+        return Plan()
+
+
+def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:
+    """Do one run of a sweep; a failure is recorded in its folder and does not stop the others.
+
+    Returns:
+        What the function returns; None where it failed.
+
+    Raises:
+        KeyboardInterrupt: where the user stopped it: that stops the sweep.
+    """
+    if sys.stdout.isatty():
+        mute()
+    try:
+        return function(cfg)
+    except Interrupted as error:
+        log.info("%s", error)
+        # As an ordinary exception it would stop this run only, and the next would begin.
+        raise KeyboardInterrupt from error
+    except Busy as error:
+        log.info("%s: left to it", error)
+        return WAITING
+    except Exception as error:
+        record(folder, error)
+        log.error("%s failed: %s", folder.name, one_line(error))
+        return WAITING
+
+
+def conclude(folder: Path) -> None:
+    """Say how a sweep ended.
+
+    Raises:
+        LccError: if there was no run, or if runs failed, naming each with its error.
+    """
+    states = survey(folder)
+    if not states:
+        raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")
+    finished = sum(state.state == "finished" for state in states)
+    failed = [state for state in states if state.state == "failed"]
+    log.info("%d of %d runs finished, in %s", finished, len(states), folder)
+    for state in failed:
+        log.error("failed: %s: %s", state.name, state.error)
+    if failed:
+        raise LccError(
+            f"{len(failed)} of {len(states)} runs failed; the same command tries them again "
+            f"(error.txt in the folder of each says why, {folder})"
+        )

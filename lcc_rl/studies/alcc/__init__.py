@@ -1,0 +1,1 @@
+"""The study of Adaptive Leading Cruise Control (ALCC)."""

@@ -1,0 +1,151 @@
+"""Driver populations: shapes, draws, densities, and tables that must be refused."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from lcc_rl.drivers.population import bootstrap, fixed, from_table, kde, load_drivers
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.io.files import parquet_metadata, write_parquet
+
+
+@pytest.fixture
+def table() -> pd.DataFrame:
+    """The first 20 shipped drivers."""
+    return load_drivers().head(20)
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Function that writes a table and returns its path."""
+
+    def write(frame):
+        path = tmp_path / "drivers.parquet"
+        write_parquet(frame, path)
+        return path
+
+    return write
+
+
+def test_shipped_population_is_the_published_one():
+    population = bootstrap()
+    assert len(population) == 249
+    assert population.desired_speed.shape == population.time_gap.shape == (249,)
+    assert population.desired_speed.dtype == torch.float32
+    assert population.constants == IDMConstants()
+    assert len(set(population.ids)) == 249
+    summary = population.summary()
+    assert summary["drivers"] == 249
+    assert summary["time_gap_mean_s"] == pytest.approx(1.33, abs=0.01)
+    assert summary["correlation"] == pytest.approx(0.15, abs=0.01)
+    assert summary["share_at_bound"] == pytest.approx(0.386, abs=0.01)
+
+
+def test_shipped_table_says_where_it_comes_from():
+    from importlib import resources
+
+    with resources.as_file(resources.files("lcc_rl.assets") / "i80_drivers.parquet") as path:
+        assert "NGSIM I-80" in parquet_metadata(path)["provenance"]
+        assert not [
+            name for name in pd.read_parquet(path) if "position" in name or "time_s" in name
+        ]
+
+
+def test_global_population_has_constants_of_its_own():
+    population = bootstrap(mode="global")
+    assert population.constants.acceleration.shape == (249,)
+    chosen = population.select(torch.tensor([3, 3, 7]))
+    assert chosen.constants.min_gap.tolist() == [
+        population.constants.min_gap[place].item() for place in (3, 3, 7)
+    ]
+    assert chosen.ids == tuple(population.ids[place] for place in (3, 3, 7))
+    assert chosen.to("cpu").constants.deceleration.shape == (3,)
+
+
+def test_draws_follow_the_seed_and_keep_pairs_together():
+    population = bootstrap()
+    first, again = (population.draw(500, torch.Generator().manual_seed(7)) for _ in range(2))
+    assert torch.equal(first, again)
+    assert first.min() >= 0
+    assert first.max() < 249
+    chosen = population.select(first)
+    pairs = set(zip(population.desired_speed.tolist(), population.time_gap.tolist(), strict=True))
+    assert set(zip(chosen.desired_speed.tolist(), chosen.time_gap.tolist(), strict=True)) <= pairs
+
+
+def test_kde_resembles_the_drivers_within_the_bounds():
+    population, drawn = bootstrap(), kde(drivers=5000, seed=1)
+    assert len(drawn) == 5000
+    assert drawn.constants == population.constants
+    assert drawn.desired_speed.min() >= 5.0
+    assert drawn.desired_speed.max() <= 40.0
+    assert drawn.time_gap.min() >= 0.3
+    assert drawn.time_gap.max() <= 4.0
+    assert drawn.time_gap.mean() == pytest.approx(population.time_gap.mean().item(), rel=0.05)
+    assert drawn.summary()["correlation"] == pytest.approx(0.15, abs=0.06)
+    assert torch.equal(drawn.desired_speed, kde(drivers=5000, seed=1).desired_speed)
+    assert not torch.equal(drawn.desired_speed, kde(drivers=5000, seed=2).desired_speed)
+
+
+def test_kde_clips_to_given_bounds_and_draws_all_free_parameters():
+    drawn = kde(drivers=50, bounds={"time_gap": [1.0, 1.5]}, mode="global")
+    assert drawn.time_gap.min() >= 1.0
+    assert drawn.time_gap.max() <= 1.5
+    assert drawn.constants.acceleration.shape == (50,)
+
+
+def test_fixed_is_one_driver():
+    population = fixed(desired_speed=22.0, time_gap=1.4, min_gap=3.0)
+    assert len(population) == 1
+    assert population.desired_speed.tolist() == [22.0]
+    assert population.constants.min_gap == 3.0
+    assert np.isnan(population.summary()["correlation"])
+
+
+def test_tables_of_one_mode_or_none_are_read(table, written):
+    assert len(load_drivers(written(table))) == 20
+    assert len(bootstrap(written(table.drop(columns=["mode", "recording"])))) == 20
+    with pytest.raises(DataError, match="no drivers of mode 'global'"):
+        load_drivers(written(table), mode="global")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.iloc[:0], "no drivers"),
+        (lambda t: t.drop(columns="time_gap_s"), r"drivers\.parquet: missing.*time_gap_s"),
+        (lambda t: t.assign(time_gap_s="x"), "'time_gap_s' is not numeric"),
+        (lambda t: t.assign(time_gap_s=t["time_gap_s"].where(t.index != 4)), "row 4.*time_gap_s"),
+        (lambda t: t.assign(min_gap_m=0.0), "row 0.*min_gap_m.*positive"),
+        (lambda t: t.assign(desired_speed_mps=np.inf), "row 0.*desired_speed_mps"),
+    ],
+)
+def test_bad_tables_end_in_one_clear_error(table, written, change, message):
+    with pytest.raises(DataError, match=message):
+        load_drivers(written(change(table)))
+    with pytest.raises(DataError):
+        from_table(change(table))
+
+
+def test_missing_and_damaged_files_are_named(tmp_path):
+    with pytest.raises(DataError, match=r"nothing\.parquet: no such file"):
+        bootstrap(tmp_path / "nothing.parquet")
+    (tmp_path / "damaged.parquet").write_bytes(b"PAR1 and no more")
+    with pytest.raises(DataError, match=r"damaged\.parquet: not a readable"):
+        bootstrap(tmp_path / "damaged.parquet")
+
+
+def test_bad_settings_are_refused(table, written):
+    for call in (
+        lambda: bootstrap(mode="locl"),
+        lambda: kde(drivers=0),
+        lambda: kde(bandwidth=-1.0),
+        lambda: fixed(desired_speed=-1.0),
+        lambda: fixed(min_gap=0.0),
+    ):
+        with pytest.raises(ConfigError):
+            call()
+    with pytest.raises(DataError, match="density"):
+        kde(written(table.head(1)))

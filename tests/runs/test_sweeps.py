@@ -1,0 +1,245 @@
+"""Sweeps: started again they skip, resume and list; their folders are found again."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import compare_launchers
+import pandas as pd
+import pytest
+from omegaconf import OmegaConf
+from test_entry_points import tiny
+
+from lcc_rl import results, train
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.runs import identity
+from lcc_rl.runs import cli
+from lcc_rl.runs.states import ERROR, Busy, claim
+from lcc_rl.runs.sweeps import (
+    Plan,
+    SweepCallback,
+    conclude,
+    make_plan,
+    parallel_jobs,
+    read_plan,
+    run_job,
+    run_name,
+    sweep_name,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_same_command_gets_the_same_folder() -> None:
+    one = sweep_name(None, ["seed=0,1", "variant=alcc"])
+    assert one == sweep_name(None, ["variant=alcc", "seed=0,1", "logger=wandb"])
+    assert one != sweep_name(None, ["variant=alcc", "seed=0,1,2"])
+    assert sweep_name("mine", ["seed=0,1"]) == "mine"
+
+
+def hydra_like(sweep: Path, *overrides: str):
+    """Return a job's whole configuration as Hydra builds it: the run's, and Hydra's own node."""
+    cfg = OmegaConf.create(OmegaConf.to_container(load("train", overrides)))
+    own = {"overrides": {"task": list(overrides)}, "sweep": {"dir": str(sweep)}, "sweeper": {}}
+    cfg.hydra = own
+    return cfg
+
+
+def test_run_names_are_one_level_short_and_found_again_by_hash(tmp_path) -> None:
+    path = "data.path='/some/where/a b.parquet'"
+    cfg = hydra_like(tmp_path, "data=episodes", path, "seed=3", "sweep=x")
+    (tmp_path / "sweep.json").write_text(json.dumps({"runs": 1, "varied": ["seed", "data.path"]}))
+    name = run_name(_root_=cfg)
+    mark = identity(load("train", ["data=episodes", path, "seed=3"]))[:8]
+    assert name == f"data.path=-some-where-a-b.parquet-,seed=3_{mark}"
+    # The same settings under another name: what was extended or typed in another order.
+    (tmp_path / f"old_{mark}").mkdir()
+    assert run_name(_root_=cfg) == f"old_{mark}"
+    long = hydra_like(tmp_path, "data=episodes", "data.path=" + "x" * 300)
+    assert len(run_name(_root_=long)) < 120
+
+
+def test_plans_know_grids_and_searches(tmp_path) -> None:
+    cfg = hydra_like(tmp_path, "seed=4")
+    cfg.hydra.overrides.task = ["seed=range(8)", "variant=alcc,reference", "agent.gamma=0.9"]
+    assert make_plan(cfg) == Plan(16, ["seed", "variant"])
+    # Where its rows are sent to does not make another run.
+    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,tensorboard"]
+    assert make_plan(cfg) == Plan(8, ["seed"])
+    cfg.hydra.sweeper = {"n_trials": 40, "params": {"agent.tau": "interval(0.001,0.01)"}}
+    cfg.hydra.overrides.task = []
+    assert make_plan(cfg) == Plan(40, ["agent.tau"])
+    assert read_plan(tmp_path) == Plan()
+
+
+def test_jobs_leave_no_core_to_two_threads(monkeypatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert [parallel_jobs(threads) for threads in (1, 2, 3, 16)] == [8, 4, 2, 1]
+
+
+def test_a_failed_run_is_recorded_and_the_next_goes_on(tmp_path) -> None:
+    def breaks(cfg):
+        raise ConfigError("too much")
+
+    assert run_job(breaks, tiny("train"), tmp_path / "a") is None
+    assert (tmp_path / "a" / ERROR).read_text() == "too much\n"
+    with pytest.raises(LccError, match="1 of 1 runs failed"):
+        conclude(tmp_path)
+
+    def busy(cfg):
+        raise Busy("another process")
+
+    assert run_job(busy, tiny("train"), tmp_path / "b") is None
+    assert not (tmp_path / "b").exists()
+
+    def stopped(cfg):
+        raise Interrupted("stopped after iteration 1")
+
+    # Not an Exception: a launcher would take that for one run's failure and begin the next.
+    with pytest.raises(KeyboardInterrupt):
+        run_job(stopped, tiny("train"), tmp_path / "c")
+
+
+def test_a_sweep_of_nothing_is_an_error(tmp_path) -> None:
+    with pytest.raises(LccError, match=r"nothing was swept, in .*is a list of values empty"):
+        conclude(tmp_path)
+
+
+def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) -> None:
+    def command() -> None:
+        monkeypatch.setattr(SweepCallback, "folder", tmp_path)
+        assert run_job(lambda cfg: 1 / 0, tiny("train"), tmp_path / "a") is None
+        raise ValueError("No trials are completed yet.")
+
+    with pytest.raises(LccError, match="1 of 1 runs failed"):
+        cli.sweep(command)
+    assert SweepCallback.folder is None
+
+
+def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, monkeypatch) -> None:
+    cfg = tiny("train", "variant=alcc", "training.episodes=32")
+    whole = train.complete(cfg, tmp_path / "whole")
+    written = (tmp_path / "whole" / "episodes.parquet").stat().st_mtime_ns
+    again = train.complete(cfg, tmp_path / "whole")
+    pd.testing.assert_frame_equal(again, whole, check_exact=True)
+    assert (tmp_path / "whole" / "episodes.parquet").stat().st_mtime_ns == written
+
+    iterate = train.Trainer._iterate
+
+    def dies(self, collector):
+        if self.iteration == 2:
+            raise MemoryError
+        return iterate(self, collector)
+
+    folder = tmp_path / "parts"
+    monkeypatch.setattr(train.Trainer, "_iterate", dies)
+    with pytest.raises(MemoryError):
+        train.complete(cfg, folder)
+    assert (folder / ERROR).read_text().startswith("MemoryError")
+    with pytest.raises(ResultsError, match=r"no episodes\.parquet"):
+        results.load(folder)
+    assert len(results.load(tmp_path, "training")) == 4 + 2  # readable while others are not done
+    begun: list[int] = []
+
+    def counted(self, collector):
+        begun.append(self.iteration)
+        return iterate(self, collector)
+
+    monkeypatch.setattr(train.Trainer, "_iterate", counted)
+    pd.testing.assert_frame_equal(train.complete(cfg, folder), whole, check_exact=True)
+    assert begun == [2, 3]
+    one, two = (read_parquet(tmp_path / f / "training.parquet") for f in ("whole", "parts"))
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
+    assert not (folder / ERROR).exists()
+
+
+def test_a_run_that_another_process_does_is_refused(tmp_path) -> None:
+    with claim(tmp_path), pytest.raises(Busy):
+        train.run(tiny("train", "variant=idm", agent=False), tmp_path)
+
+
+def test_objectives_are_columns_of_the_summary(tmp_path) -> None:
+    cfg = tiny("train", "variant=idm", "objective=[kj_per_km,collisions]", agent=False)
+    rows = train.run(cfg, tmp_path, quiet=True)
+    values = train.objective(cfg, rows)
+    assert values[1] == rows["collided"].sum()
+    with pytest.raises(ConfigError, match=r"unknown objective 'kj_per_k'.*'kj_per_km'"):
+        train.run(tiny("train", "objective=kj_per_k"), tmp_path / "b")
+
+
+def sweep(cwd: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
+    return subprocess.run(typed, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path) -> None:
+    words = ["experiment=smoke", "variant=idm", "data.platoons=4", "data.recordings=2"]
+    words += ["agent.time_gap=1.2,-1", "scenario.horizon=40", "sweep=mine"]
+    first = sweep(tmp_path, *words)
+    assert first.returncode == 2, first.stderr
+    assert "1 of 2 runs failed" in first.stderr
+    assert "Traceback" not in first.stderr
+    assert "failed: agent.time_gap=-1_" in first.stdout
+    folder = tmp_path / "outputs" / "train" / "mine"
+    assert read_plan(folder) == Plan(2, ["agent.time_gap"])
+    assert results.load(folder)["run"].nunique() == 1
+    second = sweep(tmp_path, *words)
+    assert "finished before" in second.stdout
+    assert second.returncode == 2
+
+
+def on_terminal(cwd: Path, *words: str) -> str:
+    """Do a sweep on a terminal and return what that showed."""
+    ours, its = pty.openpty()
+    typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
+    env = {**os.environ, "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
+    child = subprocess.Popen(typed, cwd=cwd, stdin=its, stdout=its, stderr=its, env=env)
+    os.close(its)
+    shown = b""
+    with suppress(OSError), open(ours, "rb", buffering=0) as screen:
+        while part := screen.read(65536):
+            shown += part
+    assert child.wait(60) == 2, shown.decode()
+    return shown.decode()
+
+
+def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
+    words = ["experiment=smoke", "variant=idm", "data.platoons=4", "data.recordings=2"]
+    words += ["agent.time_gap=1.2,1.3,-1", "scenario.horizon=40", "sweep=mine"]
+    shown = on_terminal(tmp_path, *words)
+    table, _, end = shown.rpartition("┘")
+    assert "waiting" in table
+    assert "3 runs: 2 finished, 1 failed" in end
+    assert "2 of 3 runs finished" in end
+    assert "failed: agent.time_gap=-1_" in end
+    # Log lines stay in the files, also Hydra's own between two runs.
+    assert "[lcc_rl][INFO]" not in shown
+    assert "#2 :" not in shown
+    (log,) = (tmp_path / "outputs/train/mine").glob("agent.time_gap=1.3_*/train.log")
+    assert "synthetic stream" in log.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit", "ray"])
+def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, capsys) -> None:
+    if not compare_launchers.installed(compare_launchers.LAUNCHERS[launcher][1]):
+        pytest.skip("extras sweeps, ray")
+    arguments = ["serial", launcher, "--seeds=1", f"--out={tmp_path}"]
+    assert compare_launchers.main(arguments) == 0
+    assert capsys.readouterr().out.count("those of serial") == 2
+
+
+def test_random_kills_lose_nothing() -> None:
+    """Thirty kills, or what fits in the time; by hand: python tools/kill_test.py --kills 200."""
+    words = [sys.executable, str(ROOT / "tools" / "kill_test.py"), "--kills=30", "--seconds=30"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert "nothing lost, all readable, rows identical" in done.stdout

@@ -1,0 +1,183 @@
+"""The ALCC study's tables against numbers worked out by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from study_frames import episodes, training
+
+from lcc_rl.results.tables import per_seed, savings
+from lcc_rl.studies.alcc import tables as alcc_tables
+
+# Mean energy of the human driver: + 2 kJ per driver number, + 5 kJ for the second of two profiles.
+SHIFT = 2.0 + 5.0
+
+
+def test_seeds_are_kept_apart() -> None:
+    found = per_seed(episodes(), "total_energy_kj")
+    assert set(found) == {"idm", "alcc", "reference"}  # direct has no total
+    # alcc: driver 0 of 3 draws 20 kJ more.
+    human = 40.0 + SHIFT + 20.0 / 3
+    assert found["alcc"].tolist() == pytest.approx([88.0 + human, 84.0 + human])
+    assert len(found["idm"]) == 1
+
+
+def test_headline_by_hand() -> None:
+    table = alcc_tables.headline(episodes()).set_index(["strategy", "against"])
+    idm = 100.0 + 50.0 + SHIFT
+    reference = 85.0 + 50.0 + SHIFT
+    alcc = 86.0 + 40.0 + SHIFT + 20.0 / 3
+    row = table.loc[("alcc", "idm")]
+    assert row["saving_pct"] == pytest.approx(100 * (1 - alcc / idm))
+    assert row["saving_pct_low"] == pytest.approx(100 * (1 - (alcc + 2) / idm))
+    assert row["saving_pct_high"] == pytest.approx(100 * (1 - (alcc - 2) / idm))
+    assert row["worst_seed_saving_pct"] == pytest.approx(row["saving_pct_low"])
+    assert row["net_saving_pct"] == pytest.approx(100 * (1 - (alcc - 20) / (idm - 20)))
+    row = table.loc[("alcc", "reference")]
+    assert row["saving_pct"] == pytest.approx(100 * (1 - alcc / reference))
+    assert row["saving_pct_low"] < row["saving_pct"] < row["saving_pct_high"]
+    assert set(table.index) == {("alcc", "idm"), ("alcc", "reference"), ("reference", "idm")}
+
+
+def test_one_seed_leaves_intervals_empty() -> None:
+    frame = episodes()
+    frame = frame[~(frame["training_seed"] == 1).fillna(False)]
+    table = alcc_tables.headline(frame)
+    assert table["saving_pct"].notna().all()
+    assert table["saving_pct_low"].isna().all()
+
+
+def test_energies_cover_every_strategy() -> None:
+    table = alcc_tables.energies(episodes()).set_index("strategy")
+    assert table.loc["direct", "hdv_energy_kj"] == pytest.approx(60.0 + SHIFT)
+    assert np.isnan(table.loc["direct", "total_energy_kj"])
+    assert table.loc["reference", "total_energy_kj"] == pytest.approx(135.0 + SHIFT)
+    assert table.loc["reference", "total_energy_kj_low"] == pytest.approx(130.0 + SHIFT)
+    assert table.loc["idm", "seeds"] == "–"
+    assert table.loc["alcc", "seeds"] == "2"
+
+
+def test_constraints_name_the_worst_seed() -> None:
+    table = alcc_tables.constraints(episodes()).set_index("strategy")
+    assert table.loc["alcc", "mean_unsafe_ttc_pct"] == pytest.approx(0.1)
+    assert table.loc["alcc", "worst_seed_unsafe_ttc_pct"] == pytest.approx(0.2)
+    assert table.loc["alcc", "mean_long_time_gap_pct"] == pytest.approx(0.5)
+    # The mean is within the limit of 0.1 %, the worst seed is not.
+    assert not table.loc["alcc", "within_limits"]
+    assert table.loc["reference", "within_limits"]
+    by_seed = alcc_tables.constraints_by_seed(episodes())
+    assert by_seed[["strategy", "seed"]].to_numpy().tolist() == [
+        ["alcc", "0"],
+        ["alcc", "1"],
+        ["reference", "0"],
+        ["reference", "1"],
+    ]
+
+
+def test_a_collision_is_over_the_limit() -> None:
+    frame = episodes()
+    frame.loc[frame.index[-1], "collided"] = True
+    table = alcc_tables.constraints(frame).set_index("strategy")
+    assert table.loc["reference", "collisions"] == 1
+    assert not table.loc["reference", "within_limits"]
+
+
+def test_table_iv_finds_the_best_and_the_worst_driver() -> None:
+    table = alcc_tables.table_iv(episodes()).set_index(["driver", "strategy", "from"])
+    ours = table.xs("this study", level="from")
+    # Over both profiles; driver 0 is the one that alcc costs 20 kJ.
+    assert ours.loc[("worst", "alcc"), "hdv_energy_kj"] == pytest.approx(40.0 + 5.0 + 20.0)
+    assert ours.loc[("worst", "alcc"), "saving_pct"] == pytest.approx(100 * (1 - 151 / 140))
+    # Drivers 1 and 2 save the same 9 kJ; driver 1 saves it of less.
+    assert ours.loc[("best", "alcc"), "total_energy_kj"] == pytest.approx(86.0 + 47.0)
+    assert ours.loc[("best", "alcc"), "saving_pct"] == pytest.approx(100 * (1 - 133 / 142))
+    assert ours.loc[("mean", "reference"), "cav_energy_kj"] == pytest.approx(85.0)
+    paper = table.xs("paper", level="from")
+    assert paper.loc[("mean", "reference"), "total_energy_kj"] == 408.74
+    assert paper.loc[("worst", "alcc"), "saving_pct"] == -4.92
+    assert ("best", "reference") not in paper.index
+
+
+def test_paper_numbers_agree_with_each_other() -> None:
+    for cav, hdv, total in alcc_tables.PAPER_TABLE_IV.values():
+        assert cav + hdv == pytest.approx(total, abs=0.011)
+    reference, alcc = (alcc_tables.PAPER_TABLE_IV[name][2] for name in ("reference", "alcc"))
+    assert 100 * (1 - alcc / reference) == pytest.approx(4.38, abs=0.005)
+    human = alcc_tables.PAPER_HUMAN
+    assert 100 * (1 - human["A"] / human["B"]) == pytest.approx(22.1, abs=0.05)
+
+
+def test_holistic_counts_drivers_that_are_worse_off() -> None:
+    table = alcc_tables.holistic(episodes())
+    assert table["drivers_worse_off"].tolist() == ["1 of 3", "1 of 3", "138 of 923"]
+    assert table.loc[0, "worst_driver_pct"] == pytest.approx(100 * (1 - 151 / 140))
+
+
+def test_generalization_has_every_profile_and_the_papers_four() -> None:
+    table = alcc_tables.generalization(episodes())
+    assert len(table) == 2
+    human = 2.0 + 20.0 / 3
+    assert table.loc[1, "saving_pct"] == pytest.approx(
+        100 * (1 - (86.0 + 50.0 + human) / (85.0 + 60.0 + 2.0))
+    )
+    assert table.loc[0, "reference_energy_kj"] == pytest.approx(85.0 + 52.0)
+    row = alcc_tables.generalization_row(episodes())
+    assert row["profiles"].tolist() == [2, 2, 4]
+    assert row.loc[2, "median_pct"] == pytest.approx((7.00 + 8.04) / 2)
+    headline = alcc_tables.headline(episodes()).set_index(["strategy", "against"])
+    assert row.loc[0, "together_pct"] == headline.loc[("alcc", "reference"), "saving_pct"]
+
+
+def test_human_energy_by_hand() -> None:
+    table = alcc_tables.human_energy(episodes()).set_index(["behind", "energy"])
+    row = table.loc[("reference", "raw")]
+    assert row["scenario_A_kj"] == pytest.approx(57.0)
+    assert row["scenario_B_kj"] == pytest.approx(67.0)
+    assert row["saving_pct"] == pytest.approx(100 * 10 / 67)
+    # The reference's seeds differ in the car's energy only.
+    assert row["saving_pct_low"] == pytest.approx(row["saving_pct"])
+    # alcc costs driver 0: it draws 65 kJ in A and 65 kJ in B.
+    assert table.loc[("alcc", "raw"), "drivers_better_off"] == "2 of 3"
+
+
+def test_learning_statistics() -> None:
+    frame = training()
+    table = alcc_tables.learning(frame)
+    assert len(table) == 4
+    first = table.iloc[0]
+    assert (first["variant"], first["seed"], first["episodes"]) == ("alcc", "0", 400)
+    # Tenths of 20 iterations: means of two neighbours.
+    assert first["first_tenth"] == pytest.approx(-99.5)
+    assert first["last_tenth"] == pytest.approx(-81.5)
+    assert first["sd_in_last_tenth"] == pytest.approx(0.5)
+    assert first["drop"] == 0.0
+    frame.loc[frame["iteration"] > 18, "episode_reward"] -= 10.0
+    assert alcc_tables.learning(frame).iloc[0]["drop"] == pytest.approx(8.0)
+
+
+def test_ablations_are_compared_with_the_humans_of_their_own_scenario() -> None:
+    other = episodes()
+    other[["cav_energy_kj", "total_energy_kj"]] *= 2.0
+    frame = pd.concat([episodes().assign(ablation="none"), other.assign(ablation="double")])
+    table = alcc_tables.comparison(frame).set_index(["ablation", "strategy"])
+    one, two = (table.loc[(name, "alcc")] for name in ("none", "double"))
+    assert one["saving_against_idm_pct"] == pytest.approx(two["saving_against_idm_pct"])
+    assert two["total_energy_kj"] == pytest.approx(2 * one["total_energy_kj"])
+    assert one["unsafe_ttc_pct"] == pytest.approx(0.1)
+    assert (one["rms_jerk_mps3"], one["worst_seed_rms_jerk_mps3"]) == (1.5, 2.0)
+    assert one["worst_seed_energy_kj"] > one["total_energy_kj"]
+    assert np.isnan(table.loc[("none", "reference"), "saving_against_reference_pct"])
+
+
+def test_single_profile_counts_seeds_that_beat_the_human() -> None:
+    frame = episodes(profiles=1).assign(study_profile=7)
+    cars = frame["strategy"].eq("reference") & frame["training_seed"].eq(1).fillna(False)
+    frame.loc[cars, "total_energy_kj"] = 500.0
+    row = alcc_tables.single_profile(frame).iloc[0]
+    assert row["profile"] == "7"
+    assert row["idm_energy_kj"] == pytest.approx(152.0)
+    assert row["reference_seeds_below_idm"] == "1 of 2"
+    assert row["alcc_seeds_below_idm"] == "2 of 2"
+
+
+def test_savings_are_missing_where_a_side_is() -> None:
+    assert np.isnan(savings(episodes(), "total_energy_kj", "alcc", "nobody").value)

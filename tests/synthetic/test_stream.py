@@ -1,0 +1,225 @@
+"""The synthetic stream: its drivers are who it says, it is repeatable, and it resembles I-80."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from lcc_rl.data.car_following import Criteria
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.statistics import compare_statistics, leader_statistics
+from lcc_rl.drivers.idm_fit import fit
+from lcc_rl.drivers.population import bootstrap, fixed
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.idm import IDMConstants, simulate_follower
+from lcc_rl.io.files import read_parquet
+from lcc_rl.synthetic.stop_and_go import StopAndGo, jumps, stratified_normal
+from lcc_rl.synthetic.stream import Stream, StreamSource, draw_drivers, truth_path
+
+SMALL: dict[str, Any] = {"recordings": 2, "platoons": 4, "vehicles": 3, "duration_s": (35.0, 50.0)}
+MATCH = 0.15  # the accepted deviation of every compared number
+
+
+@pytest.fixture(scope="module")
+def stream() -> Stream:
+    return StreamSource(**SMALL, noise=0.0, seed=5).generate()
+
+
+def vehicle(stream: Stream, recording: str, number: int) -> pd.DataFrame:
+    samples = stream.samples
+    return samples[(samples["recording"] == recording) & (samples["vehicle"] == number)]
+
+
+@pytest.fixture(scope="module")
+def real_statistics(shared_data: Path) -> pd.DataFrame:
+    return leader_statistics(pd.read_parquet(shared_data / "i80_pairs.parquet"))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_leaders_match_i80(real_statistics: pd.DataFrame, seed: int) -> None:
+    episodes = StreamSource(seed=seed).load().episodes
+    assert 200 <= episodes["episode"].nunique() <= 300
+    table = compare_statistics(real_statistics, leader_statistics(episodes))
+    assert (table["deviation"].abs() < MATCH).all(), table.to_string()
+
+
+def test_followers_are_idm_with_the_stated_parameters(stream: Stream) -> None:
+    assert len(stream.truth) == 2 * 4 * 2
+    for driver in stream.truth.itertuples():
+        own = vehicle(stream, driver.recording, driver.vehicle)
+        ahead = vehicle(stream, driver.recording, driver.preceding)
+        length = ahead["length_m"].iloc[0]
+        gap = ahead["position_m"].to_numpy() - length - own["position_m"].to_numpy()
+        speeds, gaps, accelerations = simulate_follower(
+            torch.tensor(ahead["speed_mps"].to_numpy())[:, None],
+            torch.tensor(own["speed_mps"].to_numpy()[:1]),
+            torch.tensor(gap[:1]),
+            torch.tensor([driver.desired_speed_mps]),
+            torch.tensor([driver.time_gap_s]),
+            IDMConstants(driver.acceleration_mps2, driver.deceleration_mps2, driver.min_gap_m),
+            0.1,
+        )
+        assert own["speed_mps"].to_numpy() == pytest.approx(speeds[:, 0].numpy(), abs=1e-9)
+        assert gap == pytest.approx(gaps[:, 0].numpy(), abs=1e-9)
+        executed = own["acceleration_mps2"].to_numpy()[1:]
+        assert executed == pytest.approx(accelerations[:, 0].numpy(), abs=1e-8)
+
+
+def test_calibration_recovers_the_time_gaps(stream: Stream, tmp_path: Path) -> None:
+    source = StreamSource(**SMALL, noise=0.0, seed=5, keep=str(tmp_path / "stream.csv"))
+    found = fit(source.load().episodes).drivers
+    keys = ["recording", "vehicle"]
+    both = found.rename(columns={"follower_id": "vehicle"}).merge(
+        source.generate().truth, on=keys, suffixes=("", "_true")
+    )
+    assert len(both) == len(found) >= 12
+    error = (both["time_gap_s"] - both["time_gap_s_true"]).abs()
+    assert error.median() < 0.02
+    assert error.max() < 0.3
+    assert found["rmspe"].median() < 0.005
+
+
+def test_nobody_reverses_or_collides() -> None:
+    samples = StreamSource(recordings=1, vehicles=8, seed=3).generate().samples
+    assert (samples["speed_mps"] >= 0.0).all()
+    assert (samples["position_m"] > 0.0).all()
+    ahead = samples[["vehicle", "frame", "position_m", "length_m"]]
+    pairs = samples.merge(
+        ahead, left_on=["preceding", "frame"], right_on=["vehicle", "frame"], suffixes=("", "_0")
+    )
+    assert len(pairs) == (samples["preceding"] > 0).sum()
+    assert (pairs["position_m_0"] - pairs["length_m_0"] - pairs["position_m"] > 0.5).all()
+
+
+def test_motion_is_consistent(stream: Stream) -> None:
+    for _, own in stream.samples.groupby(["recording", "vehicle"]):
+        speed, position = own["speed_mps"].to_numpy(), own["position_m"].to_numpy()
+        assert np.diff(position) == pytest.approx(0.05 * (speed[1:] + speed[:-1]), abs=1e-9)
+        assert np.diff(speed) / 0.1 == pytest.approx(
+            own["acceleration_mps2"].to_numpy()[1:], abs=1e-9
+        )
+        assert (np.diff(own["frame"]) == 1).all()
+
+
+def test_same_seed_same_bytes(tmp_path: Path) -> None:
+    first, second, other = (tmp_path / name for name in ("a.csv", "b.csv", "c.csv"))
+    StreamSource(**SMALL, seed=5).write(first)
+    StreamSource(**SMALL, seed=5).write(second)
+    StreamSource(**SMALL, seed=6).write(other)
+    assert first.read_bytes() == second.read_bytes()
+    assert first.read_bytes() != other.read_bytes()
+
+
+def test_file_and_truth_are_kept_where_asked(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "stream.csv.gz"
+    source = StreamSource(**SMALL, seed=5, keep=str(path))
+    loaded = source.load()
+    assert sorted(file.name for file in path.parent.iterdir()) == [
+        "stream.csv.gz",
+        "stream_truth.parquet",
+    ]
+    truth = read_parquet(truth_path(path))
+    pd.testing.assert_frame_equal(truth, source.generate().truth)
+    pairs = loaded.episodes[["recording", "follower_id", "leader_id"]].drop_duplicates()
+    assert pairs.to_numpy().tolist() == truth[["recording", "vehicle", "preceding"]].values.tolist()
+    assert "seed 5" in loaded.report[0]
+
+
+def test_a_recording_does_not_depend_on_how_many_there_are() -> None:
+    settings: dict[str, Any] = SMALL | {"recordings": 1}
+    one, two = StreamSource(**settings).generate(), StreamSource(**SMALL).generate()
+    part = two.samples[two.samples["recording"] == one.samples["recording"].iloc[0]]
+    pd.testing.assert_frame_equal(part.reset_index(drop=True), one.samples)
+
+
+def test_vehicle_ids_start_again_in_every_recording(stream: Stream) -> None:
+    ids = stream.samples.groupby("recording")["vehicle"].agg(["min", "max"])
+    assert ids.to_numpy().tolist() == [[1, 12], [1, 12]]
+
+
+def test_the_file_reads_back(stream: Stream, tmp_path: Path) -> None:
+    path = tmp_path / "stream.csv"
+    StreamSource(**SMALL, noise=0.0, seed=5).write(path)
+    order = ["recording", "vehicle", "frame"]
+    back = read_ngsim(path).samples.sort_values(order, ignore_index=True)
+    assert back["recording"].nunique() == 2
+    for name in ("vehicle", "frame", "preceding", "lane", "vehicle_class"):
+        assert back[name].tolist() == stream.samples[name].tolist(), name
+    for name in ("position_m", "speed_mps", "acceleration_mps2", "length_m"):
+        # Three decimals of a foot, in float32.
+        assert back[name].to_numpy() == pytest.approx(stream.samples[name].to_numpy(), abs=2e-4)
+
+
+def test_drivers_can_keep_up() -> None:
+    generator = np.random.default_rng(0)
+    drivers = bootstrap()
+    level = np.array([2.0, 8.0, 60.0])
+    chosen = drivers.desired_speed[draw_drivers(drivers, level, (500, 3), generator)]
+    assert (chosen[:, 1] >= 1.2 * 8.0).all()
+    assert (chosen[:, 2] == drivers.desired_speed.max()).all()  # nobody is that fast
+    assert len(chosen[:, 0].unique()) > 50
+
+
+def test_own_drivers_and_leader_are_used() -> None:
+    source = StreamSource(
+        **SMALL, drivers=fixed(30.0, 1.6), leader=StopAndGo(10.0, 0.0, 0.0, ripple_spread_mps=0.0)
+    )
+    made = source.generate()
+    assert (made.truth["time_gap_s"] == np.float32(1.6)).all()
+    leaders = made.samples[made.samples["preceding"] == 0]
+    assert leaders["speed_mps"].to_numpy() == pytest.approx(10.0)
+
+
+def test_stratified_sample_has_the_moments_of_the_normal() -> None:
+    values = stratified_normal(400, np.random.default_rng(0))
+    assert abs(values.mean()) < 0.02
+    assert values.std() == pytest.approx(1.0, abs=0.02)
+    assert np.isfinite(stratified_normal(1, np.random.default_rng(0))).all()
+
+
+def test_jumps_hold_as_long_as_stated() -> None:
+    values = jumps((20_000, 3), 0.02, np.random.default_rng(0))
+    assert (np.diff(values, axis=0) != 0).mean() == pytest.approx(0.02, rel=0.1)
+    assert values.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_configuration_holds_the_defaults() -> None:
+    file = resources.files("lcc_rl.conf") / "data" / "stream.yaml"
+    source = instantiate(OmegaConf.create(file.read_text(encoding="utf-8")))
+    default = StreamSource(leader=StopAndGo(), criteria=Criteria())
+    assert replace(source, duration_s=tuple(source.duration_s)) == default
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("recordings", 0),
+        ("recordings", 1.5),
+        ("platoons", 0),
+        ("vehicles", 1),
+        ("seed", -1),
+        ("noise", -0.1),
+        ("noise", float("nan")),
+        ("duration_s", (60.0, 30.0)),
+        ("duration_s", 60.0),
+        ("duration_s", (60.0, float("inf"))),
+    ],
+)
+def test_bad_arguments_are_named(name: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=f"'{name}'"):
+        StreamSource(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["mean_speed_mps", "wave_s", "response_s", "level_spread_mps"])
+def test_bad_leader_parameters_are_named(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"'{name}'"):
+        StopAndGo(**{name: -1.0})
