@@ -1,4 +1,4 @@
-"""Configuration room: schemas of the entry points, and the one way from a node to an object."""
+"""Composes configurations and builds the objects that their nodes describe."""
 
 from __future__ import annotations
 
@@ -8,131 +8,25 @@ import json
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
-from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_errors import check_keys, explain, refused_key
-from lcc_rl.errors import ConfigError, LccError, unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
+from lcc_rl.schemas import register_schemas
 
 TARGET = "_target_"
 CONF = "lcc_rl.conf"
-
-
-@dataclass
-class ScenarioConfig:
-    """A scenario: its clock and its pieces, in the order in which they act."""
-
-    name: str = MISSING
-    horizon: int = MISSING
-    time_step: float = MISSING
-    followers: int = MISSING
-    pieces: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass
-class RewardConfig:
-    """The reward: named terms."""
-
-    terms: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass
-class TrainingConfig:
-    """Length and bookkeeping of a training; the algorithm's own settings are the agent's."""
-
-    episodes: int = MISSING
-    environments: int = MISSING
-    segment: int = MISSING
-    checkpoint_every: int = MISSING
-    keep_every: int | None = None
-    compiled: bool | None = None
-
-
-@dataclass
-class EvaluationConfig:
-    """Size of the Monte Carlo evaluation."""
-
-    profiles: int | None = MISSING
-    drivers: int | None = MISSING
-    batch_size: int = MISSING
-    seed: int = MISSING
-    sample_episodes: int = MISSING
-    full_length: bool = False
-
-
-@dataclass
-class StudyConfig:
-    """What every entry point that drives a controlled car shares."""
-
-    variant: str = MISSING
-    seed: int = MISSING
-    device: str = MISSING
-    threads: int = MISSING
-    matmul_precision: str = "highest"
-    data: Any = MISSING
-    drivers: Any = MISSING
-    split: Any = MISSING
-    leader: Any = None
-    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
-    observation: Any = MISSING
-    reward: RewardConfig = field(default_factory=RewardConfig)
-    agent: Any = MISSING
-    gains: Any = None
-    controller: Any = None
-    # Here, not in TrainConfig, so that one recipe serves every entry point.
-    training: TrainingConfig = field(default_factory=TrainingConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    trust: list[str] = field(default_factory=list)
-
-
-@dataclass
-class TrainConfig(StudyConfig):
-    """``python -m lcc_rl.train``."""
-
-    resume: str | None = None
-    sweep: str | None = None
-    objective: Any = "total_net_energy_kj"
-    policy: str | None = None
-    logger: Any = MISSING
-
-
-@dataclass
-class EvaluateConfig(StudyConfig):
-    """``python -m lcc_rl.evaluate``."""
-
-    policy: str | None = None
-    compare: list[str] = field(default_factory=list)
-
-
-@dataclass
-class PipelineConfig(TrainConfig):
-    """``python -m lcc_rl.pipeline``."""
-
-    calibration: Any = MISSING
-    variants: list[str] = MISSING
-    jobs: int = MISSING
-
-
-def register_schemas() -> None:
-    """Make the schemas known to Hydra; each yaml names its own first in its defaults."""
-    store = ConfigStore.instance()
-    for name, schema in (
-        ("train_schema", TrainConfig),
-        ("evaluate_schema", EvaluateConfig),
-        ("pipeline_schema", PipelineConfig),
-    ):
-        store.store(name=name, node=schema)
 
 
 def chosen_folder(resumed: str | None, fresh: str) -> str:
@@ -146,10 +40,16 @@ def chosen_folder(resumed: str | None, fresh: str) -> str:
     return str(resumed or fresh)
 
 
+def terms_of_energy(string: Any) -> float:
+    """Return how many vehicles' energy counts for an automated one: its own and those behind."""
+    roles = parse_string(plain(string) if OmegaConf.is_config(string) else string)
+    return 1.0 + roles.count(HUMAN) / max(roles.count(AUTOMATED), 1)
+
+
 register_schemas()
 OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
 OmegaConf.register_new_resolver("lcc.pairs", lambda a, b: len(a) * len(b), replace=True)
-OmegaConf.register_new_resolver("lcc.add", lambda *numbers: float(sum(numbers)), replace=True)
+OmegaConf.register_new_resolver("lcc.energies", terms_of_energy, replace=True)
 
 
 def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
@@ -220,8 +120,19 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     if not isinstance(settings, Mapping) or TARGET not in settings:
         raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}")
     target = find_target(str(settings[TARGET]), where)
-    signature = inspect.signature(target).parameters
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
+    own = getattr(target, "Settings", None)
+    if own is None:
+        return _construct(target, given, where, resources)
+    # A class with a dataclass of settings: the node's keys are its fields.
+    return _construct(
+        target, {}, where, {**resources, "settings": _construct(own, given, where, {})}
+    )
+
+
+def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[str, Any]) -> Any:
+    """Call a class or function with the arguments that a node gives and, else, the resources."""
+    signature = inspect.signature(target).parameters
     for key in given:
         if key not in signature:
             own = set(signature) - set(resources)
@@ -239,7 +150,7 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}
     missing = sorted(required - set(arguments) - set(offered))
     if missing:
-        raise ConfigError(f"{where}: missing {', '.join(missing)} of {settings[TARGET]}")
+        raise ConfigError(f"{where}: missing {', '.join(missing)} of {target.__name__}")
     return target(**arguments, **offered)
 
 
@@ -307,16 +218,3 @@ def require(condition: bool, message: str) -> None:
     """Raise a ConfigError with the message unless the condition holds."""
     if not condition:
         raise ConfigError(message)
-
-
-__all__ = [
-    "EvaluateConfig",
-    "LccError",
-    "PipelineConfig",
-    "TrainConfig",
-    "build",
-    "config_hash",
-    "load",
-    "plain",
-    "require",
-]

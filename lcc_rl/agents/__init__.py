@@ -1,4 +1,4 @@
-"""Agent room: one learning algorithm a file, trained by one of two loops with one record."""
+"""Agents: one learning algorithm a file, trained by one of two loops with one record."""
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.ddpg import DDPG

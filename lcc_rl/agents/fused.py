@@ -1,4 +1,4 @@
-"""DDPG's update with its gradient written out: the same numbers as TorchRL's loss, much sooner.
+"""DDPG's update with its gradient written out: the numbers of TorchRL's loss, in less time.
 
 For networks this small, half of an update by automatic differentiation is bookkeeping. Here each
 pair of networks lives in one vector, so that Adam and the soft target update are one operation
@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+
+from lcc_rl.agents.off_policy import OffPolicySettings
 
 Layers = list[tuple[Tensor, Tensor]]
 
@@ -87,10 +89,8 @@ class FusedUpdate:
         critic: the same of the Q network, which reads observation and action side by side.
         target_actor: the actor's target network.
         target_critic: the critic's target network.
-        learning_rates: of actor and critic.
-        gamma: discount.
-        tau: share by which the targets follow.
-        saturation: weight of the penalty on the actor's square output before the tanh.
+        settings: learning rates, discount, share by which the targets follow, and the weight of
+            the penalty on the actor's square output before the tanh.
     """
 
     def __init__(
@@ -99,19 +99,17 @@ class FusedUpdate:
         critic: Sequence[Tensor],
         target_actor: Sequence[Tensor],
         target_critic: Sequence[Tensor],
-        learning_rates: tuple[float, float],
-        gamma: float,
-        tau: float,
-        saturation: float,
+        settings: OffPolicySettings,
     ) -> None:
-        self.gamma, self.tau, self.saturation = gamma, tau, saturation
+        self.gamma, self.tau = settings.gamma, settings.tau
+        self.saturation = settings.saturation
         self.online = [join(actor), join(critic)]
         self.following = [join(target_actor).data, join(target_critic).data]
         self.actor, self.critic = layers(actor), layers(critic)
         self.target_actor, self.target_critic = layers(target_actor), layers(target_critic)
         self.actor_slopes = gradients(self.online[0], actor)
         self.critic_slopes = gradients(self.online[1], critic)
-        groups = zip(self.online, learning_rates, strict=True)
+        groups = zip(self.online, (settings.actor_lr, settings.critic_lr), strict=True)
         self.optimizer = torch.optim.Adam(
             [{"params": [vector], "lr": rate} for vector, rate in groups], fused=True
         )

@@ -20,14 +20,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import TrainingConfig, require
+from lcc_rl.config import require
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_torch, write_parquet, write_torch
+from lcc_rl.pieces.rewards import REWARD, TERMS
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.schemas import TrainingConfig
 
 # What the record of an iteration is made from.
-REPORTED = (("next", "reward"), ("next", "reward_terms"), ("next", "done"), ("next", "terminated"))
+REPORTED = (
+    ("next", *REWARD),
+    ("next", *TERMS),
+    ("next", "done"),
+    ("next", "terminated"),
+)
 
 
 def derived_seed(*parts: object) -> int:
@@ -36,27 +43,32 @@ def derived_seed(*parts: object) -> int:
     return int.from_bytes(digest[:4], "big") >> 1
 
 
-def check_final_share(final_share: float) -> None:
-    """Check the share of learning rates at the end, see :func:`anneal`.
+def check_fraction(final_lr_fraction: float) -> None:
+    """Check the fraction of learning rates at the end, see :func:`anneal`.
 
     Raises:
         ConfigError: if it is out of range.
     """
-    require(0 < final_share <= 1, f"agent.final_share must lie in (0, 1], got {final_share}")
+    require(
+        0 < final_lr_fraction <= 1,
+        f"agent.final_lr_fraction must lie in (0, 1], got {final_lr_fraction}",
+    )
 
 
-def anneal(optimizers: Iterable[torch.optim.Optimizer], share: float, final_share: float) -> float:
+def anneal(
+    optimizers: Iterable[torch.optim.Optimizer], share: float, final_lr_fraction: float
+) -> float:
     """Let learning rates fall along half a cosine, from what they are made with to a share of it.
 
     Args:
         optimizers: whose rates to set.
         share: how much of the training is over.
-        final_share: of the rate at the start, at the end; 1 for a constant rate.
+        final_lr_fraction: of the rate at the start, at the end; 1 for a constant rate.
 
     Returns:
         The first rate.
     """
-    factor = final_share + (1.0 - final_share) * 0.5 * (1.0 + math.cos(math.pi * share))
+    factor = final_lr_fraction + (1.0 - final_lr_fraction) * 0.5 * (1.0 + math.cos(math.pi * share))
     groups = [group for optimizer in optimizers for group in optimizer.param_groups]
     for group in groups:
         group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
@@ -232,7 +244,7 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     """Summarise the first episode of every slot of a batch ``[environments, steps]``.
 
     A collision ends an episode early; what the collector appends after it belongs to another
-    episode and is left out. The followers of a platoon are added up.
+    episode and is left out. All automated vehicles are added up.
 
     Returns:
         Mean sums per episode of the reward and of every term, and the number of collisions.
@@ -244,9 +256,9 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
         entry = entry.flatten(2).sum(-1, keepdim=True)
         return float((entry * alive).sum(1).double().mean())
 
-    terms = batch["next", "reward_terms"]
+    terms = batch.get(("next", *TERMS))
     return {
-        "episode_reward": per_episode(batch["next", "reward"]),
+        "episode_reward": per_episode(batch.get(("next", *REWARD))),
         **{f"reward_{name}": per_episode(terms[name]) for name in terms.keys()},  # noqa: SIM118
         "collisions": float((batch["next", "terminated"] & alive).sum()),
     }

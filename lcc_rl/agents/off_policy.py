@@ -1,96 +1,183 @@
-"""What the agents that learn from a replay buffer share besides DDPG's own update."""
+"""What agents that learn from a replay buffer share: settings, networks and optimizers."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
-from lcc_rl.agents.ddpg import Exploration, check_gentleness, check_settings, leaves
-from lcc_rl.agents.loop import anneal, derived_seed
-from lcc_rl.errors import require_positive
+from lcc_rl.agents.loop import anneal, check_fraction, derived_seed
+from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
 
-class OffPolicy(ABC):
-    """A policy, its loss and its optimizers; a subclass says what an update is.
+@dataclass(frozen=True)
+class Exploration:
+    """Schedule of the exploration noise, falling linearly during training.
 
     Args:
-        observation_size, action_size, seed, gamma, hidden, batch_size, buffer_size, tau,
-            updates_per_transition, saturation, final_share, exploration, device: see
-            :class:`lcc_rl.agents.DDPG`.
+        initial: standard deviation at the first episode.
+        final: after the decay.
+        decay_share: share of the training over which it falls.
+
+    Raises:
+        ConfigError: if a value is out of range.
+    """
+
+    initial: float = 0.4
+    final: float = 0.05
+    decay_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.initial < 0 or self.final < 0 or not 0 < self.decay_share <= 1:
+            raise ConfigError(
+                "agent.exploration: initial and final must not be negative and decay_share must "
+                f"lie in (0, 1], got {self}"
+            )
+
+    def sigma(self, share: float) -> float:
+        """Return the standard deviation after this share of the training."""
+        return self.initial + (self.final - self.initial) * min(share / self.decay_share, 1.0)
+
+
+@dataclass(frozen=True)
+class OffPolicySettings:
+    """Settings that all agents with a replay buffer share; conf/agent holds their values.
+
+    Args:
+        gamma: discount.
+        hidden: sizes of the ReLU layers of policy and Q networks.
+        actor_lr: learning rate of the policy.
+        critic_lr: learning rate of the Q networks.
+        batch_size: transitions per update.
+        buffer_size: transitions that the replay buffer holds.
+        tau: share by which the target networks follow at every update.
+        saturation: weight of a penalty on the square of the actor's output before its tanh; 0 is
+            the literal algorithm. Without it some seeds brake fully for ever: where every action
+            leads to the same end, nothing else draws the actor back from the tanh's flat part.
+        final_lr_fraction: of the learning rates at the end; they fall to it along half a cosine.
+            1 is the literal algorithm, whose policy keeps swinging until it stops.
+        updates_per_transition: updates per collected transition.
+        exploration: schedule of the exploration, see :class:`Exploration`.
 
     Raises:
         ConfigError: if a setting is out of range or contradicts another.
     """
 
-    learns: ClassVar[bool] = True
+    gamma: float = 0.9
+    hidden: Sequence[int] = (200, 100, 50)
+    actor_lr: float = 1e-3
+    critic_lr: float = 1e-3
+    batch_size: int = 1024
+    buffer_size: int = 20000
+    tau: float = 0.005
+    saturation: float = 0.001
+    final_lr_fraction: float = 0.05
+    updates_per_transition: float = 0.125
+    exploration: Mapping[str, float] = field(
+        default_factory=lambda: {"initial": 0.4, "final": 0.05, "decay_share": 0.5}
+    )
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.gamma < 1.0:
+            raise ConfigError(f"agent.gamma must lie in [0, 1), got {self.gamma}")
+        if not 0.0 < self.tau <= 1.0:
+            raise ConfigError(f"agent.tau must lie in (0, 1], got {self.tau}")
+        if not 0 < self.batch_size <= self.buffer_size:
+            raise ConfigError(
+                f"agent.batch_size ({self.batch_size}) must be positive and at most "
+                f"agent.buffer_size ({self.buffer_size})"
+            )
+        if self.saturation < 0:
+            raise ConfigError(f"agent.saturation must not be negative, got {self.saturation}")
+        check_fraction(self.final_lr_fraction)
+        require_positive(
+            "agent",
+            updates_per_transition=self.updates_per_transition,
+            actor_lr=self.actor_lr,
+            critic_lr=self.critic_lr,
+        )
+
+
+class OffPolicy(ABC):
+    """A policy, its Q networks, their loss and optimizers; a subclass says what an update is.
+
+    Args:
+        observation_size: entries of the observation.
+        action_size: entries of the action.
+        seed: seed of the initial weights.
+        settings: see :class:`OffPolicySettings`; None for its defaults.
+        device: where the networks live.
+
+    Raises:
+        ConfigError: if a setting is out of range or contradicts another.
+    """
+
+    Settings: ClassVar[type[OffPolicySettings]] = OffPolicySettings
+    critics: ClassVar[int] = 1
 
     def __init__(
         self,
         observation_size: int,
         action_size: int,
         seed: int,
-        gamma: float,
-        hidden: Sequence[int],
-        batch_size: int,
-        buffer_size: int,
-        tau: float,
-        updates_per_transition: float,
-        saturation: float,
-        final_share: float,
-        exploration: Mapping[str, float] | None,
-        device: str,
+        settings: Any = None,
+        device: str = "cpu",
     ) -> None:
-        check_settings(gamma, batch_size, buffer_size, tau, updates_per_transition)
-        check_gentleness(saturation, final_share)
-        self.seed, self.gamma, self.saturation = seed, gamma, saturation
-        self.batch_size, self.buffer_size = batch_size, buffer_size
-        self.updates_per_transition, self.final_share = updates_per_transition, final_share
-        self.exploration = Exploration(**(exploration or {}))
-        self.policy: TensorDictModuleBase = make_actor(
-            observation_size, action_size, hidden, seed
-        ).to(device)
+        self.settings: Any = self.Settings() if settings is None else settings
+        self.seed, self.device, self.count = seed, device, 0
+        self.exploration = Exploration(**self.settings.exploration)
+        hidden = self.settings.hidden
+        self.policy: TensorDictModule = make_actor(observation_size, action_size, hidden, seed).to(
+            device
+        )
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)
         inputs, keys = observation_size + action_size, ["observation", "action"]
         self.values = [
-            ValueOperator(seeded_mlp(inputs, 1, hidden, seed + number), in_keys=keys).to(device)
-            for number in (1, 3)
+            ValueOperator(seeded_mlp(inputs, 1, hidden, seed + 1 + 2 * number), in_keys=keys).to(
+                device
+            )
+            for number in range(self.critics)
         ]
-        self.count = 0
+        self.optimizers: dict[str, torch.optim.Optimizer] = {}
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's."""
-        return anneal(self.optimizers.values(), share, self.final_share)
+        return anneal(self.optimizers.values(), share, self.settings.final_lr_fraction)
 
     @abstractmethod
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take one gradient step; as :meth:`lcc_rl.agents.DDPG.update`."""
+        """Take one gradient step.
 
-    def _complete(self, loss: LossModule, tau: float, rates: tuple[float, float]) -> None:
-        """Set discount, followers and optimizers of a loss with an actor and Q networks.
+        Args:
+            batch: transitions with observation, action and, under ``"next"``, observation,
+                reward, done and terminated; shape ``[batch_size]``.
 
-        Raises:
-            ConfigError: if a learning rate, of the actor or the Q networks, is not positive.
+        Returns:
+            ``loss_actor`` and ``loss_value``, detached.
         """
-        require_positive("agent", actor_lr=rates[0], critic_lr=rates[1])
+
+    def _complete(self, loss: LossModule, critic: str) -> None:
+        """Set discount, targets and optimizers of a loss with an actor and Q networks."""
         self.loss = loss
-        self.loss.make_value_estimator(gamma=self.gamma)
-        self.targets = SoftUpdate(self.loss, tau=tau)
-        networks = (self.loss.actor_network_params, self.loss.qvalue_network_params)
+        self.loss.make_value_estimator(gamma=self.settings.gamma)
+        self.targets = SoftUpdate(self.loss, tau=self.settings.tau)
+        networks = {"actor": loss.actor_network_params, "value": getattr(loss, critic)}
+        rates = {"actor": self.settings.actor_lr, "value": self.settings.critic_lr}
         self.optimizers = {
-            name: torch.optim.Adam(leaves(network), lr=rate, fused=True)
-            for name, network, rate in zip(("actor", "value"), networks, rates, strict=True)
+            name: torch.optim.Adam(leaves(network), lr=rates[name], fused=True)
+            for name, network in networks.items()
         }
 
     @contextmanager
@@ -101,8 +188,9 @@ class OffPolicy(ABC):
             yield
 
     def _penalty(self, batch: TensorDictBase) -> Tensor:
-        """Keep the policy out of the tanh's flat part, as in DDPG."""
-        return self.saturation * self.policy.module[0](batch["observation"]).square().mean()
+        """Return the penalty on the actor's output before its tanh."""
+        raw = self.policy.module[0](batch["observation"])
+        return self.settings.saturation * raw.square().mean()
 
     def _step(self, *names: str) -> None:
         """Take a step of the named optimizers along the gradients at hand."""
@@ -112,7 +200,7 @@ class OffPolicy(ABC):
             optimizer.zero_grad(set_to_none=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs to go on bit for bit."""
+        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
         return {
             "count": self.count,
             "loss": dict(self.loss.state_dict()),
@@ -125,3 +213,8 @@ class OffPolicy(ABC):
         self.loss.load_state_dict(state["loss"])
         for name, part in self.optimizers.items():
             part.load_state_dict(state["optimizers"][name])
+
+
+def leaves(parameters: TensorDictBase) -> list[Tensor]:
+    """Return the tensors of a network's parameters, in the order of its layers."""
+    return list(parameters.flatten_keys().values())

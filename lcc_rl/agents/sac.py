@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -11,11 +13,11 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
-from lcc_rl.agents.off_policy import OffPolicy
+from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
 from lcc_rl.errors import require_positive
-from lcc_rl.functional.random import normal, stream_id
+from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import SEED, STEP
-from lcc_rl.policies.actor import seeded_mlp
+from lcc_rl.policies.actor import ACTION, OBSERVATION, action_noise, seeded_mlp
 
 ONE = 1.0 - 1e-6  # the largest action whose inverse tanh exists in single precision
 
@@ -50,75 +52,66 @@ class SampledAction(TensorDictModuleBase):
     sigma: Tensor
 
     def __init__(self, head: Head) -> None:
-        self.in_keys = ["observation", SEED, STEP]
-        self.out_keys = ["action"]
+        self.in_keys = [OBSERVATION, SEED, STEP]
+        self.out_keys = [ACTION]
         super().__init__()
         self.head, self.stream = head, stream_id("exploration")
         self.register_buffer("sigma", torch.tensor(1.0))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        observation, seed, step = (tensordict.get(key) for key in self.in_keys)
-        mean, spread = self.head(observation)
-        columns = torch.arange(mean.shape[-1], device=mean.device)
-        noise = normal(seed, step, self.stream + columns)
-        return tensordict.set(
-            "action", (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE)
-        )
+        mean, spread = self.head(tensordict.get(OBSERVATION))
+        noise = action_noise(mean, tensordict, self.stream)
+        return tensordict.set(ACTION, (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE))
+
+
+@dataclass(frozen=True)
+class SACSettings(OffPolicySettings):
+    """Settings of SAC; its exploration is a factor of the policy's own standard deviation.
+
+    Args:
+        alpha_init: temperature at the start.
+        alpha_lr: learning rate of the temperature.
+        target_entropy: entropy to keep per action; None: minus the number of actions.
+
+    Raises:
+        ConfigError: if a setting is out of range or contradicts another.
+    """
+
+    exploration: Mapping[str, float] = field(
+        default_factory=lambda: {"initial": 1.0, "final": 1.0, "decay_share": 1.0}
+    )
+    alpha_init: float = 0.1
+    alpha_lr: float = 1e-3
+    target_entropy: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("agent", alpha_init=self.alpha_init, alpha_lr=self.alpha_lr)
 
 
 class SAC(OffPolicy):
     """Learns a distribution of actions and its temperature; its mean is the policy that is kept.
 
     Args:
-        alpha_init: temperature at the start.
-        alpha_lr: learning rate of the temperature.
-        target_entropy: entropy to keep per action; None: minus the number of actions.
-        exploration: factor of the policy's own standard deviation while it explores.
-        others: see :class:`lcc_rl.agents.DDPG`.
-
-    Raises:
-        ConfigError: if a setting is out of range or contradicts another.
+        observation_size, action_size, seed, settings, device: see
+            :class:`lcc_rl.agents.off_policy.OffPolicy`.
     """
+
+    Settings: ClassVar[type[OffPolicySettings]] = SACSettings
+    critics = 2
 
     def __init__(
         self,
         observation_size: int,
         action_size: int,
         seed: int,
-        gamma: float = 0.9,
-        hidden: Sequence[int] = (200, 100, 50),
-        actor_lr: float = 1e-3,
-        critic_lr: float = 1e-3,
-        batch_size: int = 1024,
-        buffer_size: int = 20000,
-        tau: float = 0.005,
-        saturation: float = 0.001,
-        final_share: float = 1.0,
-        updates_per_transition: float = 0.125,
-        exploration: dict[str, float] | None = None,
-        alpha_init: float = 0.1,
-        alpha_lr: float = 1e-3,
-        target_entropy: float | None = None,
+        settings: SACSettings | None = None,
         device: str = "cpu",
     ) -> None:
-        super().__init__(
-            observation_size,
-            action_size,
-            seed,
-            gamma,
-            hidden,
-            batch_size,
-            buffer_size,
-            tau,
-            updates_per_transition,
-            saturation,
-            final_share,
-            exploration or {"initial": 1.0, "final": 1.0},
-            device,
-        )
-        require_positive("agent", alpha_init=alpha_init, alpha_lr=alpha_lr)
-        spread = seeded_mlp(observation_size, action_size, hidden[-1:], seed + 2).to(device)
+        super().__init__(observation_size, action_size, seed, settings, device)
+        own = self.settings
+        spread = seeded_mlp(observation_size, action_size, own.hidden[-1:], seed + 2).to(device)
         head = Head(self.policy.module[0], spread)
         self.noise = SampledAction(head)
         actor = ProbabilisticActor(
@@ -127,16 +120,17 @@ class SAC(OffPolicy):
             distribution_class=TanhNormal,
             return_log_prob=True,
         )
+        entropy = -float(action_size) if own.target_entropy is None else own.target_entropy
         loss = SACLoss(
             actor,
             self.values,
-            alpha_init=alpha_init,
-            target_entropy=-float(action_size) if target_entropy is None else target_entropy,
+            alpha_init=own.alpha_init,
+            target_entropy=entropy,
             loss_function="l2",
             delay_qvalue=True,
         ).to(device)
-        self._complete(loss, tau, (actor_lr, critic_lr))
-        self.optimizers["alpha"] = torch.optim.Adam([self.loss.log_alpha], lr=alpha_lr)
+        self._complete(loss, "qvalue_network_params")
+        self.optimizers["alpha"] = torch.optim.Adam([self.loss.log_alpha], lr=own.alpha_lr)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         with self._own_randomness():

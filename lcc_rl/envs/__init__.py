@@ -1,6 +1,19 @@
-"""Environment room: a thin clock plus the pieces that a configuration names."""
+"""Environments: a thin clock plus the pieces that a configuration names."""
 
 from lcc_rl.envs.clock import Clock
-from lcc_rl.envs.factory import build_agent, build_env, load_inputs, make_env
+from lcc_rl.envs.collector import StringCollector
+from lcc_rl.envs.factory import build_env, make_env
+from lcc_rl.envs.inputs import Inputs, load_inputs
+from lcc_rl.envs.rollout import DifferentiableRollout
+from lcc_rl.envs.single import SingleAgent
 
-__all__ = ["Clock", "build_agent", "build_env", "load_inputs", "make_env"]
+__all__ = [
+    "Clock",
+    "DifferentiableRollout",
+    "Inputs",
+    "SingleAgent",
+    "StringCollector",
+    "build_env",
+    "load_inputs",
+    "make_env",
+]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
+from lcc_rl.envs.step import tick
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, STEP
 
@@ -23,7 +25,7 @@ class Clock(EnvBase):
     Args:
         horizon: steps per episode, after which it is truncated.
         batch_size: shape of the batch of episodes.
-        action_shape: shape of one action; its entries lie in [−1, 1].
+        actions: shape of each action after the batch dimensions, by key; entries lie in [−1, 1].
         seed: seed of the generator that draws the episodes' seeds.
         device: where the tensors live.
 
@@ -35,7 +37,7 @@ class Clock(EnvBase):
         self,
         horizon: int,
         batch_size: Sequence[int] | int = (),
-        action_shape: Sequence[int] = (1,),
+        actions: Mapping[NestedKey, tuple[int, ...]] | None = None,
         seed: int = 0,
         device: torch.device | str | None = None,
     ) -> None:
@@ -52,22 +54,18 @@ class Clock(EnvBase):
         self.generator = torch.Generator()
         count = Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=self.device)
-        self.observation_spec = Composite(
-            episode=Composite(seed=count.clone(), step=count.clone(), shape=batch),
-            shape=batch,
-            device=self.device,
+        times = Composite(
+            episode=Composite(seed=count, step=count.clone(), shape=batch), shape=batch
         )
-        self.state_spec = Composite(
-            episode=Composite(seed=count.clone(), step=count.clone(), shape=batch),
-            shape=batch,
-            device=self.device,
-        )
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, *action_shape), device=self.device)
+        self.observation_spec = times.to(self.device)
+        self.state_spec = times.clone().to(self.device)
+        action_spec = Composite(shape=batch, device=self.device)
+        for key, shape in (actions or {}).items():
+            action_spec[key] = Bounded(-1.0, 1.0, shape=(*batch, *shape), device=self.device)
+        self.action_spec = action_spec
         self.full_reward_spec = Composite(shape=batch, device=self.device)
         self.full_done_spec = Composite(
-            done=flag.clone(),
-            terminated=flag.clone(),
-            truncated=flag.clone(),
+            {name: flag.clone() for name in ("done", "terminated", "truncated")},
             shape=batch,
             device=self.device,
         )
@@ -91,18 +89,10 @@ class Clock(EnvBase):
         return self._moment(tensordict.get(SEED), tensordict.get(STEP) + 1)
 
     def _moment(self, seeds: torch.Tensor, step: torch.Tensor) -> TensorDictBase:
-        truncated = step >= self.horizon
-        episode = TensorDict({"seed": seeds, "step": step}, self.batch_size, device=self.device)
-        return TensorDict(
-            {
-                "episode": episode,
-                "truncated": truncated,
-                "terminated": torch.zeros_like(truncated),
-                "done": truncated,
-            },
-            self.batch_size,
-            device=self.device,
-        )
+        moment = TensorDict(batch_size=self.batch_size, device=self.device)
+        for key, value in tick(seeds, step, self.horizon).items():
+            moment.set(key, value)
+        return moment
 
 
 class Traffic(TransformedEnv):
@@ -110,5 +100,5 @@ class Traffic(TransformedEnv):
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # TorchRL looks up the shape of every reward here at every step, a twentieth of its time;
-        # the pieces' contract promises it.
+        # the shapes were checked when the environment was built.
         return next_tensordict_out

@@ -1,128 +1,28 @@
-"""The factory: from a configuration to an environment, a policy and what they need."""
+"""From a configuration to an environment."""
 
 from __future__ import annotations
 
-import inspect
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import TARGET, build, find_target, is_sweep, load, plain
-from lcc_rl.data.cycles import Case
-from lcc_rl.data.profiles import Profiles, leader_profiles
-from lcc_rl.data.sources import LoadedEpisodes, find_files
+from lcc_rl.config import build, load
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic
-from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.pieces import Piece, TotalReward
-from lcc_rl.pieces.base import SEED, STEP, Pieces, Transition, arrived
-from lcc_rl.pieces.vehicles import Population
+from lcc_rl.envs.inputs import load_inputs, string_of
+from lcc_rl.envs.single import SingleAgent
+from lcc_rl.envs.step import Pieces
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.pieces import Piece, Places, StringMotion, TotalReward
+from lcc_rl.pieces.controllers import Population
 
-
-@dataclass(frozen=True)
-class Inputs:
-    """What a study is made from: profiles to train and to evaluate on, and drivers.
-
-    Args:
-        training: speed profiles for training.
-        evaluation: speed profiles held out, as windows of one horizon.
-        population: the human drivers.
-        report: what was read and dropped, as plain lines.
-        cases: runs of a platoon that are looked at closely.
-        full_length: a whole record for a platoon; None for none.
-    """
-
-    training: Profiles
-    evaluation: Profiles
-    population: Population
-    report: tuple[str, ...] = ()
-    cases: tuple[Case, ...] = ()
-    full_length: Case | None = None
-
-
-def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
-    """Read the trajectories, split their leaders' profiles and build the population.
-
-    Args:
-        cfg: configuration of a study.
-        episodes: table of episodes if already at hand; else ``cfg.data`` is read.
-
-    Raises:
-        DataError, ConfigError: naming the file, row or option at fault.
-    """
-    if cfg.get("leader") is not None:
-        return _platoon_inputs(cfg)
-    report: Sequence[str] = ()
-    if episodes is None:
-        loaded = _load_episodes(cfg.data)
-        episodes, report = loaded.episodes, loaded.report
-    scenario = cfg.scenario
-    profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
-    training, evaluation = build(cfg.split, "split")(profiles)
-    windows = evaluation.windows(scenario.horizon, cfg.evaluation.profiles)
-    population = build(cfg.drivers, "drivers")
-    available = {"profiles": len(windows), "drivers": len(population.time_gap)}
-    return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
-
-
-# Of the sweep that this process works on: its runs mostly differ in other things than the data.
-_loaded: dict[str, LoadedEpisodes] = {}
-
-
-def _load_episodes(node: DictConfig) -> LoadedEpisodes:
-    """Load episodes; the runs of a sweep that one process does share those of the same files."""
-    if not is_sweep():
-        return build(node, "data").load()
-    settings = plain(node)
-    key = json.dumps([settings, list(_stamps(settings))])
-    if key not in _loaded:
-        loaded = build(node, "data").load()
-        _loaded.clear()
-        _loaded[key] = loaded
-    return _loaded[key]
-
-
-def _stamps(value: Any) -> Iterator[tuple[str, int, int]]:
-    """Yield name, time and size of every file that settings name, by a pattern, too."""
-    if isinstance(value, (Mapping, list)):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _stamps(item)
-    elif isinstance(value, str):
-        with suppress(DataError, OSError):
-            for name in find_files(value):
-                stat = Path(name).stat()
-                yield name, stat.st_mtime_ns, stat.st_size
-
-
-def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
-    """Return a line for everything that an evaluation asks more of than there is."""
-    return [
-        f"evaluation.{name}={cfg.evaluation[name]}: only {count} are available; taking all"
-        for name, count in available.items()
-        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count
-    ]
-
-
-def _platoon_inputs(cfg: DictConfig) -> Inputs:
-    """Read the records that a platoon's leader drives."""
-    scenario = cfg.scenario
-    leaders = build(cfg.leader, "leader").load(
-        scenario.time_step, scenario.horizon, scenario.followers
-    )
-    return Inputs(
-        leaders.training.at_least(scenario.horizon),
-        leaders.windows.spread(cfg.evaluation.profiles),
-        build(cfg.drivers, "drivers"),
-        leaders.report,
-        leaders.cases,
-        leaders.full_length,
-    )
+ACTION = (AUTOMATED, "action")
 
 
 def build_env(
@@ -132,6 +32,7 @@ def build_env(
     batch_size: Sequence[int] | int = (),
     seed: int = 0,
     device: torch.device | str | None = None,
+    nominal: bool = False,
 ) -> TransformedEnv:
     """Build the environment of a configuration.
 
@@ -142,119 +43,107 @@ def build_env(
         batch_size: episodes side by side.
         seed: seed of the episodes' seeds.
         device: where the tensors live.
+        nominal: leaders and starts as in an evaluation, without the deviations of training.
 
     Returns:
-        A TorchRL environment; see the README for its entries.
+        A TorchRL environment; docs/entries.md lists its entries.
 
     Raises:
         ConfigError: naming the option at fault.
     """
     scenario = cfg.scenario
+    pieces = build_pieces(cfg, profiles, population, nominal)
+    acts = any(key == ACTION for piece in pieces for _, key in piece.sources)
+    actions: dict[NestedKey, tuple[int, ...]] = {}
+    if acts:
+        actions[ACTION] = (string_of(cfg).count(AUTOMATED), 1)
+    check_pieces(pieces, scenario.horizon, actions)
+    clock = Clock(scenario.horizon, batch_size, actions, seed, device)
+    env = Traffic(clock, Pieces(*pieces))
+    return env.to(device) if device is not None else env
+
+
+def build_pieces(
+    cfg: DictConfig, profiles: Profiles, population: Population, nominal: bool = False
+) -> list[Piece]:
+    """Build the pieces of a configuration in the order in which they act.
+
+    The leader; the controllers of the roles that occur, and their filters; the motion of the
+    string; the further pieces of the scenario; and, where there are automated vehicles, what they
+    observe and are rewarded with. Arguments as of :func:`build_env`.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    scenario, string = cfg.scenario, string_of(cfg)
     resources = {
         "profiles": profiles,
         "population": population,
         "time_step": scenario.time_step,
         "horizon": scenario.horizon,
+        "string": string,
+        "nominal": nominal,
     }
-    pieces: list[Piece] = [
-        build(node, f"scenario.pieces.{name}", **resources)
-        for name, node in scenario.pieces.items()
-        if node is not None
-    ]
+    named = {name: node for name, node in scenario.pieces.items() if node is not None}
+    leader = named.pop("leader", None)
+    if (leader is None) != string.ring:
+        raise ConfigError(
+            "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
+            f"scenario.road={scenario.road} and leader={leader}"
+        )
+    pieces: list[Piece] = []
+    if leader is not None:
+        pieces.append(build(leader, "scenario.pieces.leader", **resources))
+    pieces += [Places(string), *_drivers(scenario, string, resources)]
+    pieces.append(_motion(scenario, string, resources))
+    pieces += [build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
+    if not string.count(AUTOMATED):
+        return pieces
     pieces.append(build(cfg.observation, "observation", **resources))
     pieces += [
         build(node, f"reward.terms.{name}", name=name, **resources)
         for name, node in cfg.reward.terms.items()
     ]
-    moved = [piece.event_shape for piece in pieces if ("action",) in map(arrived, piece.in_keys)]
-    action_shape = moved[0] if moved else (1,)
-    # What is rewarded is what acts: one car, or every follower of a platoon.
-    pieces.append(TotalReward(list(cfg.reward.terms), action_shape))
-    _check_wiring(pieces)
-    clock = Clock(scenario.horizon, batch_size, action_shape, seed, device)
-    env = Traffic(clock, Pieces(*pieces))
-    return env.to(device) if device is not None else env
+    # The sum stays last, before collisions of the next step.
+    return [*pieces, TotalReward(list(cfg.reward.terms), string)]
 
 
-def _check_wiring(pieces: Sequence[Piece]) -> None:
-    """Check that every entry read is written by the clock, the policy or a piece.
-
-    Raises:
-        ConfigError: naming the entry and the piece that reads it.
-    """
-    own = [SEED, STEP, ("action",), ("done",), ("terminated",)]
-    written = {arrived(key) for piece in pieces for key in piece.out_keys} | set(own)
-    for piece in pieces:
-        written |= set(piece.constants) if isinstance(piece, Transition) else set()
-    for piece in pieces:
-        for key in map(arrived, piece.in_keys):
-            if key not in written:
+def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> list[Piece]:
+    """Build the controllers of the roles that occur, and their safety filters."""
+    pieces = []
+    for group, needed in (("controllers", True), ("filters", False)):
+        nodes = scenario[group]
+        for role in string.names:
+            if nodes.get(role) is not None:
+                where = f"scenario.{group}.{role}"
+                pieces.append(build(nodes[role], where, role=role, **resources))
+            elif needed:
+                known = ", ".join(name for name in nodes if nodes[name] is not None)
                 raise ConfigError(
-                    f"{type(piece).__name__} reads {'.'.join(key)}, which no piece of the "
-                    "scenario writes; was a piece removed?"
+                    f"scenario.string has the role {role!r}, but scenario.controllers names only "
+                    f"{known}; say +controller@scenario.controllers.{role}=… for another"
                 )
+        strange = [role for role in nodes if not needed and role not in string.names]
+        if strange:
+            raise ConfigError(f"scenario.filters.{strange[0]}: no vehicle has that role")
+    return pieces
 
 
-def any_leader(cfg: DictConfig) -> DictConfig:
-    """Return a configuration without the one record that its leader may be told to play.
-
-    That record is one to train on: with other profiles at hand its number means nothing.
-    """
-    cfg = cfg.copy()
-    if "profile" in cfg.scenario.pieces.get("leader", {}):
-        cfg.scenario.pieces.leader.profile = None
-    return cfg
-
-
-def learns(cfg: DictConfig) -> bool:
-    """Whether the agent of a configuration learns anything."""
-    return bool(getattr(find_target(cfg.agent[TARGET], "agent"), "learns", True))
-
-
-def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Any:
-    """Build the agent of a configuration: something with ``policy`` and ``learns``.
-
-    Raises:
-        ConfigError: naming the option at fault.
-    """
-    node = plain(cfg.agent)
-    if not learns(cfg):
-        # A recipe's learning settings mean nothing to those that do not learn.
-        known = inspect.signature(find_target(node[TARGET], "agent")).parameters
-        node = {key: value for key, value in node.items() if key in known or key == TARGET}
-    vehicle = cfg.scenario.pieces.get("cav") or cfg.scenario.pieces.get("platoon")
-    observation: Piece = build(cfg.observation, "observation")
-    return build(
-        node,
-        "agent",
-        population=population,
-        observation_size=observation.event_shape[-1],
-        action_size=1,
-        max_acceleration=vehicle.max_acceleration if vehicle is not None else 1.0,
-        seed=cfg.seed,
-        time_step=cfg.scenario.time_step,
-        device=device,
-    )
-
-
-def build_policy(cfg: DictConfig, learned: Any) -> Any:
-    """Build what drives: the agent's policy, or the controller composed with it.
-
-    Args:
-        cfg: configuration of a study; its node ``controller`` may be null.
-        learned: the policy of the agent.
-
-    Raises:
-        ConfigError: naming the option at fault.
-    """
-    if cfg.get("controller") is None:
-        return learned
-    return build(
-        cfg.controller,
-        "controller",
-        learned=learned,
-        time_step=cfg.scenario.time_step,
-        max_acceleration=cfg.scenario.pieces.platoon.max_acceleration,
+def _motion(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> StringMotion:
+    start = {
+        role: build(node, f"scenario.start.{role}", **resources)
+        for role, node in scenario.start.items()
+        if role in string.names and node is not None and not string.ring
+    }
+    if not string.ring and scenario.circumference is not None:
+        raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
+    return StringMotion(
+        string,
+        scenario.time_step,
+        start,
+        scenario.circumference,
+        scenario.vehicle_length,
+        scenario.initial_speed,
     )
 
 
@@ -265,6 +154,7 @@ def make_env(
     seed: int = 0,
     device: torch.device | str | None = None,
     held_out: bool = False,
+    single: bool | None = None,
 ) -> TransformedEnv:
     """Build the environment of a variant, as the command line would.
 
@@ -274,10 +164,13 @@ def make_env(
         overrides: further command-line overrides, e.g. ``["scenario.horizon=100"]``.
         seed: seed of the episodes' seeds.
         device: where the tensors live.
-        held_out: play the evaluation profiles instead of the training ones.
+        held_out: play the evaluation profiles instead of the training ones, as an evaluation.
+        single: show the entries of the one automated vehicle at the root, see
+            :class:`lcc_rl.envs.SingleAgent`; None: where there is just one.
 
     Raises:
-        ConfigError: if the variant or an override is unknown.
+        ConfigError: if the variant or an override is unknown, or ``single`` is asked for and
+            there is not just one automated vehicle.
 
     Examples:
         >>> env = make_env("alcc", batch_size=1024)  # doctest: +SKIP
@@ -287,4 +180,8 @@ def make_env(
     cfg = load("train", [f"variant={variant}", *overrides])
     inputs = load_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.training
-    return build_env(cfg, profiles, inputs.population, batch_size, seed, device)
+    env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)
+    count = string_of(cfg).count(AUTOMATED)
+    if single and count != 1:
+        raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
+    return env.append_transform(SingleAgent()) if count == 1 and single is not False else env

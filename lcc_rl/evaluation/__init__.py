@@ -1,1 +1,1 @@
-"""Evaluation room: every driver behind every held-out profile, and what is measured there."""
+"""Evaluation: strategies driven through the same episodes, and what is measured there."""

@@ -11,20 +11,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.config import require
-from lcc_rl.data.profiles import Profiles
-from lcc_rl.envs.factory import any_leader, build_env
-from lcc_rl.envs.unroll import Unrolled
+from lcc_rl.envs import DifferentiableRollout, build_env
+from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.envs.rollout import ACTION
+from lcc_rl.evaluation.episodes import any_leader, pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
-from lcc_rl.evaluation.monte_carlo import Strategy, choices, pairs
+from lcc_rl.evaluation.rollout import reset_options
+from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces.base import STEP
-from lcc_rl.pieces.vehicles import Population
+from lcc_rl.pieces.views import VEHICLES, Views
 
 MEASURED = ("gap", "relative_speed", "time_gap", "speed")
 MARGIN = 1.01  # the limits are kept with one per cent to spare
@@ -38,23 +42,23 @@ class Planned:
 
     Args:
         policy: what is moved; reads and writes a TensorDict.
-        shifts: the plan, ``[steps, batch, 1]``.
+        shifts: the plan, ``[steps, batch, A, 1]``.
     """
 
-    def __init__(self, policy: Callable[[TensorDictBase], TensorDictBase], shifts: Tensor) -> None:
+    def __init__(self, policy: Any, shifts: Tensor) -> None:
         self.policy, self.shifts = policy, shifts
+        self.in_keys = [*policy.in_keys, STEP]
 
     def __call__(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         td = self.policy(td)
         shift = self.shifts[int(td.get(STEP).flatten()[0])]
-        return td.set("action", (td.get("action") + shift).clamp(-1.0, 1.0))
+        return td.set(ACTION, (td.get(ACTION) + shift).clamp(-1.0, 1.0))
 
 
 def clairvoyant(
     strategy: Strategy,
-    profiles: Profiles,
-    population: Population,
+    inputs: Inputs,
     drivers: int | None,
     seed: int,
     iterations: int = 400,
@@ -68,8 +72,8 @@ def clairvoyant(
 
     Args:
         strategy: the controller to begin with; its policy must be a network of the observation.
-        profiles, population, drivers, seed: as for :func:`lcc_rl.evaluation.monte_carlo.evaluate`,
-            which must be given the same, and a batch that holds all episodes.
+        inputs, drivers, seed: as for :func:`lcc_rl.evaluation.episodes.evaluate`, which must be
+            given the same, and a batch that holds all episodes.
         iterations: steps along the gradient.
         compiled: compile the simulator.
         report: told the number of the iteration, the energy [kJ] and the price of the limits.
@@ -78,24 +82,29 @@ def clairvoyant(
         ConfigError: if there are no iterations.
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
-    profile, driver = pairs(len(profiles), len(population.time_gap), drivers)
-    env = build_env(any_leader(strategy.cfg), profiles, population, len(profile))
-    given = choices(env, profile, driver, seed, len(population.time_gap))
-    wanted = [*(("cav", entry) for entry in MEASURED), ("hdv", "speed")]
-    source = Unrolled(env, wanted=wanted, compiled=compiled)
-    network, steps = strategy.policy.module.requires_grad_(False), env.base_env.horizon
-    shifts = torch.zeros(steps, len(profile), 1, requires_grad=True)
+    count = len(inputs.population.time_gap)
+    profile, driver = pairs(len(inputs.evaluation), count, drivers)
+    env = build_env(
+        any_leader(strategy.cfg), inputs.evaluation, inputs.population, len(profile), nominal=True
+    )
+    given = reset_options(env, profile, driver, seed, count)
+    string = string_of(strategy.cfg)
+    source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
+    policy: Any = strategy.policy
+    network, steps = policy.module.requires_grad_(False), env.base_env.horizon
+    shifts = torch.zeros(steps, len(profile), string.count(AUTOMATED), 1, requires_grad=True)
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
     for iteration in range(iterations):
         share = iteration / iterations
         _, record = source.play(source.start(given), network, steps, shifts)
         data = source.assemble(record)
-        energy, missed = path_energy(data, strategy.cfg.scenario.time_step), misses(data)
+        energy = path_energy(data, strategy.cfg.scenario.time_step)
+        missed = misses(data, string)
         optimizer.zero_grad(set_to_none=True)
         (energy + min(1.0, 0.1 + 1.8 * share) * missed).sum().backward()
         assert shifts.grad is not None
         # Every episode is a problem of its own, whatever its scale.
-        shifts.grad /= shifts.grad.square().sum((0, 2), keepdim=True).sqrt().clamp(min=1e-6)
+        shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
         fall = 0.5 * (1.0 + math.cos(math.pi * share))
         optimizer.param_groups[0]["lr"] = SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall
         optimizer.step()
@@ -107,18 +116,16 @@ def clairvoyant(
 
 def path_energy(data: TensorDictBase, time_step: float) -> Tensor:
     """Return the energy of all vehicles without what the last speed stores, ``[batch]`` [kJ]."""
-    total = torch.zeros(())
-    for vehicle in ("cav", "hdv"):
-        now, then = data.get((vehicle, "speed")), data.get(("next", vehicle, "speed"))
-        power = steady_power(now) + acceleration_loss(now, (then - now) / time_step)
-        total = total + power.flatten(1).sum(1) * time_step * KILO
-    return total
+    now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
+    power = steady_power(now) + acceleration_loss(now, (then - now) / time_step)
+    return power.flatten(1).sum(1) * time_step * KILO
 
 
-def misses(data: TensorDictBase) -> Tensor:
+def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
     """Return by how much the limits are missed in an episode, ``[batch]``, zero where kept."""
-    gap, time_gap = (data.get(("next", "cav", entry)) for entry in ("gap", "time_gap"))
-    closing = -data.get(("next", "cav", "relative_speed"))
+    views = Views(string, AUTOMATED, [f"next.self.{name}" for name in MEASURED])
+    gap, relative_speed, time_gap, _ = views(*(data.get(key) for key in views.keys))
+    closing = -relative_speed
     longest = LONG_TIME_GAP / MARGIN * gap / time_gap.clamp(min=1e-3)
     over = torch.stack([MARGIN * UNSAFE_TTC * closing - gap, gap - longest]).clamp(0.0, FAR)
     near = (LEAST_GAP - gap).clamp(min=0.0)

@@ -17,26 +17,28 @@ LONG_TIME_GAP = 2.5  # [s] (A13)
 def energy_measures(
     power: Tensor, speed: Tensor, alive: Tensor, time_step: float
 ) -> dict[str, Tensor]:
-    """Energy of one vehicle, raw, net of its change in kinetic energy, and its distance.
+    """Energy of every vehicle, raw, net of its change in kinetic energy, and its distance.
 
     Args:
-        power: motor power of each step, ``[time, *batch]`` [W].
-        speed: speed at every moment, ``[time + 1, *batch]`` [m/s].
-        alive: whether the episode was still running, ``[time, *batch]``.
+        power: motor power of each step, ``[time, *batch, n, 1]`` [W].
+        speed: speed at every moment, ``[time + 1, *batch, n, 1]`` [m/s].
+        alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
     Returns:
         ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
         that it did not draw), what the speeds driven take without accelerating
         (``steady_energy_kj``), what accelerating loses (``acceleration_loss_kj``, see
-        :func:`lcc_rl.functional.power.acceleration_loss`) and ``distance_m``, each ``[*batch]``.
+        :func:`lcc_rl.functional.power.acceleration_loss`) and ``distance_m``, each
+        ``[*batch, n, 1]``.
     """
 
     def total(rate: Tensor) -> Tensor:
         return (rate * alive).sum(0) * time_step
 
     energy = total(power) * KILO
-    last = speed.gather(0, alive.sum(0, keepdim=True).long()).squeeze(0)
+    steps = alive.sum(0, keepdim=True).long().expand(1, *speed.shape[1:])
+    last = speed.gather(0, steps).squeeze(0)
     stored = (kinetic_energy(last) - kinetic_energy(speed[0])) * KILO
     acceleration = speed.diff(dim=0) / time_step
     return {
@@ -51,34 +53,36 @@ def energy_measures(
 def safety_measures(
     series: Mapping[str, Tensor], alive: Tensor, time_step: float
 ) -> dict[str, Tensor]:
-    """Safety, efficiency and comfort of the controlled car.
+    """Safety, efficiency and comfort of the automated vehicles of a string.
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
-            each ``[time, *batch]``.
-        alive: whether the episode was still running, ``[time, *batch]``.
+            each ``[time, *batch, A, 1]``.
+        alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
     Returns:
-        Minima, maxima, shares of time and root mean squares, each ``[*batch]``.
+        Minima and maxima over the vehicles, shares of time and root mean squares averaged over
+        them, each ``[*batch, 1]``.
     """
-    steps = alive.sum(0).clamp(min=1)
+    steps = alive.sum(0).clamp(min=1).squeeze(-2)
+    vehicles = series["gap"].shape[-2]
 
-    def share(condition: Tensor) -> Tensor:
-        return (condition & alive).sum(0) / steps
+    def average(entry: Tensor) -> Tensor:
+        return (entry * alive).sum(0).sum(-2) / (steps * vehicles)
 
     def lowest(entry: Tensor) -> Tensor:
-        return torch.where(alive, entry, torch.inf).amin(0)
+        return torch.where(alive, entry, torch.inf).amin(0).amin(-2)
 
     def highest(entry: Tensor) -> Tensor:
-        return torch.where(alive, entry, -torch.inf).amax(0)
+        return torch.where(alive, entry, -torch.inf).amax(0).amax(-2)
 
     return {
         "min_gap_m": lowest(series["gap"]),
         "min_ttc_s": lowest(series["ttc"]),
         "max_time_gap_s": highest(series["time_gap"]),
-        "share_ttc_unsafe": share(series["ttc"] < UNSAFE_TTC),
-        "share_time_gap_long": share(series["time_gap"] > LONG_TIME_GAP),
-        "rms_jerk_mps3": ((series["jerk"] ** 2 * alive).sum(0) / steps).sqrt(),
-        "duration_s": alive.sum(0) * time_step,
+        "share_ttc_unsafe": average(series["ttc"] < UNSAFE_TTC),
+        "share_time_gap_long": average(series["time_gap"] > LONG_TIME_GAP),
+        "rms_jerk_mps3": average(series["jerk"] ** 2).sqrt(),
+        "duration_s": alive.sum(0).squeeze(-2) * time_step,
     }

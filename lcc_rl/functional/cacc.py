@@ -1,12 +1,12 @@
-"""Cooperative adaptive cruise control and the hybrid strategy built on it (HCFS H1–H14).
+"""Cooperative adaptive cruise control and dead-beat control (HCFS H1–H11).
 
 Signs: an error is positive where the follower is too far behind or too slow; the signs of H1–H2 as
-printed would make the gap negative. Tensors of followers are ``[*batch, followers, 1]``, those of
-the leader ``[*batch, 1]``.
+printed would make the gap negative. Tensors of vehicles are ``[*batch, N, 1]``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,10 +15,11 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.kinematics import advance_speed
+from lcc_rl.functional.string import gather
 
 
 class Errors(NamedTuple):
-    """What a follower knows of its place in the platoon, each ``[*batch, followers, 1]``.
+    """What a vehicle knows of its place in the platoon, each ``[*batch, N, 1]``.
 
     gap: e_x(i,i−1) [m]; speed: e_v(i,i−1) [m/s]; leader_gap: e_x(i,0) [m]; leader_speed:
     e_v(i,0) [m/s].
@@ -30,37 +31,70 @@ class Errors(NamedTuple):
     leader_speed: Tensor
 
 
-def speeds_ahead(leader_speed: Tensor, speed: Tensor) -> Tensor:
-    """Return the speed of the vehicle ahead of each follower, ``[*batch, followers, 1]``."""
-    first = leader_speed.unsqueeze(-2)
-    return first if speed.shape[-2] == 1 else torch.cat([first, speed[..., :-1, :]], dim=-2)
-
-
 def platoon_errors(
-    leader_speed: Tensor, speed: Tensor, gap: Tensor, safe_headway: float, delay: float
+    ahead: Tensor,
+    lead: Tensor,
+    speed: Tensor,
+    gap: Tensor,
+    headway: float,
+    delay: float,
+    chain: Chain | None = None,
 ) -> Errors:
-    """Compute the errors to the predecessor and to the leader (H1–H2).
+    """Compute the errors to the predecessor and to the leader of the chain (H1–H2).
 
     e_x(i,i−1) = x_{i−1} − x_i − (L+h) and e_x(i,0) = x_0 − x_i − i (L+h). With gaps measured
     bumper to bumper the vehicle length L cancels. The delay acts on the positions *received*,
     x̂ = x − delay · v, and is never integrated.
 
     Args:
-        leader_speed: v_0 [m/s].
+        ahead: speed of the vehicle ahead of each vehicle [m/s].
+        lead: speed of the leader of its chain [m/s].
         speed: v_i [m/s].
         gap: bumper-to-bumper gap to the vehicle ahead [m].
-        safe_headway: h, the gap to be kept [m].
+        headway: h, the gap to be kept [m].
         delay: of vehicle-to-vehicle messages [s].
+        chain: who hears whom; None: all vehicles are one chain behind a leader that sends.
     """
-    ahead = speeds_ahead(leader_speed, speed)
-    lead = leader_speed.unsqueeze(-2)
-    excess = gap - safe_headway
-    return Errors(
-        gap=excess - delay * ahead,
-        speed=ahead - speed,
-        leader_gap=excess.cumsum(-2) - delay * lead,
-        leader_speed=lead - speed,
-    )
+    excess = gap - headway
+    received = excess - delay * ahead
+    total = excess.cumsum(-2)
+    if chain is None:
+        leader_gap = total - delay * lead
+    else:
+        received = torch.where(chain.hears, received, excess)
+        total = total - gather(total - excess, chain.first)
+        leader_gap = torch.where(chain.hears, total - delay * lead, total)
+    return Errors(received, ahead - speed, leader_gap, lead - speed)
+
+
+class Chain(NamedTuple):
+    """Who hears whom by radio; all others rely on their own sensors, which have no delay.
+
+    first: place of the first vehicle of each vehicle's chain of connected vehicles, int64,
+    ``[*batch, N]``; hears: whether the vehicle ahead, and so the leader of its chain, sends to it,
+    ``[*batch, N, 1]``.
+    """
+
+    first: Tensor
+    hears: Tensor
+
+
+def find_chains(connected: Tensor, leader_sends: bool) -> Chain:
+    """Find the chains of connected vehicles, each behind a leader that is not.
+
+    A vehicle hears the connected vehicles ahead of it without a gap in the chain; the vehicle
+    ahead of the first of them is their leader, seen by the first one's sensors.
+
+    Args:
+        connected: whether a vehicle sends and hears, ``[*batch, N]``.
+        leader_sends: the vehicle ahead of the whole string sends, too.
+    """
+    before = torch.nn.functional.pad(connected[..., :-1], (1, 0), value=False)
+    goes_on = connected & before
+    place = torch.arange(connected.shape[-1], device=connected.device)
+    first = torch.where(goes_on, 0, place).cummax(-1).values
+    hears = goes_on | (connected & leader_sends & (place == 0))
+    return Chain(first, hears.unsqueeze(-1))
 
 
 @dataclass(frozen=True)
@@ -100,7 +134,7 @@ class Gains:
 def cacc_acceleration(
     errors: Errors, gains: Gains, time_step: float, max_acceleration: float
 ) -> Tensor:
-    """Compute the acceleration of the CACC law (H11), ``[*batch, followers, 1]`` [m/s²].
+    """Compute the acceleration of the CACC law (H11), ``[*batch, N, 1]`` [m/s²].
 
     H11 is dimensionally a speed command, v_cmd = v_i + k1 e_x(i,i−1) + k2 e_v(i,i−1) +
     k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = clip((v_cmd − v_i)/T, ±a_max).
@@ -130,18 +164,16 @@ def check_lookahead(lookahead: str, where: str) -> str:
     return lookahead
 
 
-def next_leader_speed(
-    speed: Tensor, acceleration: Tensor, true_next: Tensor, lookahead: str, time_step: float
-) -> Tensor:
-    """Predict the leader's speed one step ahead, ``[*batch, 1]`` [m/s].
+def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float) -> Tensor:
+    """Predict the leader's speed one step ahead [m/s].
 
     Args:
-        speed: v_0 [m/s].
-        acceleration: a_0 by backward difference [m/s²].
-        true_next: the speed that the leader will really have; only ``"oracle"`` looks at it.
+        leader: its speed v_0 [m/s], its acceleration a_0 by backward difference [m/s²] and the
+            speed that it will really have [m/s], which only ``"oracle"`` looks at.
         lookahead: ``"causal"`` for v_0 + a_0 T, ``"hold"`` for v_0, ``"oracle"`` for the truth.
         time_step: T [s].
     """
+    speed, acceleration, true_next = leader
     if lookahead == "oracle":
         return true_next
     if lookahead == "hold":
@@ -155,161 +187,10 @@ def dead_beat_acceleration(
     """Compute the acceleration that reaches the leader's predicted speed in one step [m/s²].
 
     Args:
-        speed: v_i, ``[*batch, followers, 1]`` [m/s].
-        target: the leader's predicted speed, ``[*batch, 1]`` [m/s].
+        speed: v_i, ``[*batch, N, 1]`` [m/s].
+        target: the predicted speed of each vehicle's leader [m/s].
         time_step: T [s].
         max_acceleration: bound in both directions [m/s²].
     """
-    wanted = (target.unsqueeze(-2) - speed) / time_step
+    wanted = (target - speed) / time_step
     return wanted.clamp(-max_acceleration, max_acceleration)
-
-
-@dataclass(frozen=True)
-class PlatoonReward:
-    """The paper's reward H4–H6: −ω1 |e_v(i,0)|/v_max − ω2 |jerk|/jerk_scale.
-
-    Table IV of the paper determines ω1/v_max = 0.369 s/m and ω2 = 0.036 (jerk_scale =
-    2 a_max/T = 30 m/s³).
-
-    Args:
-        velocity_weight: ω1.
-        speed_scale: v_max [m/s].
-        jerk_weight: ω2.
-        jerk_scale: 2 a_max/T [m/s³].
-    """
-
-    velocity_weight: float = 10.0
-    speed_scale: float = 27.1
-    jerk_weight: float = 0.036
-    jerk_scale: float = 30.0
-
-    def __call__(self, speed_error: Tensor, jerk: Tensor) -> Tensor:
-        """Return the reward of e_v(i,0) [m/s] and jerk [m/s³], of their broadcast shape."""
-        return (
-            -self.velocity_weight / self.speed_scale * speed_error.abs()
-            - self.jerk_weight / self.jerk_scale * jerk.abs()
-        )
-
-    def one_step(
-        self,
-        speed: Tensor,
-        last_acceleration: Tensor,
-        acceleration: Tensor,
-        leader_next: Tensor,
-        time_step: float,
-    ) -> Tensor:
-        """Return the reward that an acceleration will earn, ``[*batch, followers, 1]`` (H12)."""
-        reached, executed = advance_speed(speed, acceleration, time_step)
-        jerk = (executed - last_acceleration) / time_step
-        return self(leader_next.unsqueeze(-2) - reached, jerk)
-
-
-def safe_acceleration(
-    gap: Tensor,
-    speed: Tensor,
-    ahead: Tensor,
-    time_step: float,
-    braking: float,
-    margin: float,
-) -> Tensor:
-    """Compute the largest acceleration after which braking still avoids the vehicle ahead.
-
-    The vehicle ahead brakes at ``braking`` to standstill from now on; the follower executes this
-    acceleration for one step, then brakes at ``braking`` too and ends ``margin`` behind it.
-
-    Args:
-        gap: bumper-to-bumper gap as received [m].
-        speed: own speed [m/s].
-        ahead: speed of the vehicle ahead [m/s].
-        time_step: T [s].
-        braking: b [m/s²].
-        margin: g [m].
-
-    Returns:
-        The cap [m/s²], of the arguments' shape; it may lie below −b where it is too late.
-    """
-    ahead_next = (ahead - braking * time_step).clamp(min=0.0)
-    room = gap + 0.5 * time_step * (ahead + ahead_next) + ahead_next**2 / (2.0 * braking) - margin
-    q = 0.5 * time_step * speed - room
-    root = (0.25 * time_step**2 - 2.0 * q / braking).clamp(min=0.0).sqrt()
-    reached = braking * (root - 0.5 * time_step)
-    return (reached - speed) / time_step
-
-
-class Decision(NamedTuple):
-    """What the hybrid strategy decides, each ``[*batch, followers, 1]``.
-
-    acceleration [m/s²]; winner: 0 for the rule, 1 for the learned policy; switched, clamped,
-    capped: whether the winner changed, the jerk bound cut a candidate, the safe cap the result.
-    """
-
-    acceleration: Tensor
-    winner: Tensor
-    switched: Tensor
-    clamped: Tensor
-    capped: Tensor
-
-
-def jerk_interval(
-    last_acceleration: Tensor, jerk_bound: float, time_step: float, max_acceleration: float
-) -> tuple[Tensor, Tensor]:
-    """Return the accelerations between which |jerk| stays within the bound (HCFS step 1)."""
-    reach = jerk_bound * time_step
-    low = (last_acceleration - reach).clamp(min=-max_acceleration)
-    return low, (last_acceleration + reach).clamp(max=max_acceleration)
-
-
-def hybrid_decision(
-    rule: Tensor,
-    learned: Tensor,
-    speed: Tensor,
-    last_acceleration: Tensor,
-    last_winner: Tensor | None,
-    leader_next: Tensor,
-    interval: tuple[Tensor, Tensor] | None,
-    cap: Tensor | None,
-    reward: PlatoonReward,
-    time_step: float,
-    max_acceleration: float,
-) -> Decision:
-    """Decide between two candidate accelerations, per follower (H12–H14).
-
-    1. Clamp both to the interval of the jerk bound and, from above, to the safe cap.
-    2. The one whose one-step reward is larger wins; the rule wins ties.
-    3. In the frame in which the winner changes, the two are blended half and half.
-
-    The theorem H15–H21 assumes that each candidate keeps the jerk bound relative to the
-    acceleration executed last; without step 1 that is not so.
-
-    Args:
-        rule, learned: the candidates [m/s²].
-        speed: v_i [m/s].
-        last_acceleration: a_{k−1} as executed [m/s²].
-        last_winner: winner of the frame before, negative where there was none; None likewise.
-        leader_next: the leader's predicted speed, ``[*batch, 1]`` [m/s].
-        interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
-        cap: see :func:`safe_acceleration`; None leaves it out.
-        reward: the reward to compare by.
-        time_step: T [s].
-        max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
-    """
-    candidates = torch.stack([rule, learned])
-    free = candidates
-    if interval is not None:
-        candidates = candidates.clamp(*interval)
-    clamped = (candidates != free).any(0)
-    capped = torch.zeros_like(clamped)
-    if cap is not None:
-        bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
-        capped = (bounded != candidates).any(0)
-        candidates = bounded
-    rule, learned = candidates.unbind(0)
-    earned = reward.one_step(speed, last_acceleration, candidates, leader_next, time_step)
-    winner = (earned[1] > earned[0]).to(torch.int64)
-    if last_winner is None:
-        switched = torch.zeros_like(clamped)
-    else:
-        switched = (last_winner >= 0) & (winner != last_winner)
-    chosen = torch.where(winner.bool(), learned, rule)
-    chosen = torch.where(switched, 0.5 * (rule + learned), chosen)
-    return Decision(chosen, winner, switched, clamped, capped)

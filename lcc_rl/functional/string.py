@@ -6,6 +6,7 @@ Entries of vehicles are ``[*batch, N, w]``, front to back; those of the leader `
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -72,7 +73,7 @@ def advance_string(
 
 def blocks_of(places: Sequence[int]) -> list[slice]:
     """Return slices that together select the given places, in order; one where a stride does."""
-    steps = {b - a for a, b in zip(places[:-1], places[1:], strict=True)}
+    steps = {b - a for a, b in pairwise(places)}
     if len(steps) <= 1 and all(step > 0 for step in steps):
         step = steps.pop() if steps else 1
         return [slice(places[0], places[-1] + 1, step)] if places else [slice(0, 0)]

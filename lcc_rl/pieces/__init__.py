@@ -1,12 +1,15 @@
-"""Piece room: everything that an environment is made of, one TensorDict transform each."""
+"""Pieces: everything that an environment is made of, one TensorDict transform each."""
 
-from lcc_rl.pieces.barrier import Barrier
-from lcc_rl.pieces.base import Feature, Piece, RewardPiece, Transition
+from lcc_rl.functional.pattern import VehicleString, parse_string
+from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
+from lcc_rl.pieces.cbf import CBFFilter
+from lcc_rl.pieces.connected import CACC, HCFS, Communication, DeadBeat
+from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
 from lcc_rl.pieces.estimator import DriverEstimator
-from lcc_rl.pieces.features import MotorPower, Observation, TimeGap, TimeToCollision
+from lcc_rl.pieces.features import MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
-from lcc_rl.pieces.leader import NGSIMLeader, PlatoonLeader
-from lcc_rl.pieces.platoon import PlatoonErrors, PlatoonMotion, PlatoonObservation
+from lcc_rl.pieces.leader import NGSIMLeader
+from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
@@ -17,20 +20,32 @@ from lcc_rl.pieces.rewards import (
     TotalReward,
     VelocityReward,
 )
+from lcc_rl.pieces.rules import FollowerStopper, Handover
+from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
+from lcc_rl.pieces.string import Places, StringMotion
 from lcc_rl.pieces.surrogates import SmoothEfficiency, Smoothness, SmoothSafety
 from lcc_rl.pieces.termination import Collision
-from lcc_rl.pieces.vehicles import CAVMotion, IDMFollower
 
 __all__ = [
-    "Barrier",
-    "CAVMotion",
+    "CACC",
+    "HCFS",
+    "IDM",
+    "Action",
+    "CBFFilter",
     "Collision",
     "CollisionPenalty",
+    "Communication",
+    "ConstantAcceleration",
+    "Controller",
+    "DeadBeat",
     "DriverEstimator",
     "EfficiencyReward",
     "EnergyReward",
+    "EquilibriumStart",
     "Feature",
-    "IDMFollower",
+    "FollowerStopper",
+    "Handover",
+    "HeadwayStart",
     "JerkReward",
     "LeaderPreview",
     "MotorPower",
@@ -38,19 +53,20 @@ __all__ = [
     "Observation",
     "ObservationMemory",
     "Piece",
-    "PlatoonErrors",
-    "PlatoonLeader",
-    "PlatoonMotion",
-    "PlatoonObservation",
+    "Places",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
     "SmoothEfficiency",
     "SmoothSafety",
     "Smoothness",
+    "StepTransform",
+    "StringMotion",
     "TimeGap",
+    "TimeGapStart",
     "TimeToCollision",
     "TotalReward",
-    "Transition",
+    "VehicleString",
     "VelocityReward",
+    "parse_string",
 ]

@@ -1,10 +1,10 @@
 """The contract: every piece reads named entries of a TensorDict and writes named entries.
 
-One object serves every role: appended to an environment, inside a ``TensorDictSequential``, by
-keyword call, on a stored rollout and in a replay buffer. Two kinds exist:
+One object serves every role: in an environment, inside a ``TensorDictSequential``, by keyword
+call, on a stored rollout and in a replay buffer. Two kinds exist:
 
-* a :class:`Feature` looks at one moment: the same function at reset and after every step;
-* a :class:`Transition` looks at two: keys under ``"next"`` belong to the moment reached, all
+* a :class:`Feature` reads one moment: the same function at reset and after every step;
+* a :class:`StepTransform` reads two: keys under ``"next"`` belong to the moment reached, all
   others to the moment left, so that it applies unchanged to any stored transition.
 """
 
@@ -15,12 +15,15 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.base import NO_DEFAULT
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.transforms import Transform
+
+Key = tuple[str, ...]
+# The entries of one moment by their full keys.
+State = dict[Key, Tensor]
 
 NEXT = "next"
 # Written by the clock: the seed from which everything random in an episode follows, and its step.
@@ -28,39 +31,20 @@ SEED = ("episode", "seed")
 STEP = ("episode", "step")
 
 
-def as_tuple(key: NestedKey) -> tuple[str, ...]:
-    """Return a key as a tuple; a dotted string counts as nested (``"cav.gap"``)."""
-    if isinstance(key, str):
-        return tuple(key.split("."))
-    return tuple(key)
+def as_key(key: NestedKey) -> Key:
+    """Return a key as a tuple; a dotted string counts as nested (``"vehicles.gap"``)."""
+    return tuple(key.split(".")) if isinstance(key, str) else tuple(key)
 
 
-def following(key: NestedKey) -> tuple[str, ...]:
-    """Return the key of the same entry one step later."""
-    return (NEXT, *as_tuple(key))
+def next_key(key: NestedKey) -> Key:
+    """Return the key of the same entry at the moment reached."""
+    return (NEXT, *as_key(key))
 
 
-def arrived(key: NestedKey) -> tuple[str, ...]:
-    """Return the key of an entry of the moment reached, as that moment itself names it."""
-    key = as_tuple(key)
+def root_key(key: NestedKey) -> Key:
+    """Return a key without ``"next"``."""
+    key = as_key(key)
     return key[1:] if key[0] == NEXT else key
-
-
-def as_sequence(values: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
-    """Return what :meth:`Piece.compute` returned as a sequence, also where it is one tensor."""
-    return (values,) if isinstance(values, Tensor) else values
-
-
-def peek(source: Any, key: tuple[str, ...]) -> Tensor:
-    """Return an entry, past TensorDict's checks of the key, which cost as much as the physics."""
-    for part in key:
-        source = source._get_str(part, NO_DEFAULT)
-    return source
-
-
-def put(target: TensorDictBase, key: tuple[str, ...], value: Tensor) -> None:
-    """Set an entry of an environment's own TensorDict, past the checks of shape and device."""
-    target._set_tuple(key, value, inplace=False, validated=True, non_blocking=False)
 
 
 class Piece(TensorDictModuleBase, Transform):
@@ -82,21 +66,44 @@ class Piece(TensorDictModuleBase, Transform):
         event_shape: Sequence[int] = (1,),
     ) -> None:
         super().__init__(
-            in_keys=[as_tuple(key) for key in reads], out_keys=[as_tuple(key) for key in writes]
+            in_keys=[as_key(key) for key in reads], out_keys=[as_key(key) for key in writes]
         )
-        self._entries, self._results = list(map(as_tuple, reads)), list(map(as_tuple, writes))
         self.event_shape = tuple(event_shape)
+        # As plain tuples: TorchRL's properties convert at every access.
+        self.sources = [(as_key(key)[0] == NEXT, root_key(key)) for key in reads]
+        self.targets = [root_key(key) for key in writes]
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
+    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         """Return the spec of each written key, without ``"next"``."""
         shape = (*batch, *self.event_shape)
-        return {key: Unbounded(shape=shape, device=device) for key in map(arrived, self.out_keys)}
+        return {key: Unbounded(shape=shape, device=device) for key in self.targets}
 
-    @dispatch(auto_batch_size=False)  # entries of followers have one dimension more
+    def apply(self, before: State, reached: State, detached: bool = False) -> None:
+        """Compute the entries written from plain mappings of entries.
+
+        Args:
+            before: entries of the moment left; a feature does not look at them.
+            reached: entries of the moment reached, to which those written are added.
+            detached: cut the gradient of what is written.
+        """
+        values = self._entries(before, reached)
+        if detached:
+            values = [value.detach() for value in values]
+        self._write(self.compute(*values), reached)
+
+    def _entries(self, before: State, reached: State) -> list[Tensor]:
+        return [(reached if late else before)[key] for late, key in self.sources]
+
+    def _write(self, values: Tensor | Sequence[Tensor], reached: State) -> None:
+        values = (values,) if isinstance(values, Tensor) else values
+        reached.update(zip(self.targets, values, strict=True))
+
+    @dispatch(auto_batch_size=False)  # entries of vehicles have one dimension more
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         values = self.compute(*(tensordict.get(key) for key in self.in_keys))
-        for key, value in zip(self.out_keys, as_sequence(values), strict=True):
+        values = (values,) if isinstance(values, Tensor) else values
+        for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
         return tensordict
 
@@ -124,29 +131,29 @@ def add_specs(piece: Piece, spec: Composite) -> Composite:
 
 
 class Feature(Piece):
-    """A piece that looks at one moment, at reset as well as after every step."""
+    """A piece that reads one moment, at reset as well as after every step."""
+
+    def _entries(self, before: State, reached: State) -> list[Tensor]:
+        return [reached[key] for _, key in self.sources]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self.compute(*[peek(next_tensordict, key) for key in self._entries])
-        for key, value in zip(self._results, as_sequence(values), strict=True):
-            put(next_tensordict, key, value)
-        return next_tensordict
+        return self.forward(next_tensordict)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return self._call(tensordict_reset)
+        return self.forward(tensordict_reset)
 
 
-class Transition(Piece):
-    """A piece that looks at the moment left and the moment reached.
+class StepTransform(Piece):
+    """A piece that reads the moment left and the moment reached.
 
     Args:
         reads: keys of the arguments of :meth:`compute`; under ``"next"`` for the moment reached.
         writes: keys written at the moment reached, given without ``"next"``.
         constants: keys that :meth:`begin` sets at reset and that keep their value for the whole
-            episode; a caller may set those listed in ``choices`` through ``env.reset``.
-        choices: the keys among ``constants`` that can be given to ``env.reset``.
+            episode.
+        reset_options: the keys among ``constants`` that a caller may set through ``env.reset``.
         event_shape: shape of one written entry after the batch dimensions.
     """
 
@@ -155,40 +162,39 @@ class Transition(Piece):
         reads: Sequence[NestedKey],
         writes: Sequence[NestedKey],
         constants: Sequence[NestedKey] = (),
-        choices: Sequence[NestedKey] = (),
+        reset_options: Sequence[NestedKey] = (),
         event_shape: Sequence[int] = (1,),
     ) -> None:
-        super().__init__(reads, [following(key) for key in writes], event_shape)
-        self._sources = [(as_tuple(key)[0] == NEXT, arrived(key)) for key in reads]
-        self._arrival_keys = [as_tuple(key) for key in writes]
-        self.constants = [as_tuple(key) for key in constants]
-        self.choices = [as_tuple(key) for key in choices]
+        super().__init__(reads, [next_key(key) for key in writes], event_shape)
+        self.constants = [as_key(key) for key in constants]
+        self.reset_options = [as_key(key) for key in reset_options]
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         """Set the written entries and the constants at reset; zeros unless overridden.
 
         Args:
-            given: what the caller passed to ``env.reset``: the ``choices`` may be in it.
+            given: what the caller passed to ``env.reset``: the reset options may be in it.
             start: the first moment of the episodes, written by the pieces before this one.
         """
-        specs = self.written_specs(start.batch_size, start.device)
-        for key in map(arrived, self.out_keys):
-            start.set(key, specs[key].zero())
+        for key, spec in self.written_specs(start.batch_size, start.device).items():
+            start.set(key, spec.zero())
 
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
+    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         """Return the spec of each constant key."""
         shape = (*batch, *self.event_shape)
         return {key: Unbounded(shape=shape, device=device) for key in self.constants}
 
+    def apply(self, before: State, reached: State, detached: bool = False) -> None:
+        super().apply(before, reached, detached)
+        reached.update((key, before[key]) for key in self.constants)
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        entries = [
-            peek(next_tensordict if late else tensordict, key) for late, key in self._sources
-        ]
-        values = as_sequence(self.compute(*entries))
-        for key, value in zip(self._arrival_keys, values, strict=True):
-            put(next_tensordict, key, value)
-        for key in self.constants:
-            put(next_tensordict, key, peek(tensordict, key))
+        entries = [(next_tensordict if late else tensordict).get(key) for late, key in self.sources]
+        reached: State = {}
+        self._write(self.compute(*entries), reached)
+        reached.update((key, tensordict.get(key)) for key in self.constants)
+        for key, value in reached.items():
+            next_tensordict.set(key, value)
         return next_tensordict
 
     def _reset(
@@ -206,51 +212,25 @@ class Transition(Piece):
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         constants = self.constant_specs(state_spec.shape, state_spec.device)
-        for key in self.choices:
+        for key in self.reset_options:
             state_spec[key] = constants[key]
         return state_spec
 
 
-class Pieces(Compose):
-    """The pieces of an environment in the order in which they act.
+class RewardPiece(Feature):
+    """A feature written to the reward spec: it exists after a step, not at reset.
 
-    No piece has an inverse, changes the device or the size of the batch, or looks at what a step
-    leaves behind. TorchRL asks for all this at every step; here only other transforms, which a
-    user may append, are asked.
+    Called on stored transitions (TensorDicts with ``"next"``), it reads the moment reached and
+    writes there, as in an environment.
     """
 
-    def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Apply the inverse of what is not a piece, last first."""
-        tensordict = tensordict.copy()
-        for transform in reversed(self._others()):
-            tensordict = transform._inv_call(tensordict)
-        return tensordict
-
-    def _post_step_mdp_hooks(
-        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        for transform in self._others():
-            tensordict, tensordict_ = transform._post_step_mdp_hooks(tensordict, tensordict_)
-        return tensordict, tensordict_
-
-    def transform_env_device(self, device: torch.device) -> torch.device:
-        """Return the device of the environment."""
-        for transform in self._others():
-            device = transform.transform_env_device(device)
-        return device
-
-    def transform_env_batch_size(self, batch_size: torch.Size) -> torch.Size:
-        """Return the size of the environment's batch."""
-        for transform in self._others():
-            batch_size = transform.transform_env_batch_size(batch_size)
-        return batch_size
-
-    def _others(self) -> list[Transform]:
-        return [transform for transform in self.transforms if not isinstance(transform, Piece)]
-
-
-class RewardPiece(Feature):
-    """A feature written to the reward spec: it exists after a step, not at reset."""
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Apply the piece to transitions, or to a TensorDict that holds its ``in_keys``."""
+        if NEXT in tensordict.keys():  # noqa: SIM118  a TensorDict is no dict
+            super().forward(tensordict.get(NEXT))
+            return tensordict
+        return super().forward(tensordict)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -1,4 +1,4 @@
-"""The estimator: what the controlled car believes of the human driver behind it."""
+"""The estimator: what an automated vehicle believes of the human drivers behind it."""
 
 from __future__ import annotations
 
@@ -11,30 +11,32 @@ from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
-from lcc_rl.pieces.base import STEP, Transition, following
-from lcc_rl.pieces.vehicles import Population
+from lcc_rl.functional.pattern import HUMAN, VehicleString
+from lcc_rl.pieces.base import Key, StepTransform
+from lcc_rl.pieces.controllers import Population
+from lcc_rl.pieces.views import Views
 
 
-class DriverEstimator(Transition):
-    """Predicts the follower's acceleration from what on-board sensors measure (A15).
+class DriverEstimator(StepTransform):
+    """Predicts the acceleration of human drivers from what on-board sensors measure (A15).
 
     During the first ``learning_time`` the prediction is the mean over the calibrated drivers;
     afterwards it is the IDM with the (v0, T) fitted to this episode so far. Only speeds and gaps
-    up to now are used; the follower's acceleration is the difference of its speeds.
+    up to now are used; a driver's acceleration is the difference of its speeds.
 
-    Writes under ``name``: ``"predicted_acceleration"`` of the step just taken, as predicted at
-    its start, shape ``[*batch, followers, 1]`` [m/s²], and the belief ``"estimate"``
-    ``[*batch, followers, 2]`` and ``"covariance"`` ``[*batch, followers, 3]`` (see
+    Writes under the role: ``"predicted_acceleration"`` of the step just taken, as predicted at
+    its start, ``[*batch, n, 1]`` [m/s²], and the belief ``"estimate"`` ``[*batch, n, 2]`` and
+    ``"covariance"`` ``[*batch, n, 3]`` (see
     :mod:`lcc_rl.functional.estimation`).
 
     Args:
         population: the calibrated drivers.
         time_step: duration of a step [s].
-        followers: human drivers observed.
         learning_time: time before the online fit is trusted [s]; infinite for the population
             mean throughout.
         measurement_error: standard deviation of the measured acceleration [m/s²].
-        name: namespace of the followers.
+        string: the string of vehicles; one human driver where not given.
+        role: whose acceleration is predicted.
 
     Raises:
         ConfigError: if ``measurement_error`` is not positive or ``learning_time`` negative.
@@ -47,27 +49,24 @@ class DriverEstimator(Transition):
         self,
         population: Population,
         time_step: float,
-        followers: int = 1,
         learning_time: float = 5.0,
         measurement_error: float = 0.05,
-        name: str = "hdv",
+        string: VehicleString | None = None,
+        role: str = HUMAN,
     ) -> None:
         if not measurement_error > 0:
             raise ConfigError(f"measurement_error must be positive, got {measurement_error}")
         if not learning_time >= 0:
             raise ConfigError(f"learning_time must not be negative, got {learning_time}")
-        belief = [(name, "estimate"), (name, "covariance")]
+        string = VehicleString((role,)) if string is None else string
+        belief = [(role, "estimate"), (role, "covariance")]
+        motion = [f"self.{name}" for name in ("speed", "gap", "relative_speed")]
+        names = [*motion, *(".".join(key) for key in belief), "episode.step", "next.self.speed"]
+        self.views = Views(string, role, names)
         super().__init__(
-            reads=[
-                (name, "speed"),
-                (name, "gap"),
-                (name, "relative_speed"),
-                *belief,
-                STEP,
-                following((name, "speed")),
-            ],
-            writes=[(name, "predicted_acceleration"), *belief],
-            event_shape=(followers, 1),
+            self.views.keys,
+            [(role, "predicted_acceleration"), *belief],
+            event_shape=(string.count(role), 1),
         )
         self.time_step, self.measurement_error = time_step, measurement_error
         self.learning_steps = learning_time / time_step
@@ -79,41 +78,32 @@ class DriverEstimator(Transition):
         self.register_buffer("prior_estimate", start.estimate)
         self.register_buffer("prior_covariance", start.covariance)
 
-    def compute(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        relative_speed: Tensor,
-        estimate: Tensor,
-        covariance: Tensor,
-        step: Tensor,
-        speed_reached: Tensor,
-    ) -> tuple[Tensor, ...]:
+    def compute(self, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the predicted acceleration of the step and the belief after it."""
+        speed, gap, relative_speed, estimate, covariance, step, reached = self.views(*entries)
         predicted, belief = predict_and_update(
             speed,
             gap,
             -relative_speed,
-            speed_reached,
+            reached,
             Belief(estimate, covariance),
             self.drivers,
             self.time_step,
             self.measurement_error,
         )
-        early = step.unsqueeze(-2) < self.learning_steps
+        early = step < self.learning_steps
         predicted = torch.where(early, self.mean(speed, gap, -relative_speed), predicted)
         return predicted, belief.estimate, belief.covariance
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
-        followers = self.event_shape[0]
+    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         return {
-            key: Unbounded(shape=(*batch, followers, width), device=device)
-            for key, width in zip(self._arrival_keys, (1, 2, 3), strict=True)
+            key: Unbounded(shape=(*batch, self.event_shape[0], width), device=device)
+            for key, width in zip(self.targets, (1, 2, 3), strict=True)
         }
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
         for key, value in zip(
-            self._arrival_keys[1:], (self.prior_estimate, self.prior_covariance), strict=True
+            self.targets[1:], (self.prior_estimate, self.prior_covariance), strict=True
         ):
             start.set(key, value.expand_as(start.get(key)).clone())

@@ -1,4 +1,4 @@
-"""What the car can know beyond the present moment: its own memory, and a preview of the leader."""
+"""Knowledge beyond the present moment: a vehicle's own memory, and a preview of the leader."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.pieces.base import SEED, STEP, Feature, Transition, arrived, as_tuple, following
+from lcc_rl.pieces.base import NEXT, SEED, STEP, Feature, Key, StepTransform
+from lcc_rl.pieces.views import Views
 
 KINDS = ("filtered", "stacked")
 
@@ -21,7 +23,7 @@ KINDS = ("filtered", "stacked")
 class LeaderPreview(Feature):
     """The leader's speed some seconds ahead, as a message from further down the road would give.
 
-    Writes ``(name, "speed")`` [m/s], shape ``[*batch, horizons]``. Beyond the end of a record its
+    Writes ``("preview", "speed")`` [m/s], ``[*batch, 1, horizons]``, one row for all. Beyond the end of a record its
     last speed stands; a window cut from a longer record goes on in it. Reading the record is what
     makes it an upper bound: no real message knows this much.
 
@@ -31,8 +33,6 @@ class LeaderPreview(Feature):
         horizons: how far ahead, one or more [s].
         noise: standard deviation of an error drawn anew for each step and horizon [m/s].
         delay: age of the message: the speed of that long before is given instead [s].
-        leader: namespace of the leader.
-        name: namespace of what is written.
 
     Raises:
         ConfigError: if there is no horizon, or a setting is negative.
@@ -51,18 +51,16 @@ class LeaderPreview(Feature):
         horizons: Sequence[float] = (1.0, 2.0, 3.0, 4.0, 5.0),
         noise: float = 0.0,
         delay: float = 0.0,
-        leader: str = "leader",
-        name: str = "preview",
     ) -> None:
-        _check_numbers(f"{name}.horizons", horizons)
+        _check_numbers("preview.horizons", horizons)
         if not horizons or min(horizons) < 0 or noise < 0 or delay < 0:
             raise ConfigError(
-                f"{name}: horizons {list(horizons)} must be given, and horizons, noise {noise} "
+                f"preview: horizons {list(horizons)} must be given, and horizons, noise {noise} "
                 f"and delay {delay} must not be negative"
             )
-        reads = [(leader, "profile"), (leader, "start"), SEED, STEP]
-        super().__init__(reads, [(name, "speed")], (len(horizons),))
-        self.noise, self.stream = noise, stream_id(f"{name}.noise")
+        reads = [("leader", "profile"), ("leader", "start"), SEED, STEP]
+        super().__init__(reads, [("preview", "speed")], (1, len(horizons)))
+        self.noise, self.stream = noise, stream_id("preview.noise")
         steps = [round((horizon - delay) / time_step) for horizon in horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
@@ -78,23 +76,23 @@ class LeaderPreview(Feature):
         if self.noise:
             error = normal(seed, step, self.stream + self.columns)
             speed = (speed + self.noise * error).clamp(min=0.0)
-        return speed
+        return speed.unsqueeze(-2)
 
 
-class ObservationMemory(Transition):
-    """What the car measured during the last seconds.
+class ObservationMemory(StepTransform):
+    """What each automated vehicle measured during the last seconds.
 
-    Writes ``(name, "entries")``, shape ``[*batch, sources × seconds]``, sources slowest: for each
+    Writes ``("memory", "entries")``, ``[*batch, A, sources × seconds]``, sources slowest: for each
     source and each number in ``seconds`` its exponential average with that time constant
     (``filtered``), or its value of that long ago (``stacked``, which also writes the
-    ``(name, "history")`` that it needs). Before the episode began nothing had changed.
+    ``("memory", "history")`` that it needs). Before the episode began nothing had changed.
 
     Args:
         time_step: duration of a step [s].
-        sources: entries remembered, each one number wide, dotted: ``"cav.gap"``.
+        sources: what is remembered, views one number wide, dotted: ``"self.gap"``.
         seconds: time constants or ages, one or more, positive [s].
         kind: ``"filtered"`` or ``"stacked"``.
-        name: namespace of what is written.
+        string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
         ConfigError: if a setting is unknown, missing or not positive.
@@ -106,50 +104,60 @@ class ObservationMemory(Transition):
     def __init__(
         self,
         time_step: float,
-        sources: Sequence[str] = ("leader.speed",),
+        sources: Sequence[str] = ("ahead.speed",),
         seconds: Sequence[float] = (1.0, 5.0),
         kind: str = "filtered",
-        name: str = "memory",
+        string: VehicleString | None = None,
     ) -> None:
         if kind not in KINDS:
-            raise ConfigError(f"{name}.kind must be one of {', '.join(KINDS)}, got {kind!r}")
-        _check_numbers(f"{name}.seconds", seconds)
+            raise ConfigError(f"memory.kind must be one of {', '.join(KINDS)}, got {kind!r}")
+        _check_numbers("memory.seconds", seconds)
         if not sources or not seconds or min(seconds) < time_step:
             raise ConfigError(
-                f"{name}: sources {list(sources)} and seconds {list(seconds)} must be given, and "
+                f"memory: sources {list(sources)} and seconds {list(seconds)} must be given, and "
                 f"no second be shorter than a step ({time_step})"
             )
+        string = VehicleString() if string is None else string
         ages = [round(age / time_step) for age in seconds]
         self.stacked, self.depth = kind == "stacked", max(ages) + 1
         kept = "history" if kind == "stacked" else "entries"
-        writes = [(name, "entries")] + ([(name, "history")] if self.stacked else [])
-        reads = [(name, kept), *(following(as_tuple(source)) for source in sources)]
-        super().__init__(reads, writes, event_shape=(len(sources) * len(seconds),))
-        self.sources = [as_tuple(source) for source in sources]
+        self.views = Views(
+            string, AUTOMATED, [f"memory.{kept}", *(f"{NEXT}.{source}" for source in sources)]
+        )
+        # The same entries at reset, where there is no step before.
+        self.first = Views(string, AUTOMATED, sources)
+        writes = [("memory", "entries")] + ([("memory", "history")] if self.stacked else [])
+        self.sources_count, self.repeat = len(sources), len(seconds)
+        super().__init__(
+            self.views.keys,
+            writes,
+            event_shape=(string.count(AUTOMATED), len(sources) * len(seconds)),
+        )
         shares = 1.0 - torch.exp(-time_step / torch.tensor(list(seconds)))
         self.register_buffer("shares", shares.repeat(len(sources)))
         self.register_buffer("places", torch.tensor(ages))
-        self.repeat = len(seconds)
 
-    def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+    def compute(self, *entries: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the entries, and the history where it is kept."""
+        kept, *measured = self.views(*entries)
         now = torch.cat(measured, -1)
         if not self.stacked:
             return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
-        past = kept.unflatten(-1, (len(self.sources), self.depth))
+        past = kept.unflatten(-1, (self.sources_count, self.depth))
         past = torch.cat([now.unsqueeze(-1), past[..., :-1]], -1)
         return past[..., self.places].flatten(-2), past.flatten(-2)
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
-        widths = (self.event_shape[0], len(self.sources) * self.depth)
+    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        vehicles, width = self.event_shape
+        widths = (width, self.sources_count * self.depth)
         return {
-            arrived(key): Unbounded(shape=(*batch, width), device=device)
-            for key, width in zip(self.out_keys, widths, strict=False)
+            key: Unbounded(shape=(*batch, vehicles, wide), device=device)
+            for key, wide in zip(self.targets, widths, strict=False)
         }
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        now = torch.cat([start.get(source) for source in self.sources], -1)
-        for key, repeat in zip(self._arrival_keys, (self.repeat, self.depth), strict=False):
+        now = torch.cat(self.first(*(start.get(key) for key in self.first.keys)), -1)
+        for key, repeat in zip(self.targets, (self.repeat, self.depth), strict=False):
             start.set(key, now.repeat_interleave(repeat, -1))
 
 

@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import choose, stream_id, uniform
-from lcc_rl.pieces.base import SEED, STEP, Transition, following
+from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key
+
+PROFILE, FIRST = ("leader", "profile"), ("leader", "start")
+SPEED, ACCELERATION, NEXT_SPEED = (
+    ("leader", name) for name in ("speed", "acceleration", "next_speed")
+)
 
 
-class RecordedLeader(Transition):
-    """Base of leaders: draws a window of a speed profile at reset.
+class NGSIMLeader(StepTransform):
+    """Plays back a window of a speed record ahead of the string (PV in ALCC, leader in HCFS).
 
-    The profile is random by the episode's seed, or given to ``env.reset`` as ``("leader",
+    The record is random by the episode's seed, or given to ``env.reset`` as ``("leader",
     "profile")`` and ``("leader", "start")``, one per episode: an id, or a list paired with
     drivers.
+
+    Writes ``("leader", "speed")`` [m/s] and ``("leader", "acceleration")``, the backward
+    difference [m/s²], ``[*batch, 1]``; with ``foresight`` also ``("leader", "next_speed")``, the
+    speed one step ahead, which only an oracle may read [m/s].
+
+    A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)): every episode has its own
+    c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
 
     Args:
         profiles: the records to play; each must hold at least ``horizon`` steps.
@@ -32,16 +43,21 @@ class RecordedLeader(Transition):
         start: ``"random"`` draws where in the record the window begins, ``"first"`` begins at
             its first sample.
         profile: the record to play in every episode; None draws one for each.
-        name: namespace of the written entries.
-        reads, writes: entries read and written besides those of every leader.
+        perturbation: p; evaluation takes 0, the record as it is.
+        foresight: write the next speed, too.
+        nominal: no perturbation, as in an evaluation.
 
     Raises:
-        ConfigError: if ``start`` or ``profile`` is unknown.
+        ConfigError: if a setting is unknown or out of range.
         DataError: if no record is as long as the horizon.
+
+    Examples:
+        >>> leader = NGSIMLeader.from_file("trajectories.csv", horizon=300)  # doctest: +SKIP
     """
 
     speeds: Tensor
     offsets: Tensor
+    lengths: Tensor
     starts: Tensor
 
     def __init__(
@@ -51,45 +67,95 @@ class RecordedLeader(Transition):
         time_step: float,
         start: str = "random",
         profile: int | None = None,
-        name: str = "leader",
-        reads: Sequence[NestedKey] = (),
-        writes: Sequence[NestedKey] = (),
+        perturbation: float = 0.0,
+        foresight: bool = False,
+        nominal: bool = False,
     ) -> None:
         if start not in ("random", "first"):
             raise ConfigError(f"leader start must be 'random' or 'first', got {start!r}")
-        chosen = [(name, "profile"), (name, "start")]
+        if not perturbation >= 0:
+            raise ConfigError(f"leader.perturbation must not be negative, got {perturbation}")
+        chosen = [PROFILE, FIRST]
+        self.perturbation = 0.0 if nominal else perturbation
+        writes = [SPEED, ACCELERATION, *([NEXT_SPEED] if foresight else [])]
         super().__init__(
-            reads=[*chosen, (name, "speed"), following(STEP), *reads],
-            writes=[(name, "speed"), (name, "acceleration"), *writes],
+            reads=[*chosen, SPEED, next_key(STEP), SEED],
+            writes=writes,
             constants=chosen,
-            choices=chosen,
+            reset_options=chosen,
         )
         profiles = profiles.at_least(horizon)
         if profile is not None and not 0 <= profile < len(profiles):
-            raise ConfigError(f"{name}.profile must lie in 0…{len(profiles) - 1}, got {profile}")
-        self.name, self.start, self.time_step = name, start, time_step
-        self.profile = profile
-        self.profile_stream = stream_id(f"{name}.profile")
-        self.start_stream = stream_id(f"{name}.start")
+            raise ConfigError(f"leader.profile must lie in 0…{len(profiles) - 1}, got {profile}")
+        self.start, self.profile, self.time_step = start, profile, time_step
+        self.foresight = foresight
+        self.profile_stream = stream_id("leader.profile")
+        self.start_stream = stream_id("leader.start")
+        self.streams = [stream_id(f"leader.perturbation.{part}") for part in "cAtp"]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
+        self.register_buffer("lengths", profiles.lengths)
         self.register_buffer("starts", profiles.lengths - horizon)
 
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Any, Any]:
+    @classmethod
+    def from_file(
+        cls, path: str | Path, horizon: int = 300, time_step: float = 0.1, **settings: Any
+    ) -> NGSIMLeader:
+        """Read the leaders of a trajectory file in any published NGSIM layout.
+
+        Args:
+            path: the file, plain or .gz, or a pattern of files.
+            horizon: steps per episode; shorter records are left out.
+            time_step: duration of a step [s].
+            **settings: further arguments of :class:`NGSIMLeader`.
+
+        Raises:
+            DataError: naming the file, column or row at fault.
+        """
+        return cls(from_trajectories(path, time_step), horizon, time_step, **settings)  # noqa
+
+    def compute(
+        self, profile: Tensor, first: Tensor, speed: Tensor, step: Tensor, seed: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Return speed, acceleration and next speed at the moment reached."""
+        reached = self.speed_at(profile, first, step, seed)
+        motion = (reached, (reached - speed) / self.time_step)
+        if not self.foresight:
+            return motion
+        return (*motion, self.speed_at(profile, first, step + 1, seed))
+
+    def speed_at(self, profile: Tensor, first: Tensor, step: Tensor, seed: Tensor) -> Tensor:
+        """Return the speed at a step of the episode; a record that is over keeps its last."""
+        sample = first + step
+        if self.foresight:
+            sample = torch.minimum(sample, self.lengths[profile] - 1)
+        speed = self.speeds[self.offsets[profile] + sample]
+        if not self.perturbation:
+            return speed
+        share, height, period, phase = (uniform(seed, 0, stream) for stream in self.streams)
+        angle = 2 * math.pi * (step * self.time_step / (4.0 + 16.0 * period) + phase)
+        factor = 1.0 + self.perturbation * 0.4 * (share - 0.5)
+        return (factor * speed + self.perturbation * height * angle.sin()).clamp(min=0.0)
+
+    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         spec = Unbounded(shape=(*batch, 1), dtype=torch.int64, device=device)
         return {key: spec.clone() for key in self.constants}
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        profile, first = self._window(given, start.get(SEED))
-        speed = self.speeds[self.offsets[profile] + first]
-        start.set(self.choices[0], profile)
-        start.set(self.choices[1], first)
-        start.set((self.name, "speed"), speed)
-        start.set((self.name, "acceleration"), torch.zeros_like(speed))
+        seed = start.get(SEED)
+        profile, first = self._window(given, seed)
+        still = torch.zeros_like(seed)
+        speed = self.speed_at(profile, first, still, seed)
+        start.set(PROFILE, profile)
+        start.set(FIRST, first)
+        start.set(SPEED, speed)
+        start.set(ACCELERATION, torch.zeros_like(speed))
+        if self.foresight:
+            start.set(NEXT_SPEED, self.speed_at(profile, first, still + 1, seed))
 
     def _window(self, given: TensorDictBase, seed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the profile and its first sample, as given or else drawn."""
-        profile, first = given.get(self.choices[0], None), given.get(self.choices[1], None)
+        """Return the record and its first sample, as given or else drawn."""
+        profile, first = given.get(PROFILE, None), given.get(FIRST, None)
         if profile is None and self.profile is not None:
             profile = torch.full_like(seed, self.profile)
         elif profile is None:
@@ -101,97 +167,3 @@ class RecordedLeader(Transition):
             if self.start == "random":
                 first = choose(seed, self.starts[profile], self.start_stream)
         return profile, first
-
-
-class NGSIMLeader(RecordedLeader):
-    """Plays back a window of a speed profile (the PV of the ALCC scenarios).
-
-    Writes ``(name, "speed")`` [m/s] and ``(name, "acceleration")`` [m/s²], shape ``[*batch, 1]``.
-
-    Args:
-        profiles, horizon, time_step, start, profile, name: see :class:`RecordedLeader`.
-    """
-
-    def __init__(
-        self,
-        profiles: Profiles,
-        horizon: int,
-        time_step: float,
-        start: str = "random",
-        profile: int | None = None,
-        name: str = "leader",
-    ) -> None:
-        super().__init__(profiles, horizon, time_step, start, profile, name)
-
-    def compute(
-        self, profile: Tensor, start: Tensor, speed: Tensor, step: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return speed and acceleration at the moment reached."""
-        reached = self.speeds[self.offsets[profile] + start + step]
-        return reached, (reached - speed) / self.time_step
-
-
-class PlatoonLeader(RecordedLeader):
-    """Plays back a window of a speed record, in training with perturbed speeds (HCFS).
-
-    A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)): every episode has its own
-    c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
-
-    Writes ``(name, "speed")`` [m/s], ``(name, "acceleration")`` [m/s²], the backward difference,
-    and ``(name, "next_speed")`` [m/s], the speed one step ahead, which only an ``oracle`` may
-    look at; shape ``[*batch, 1]``.
-
-    Args:
-        profiles, horizon, time_step, start, profile, name: see :class:`RecordedLeader`.
-        perturbation: p, 0 for the record as it is.
-
-    Raises:
-        ConfigError: if ``perturbation`` is negative, or as :class:`RecordedLeader`.
-    """
-
-    lengths: Tensor
-
-    def __init__(
-        self,
-        profiles: Profiles,
-        horizon: int,
-        time_step: float,
-        start: str = "random",
-        profile: int | None = None,
-        perturbation: float = 0.0,
-        name: str = "leader",
-    ) -> None:
-        if not perturbation >= 0:
-            raise ConfigError(f"{name}.perturbation must not be negative, got {perturbation}")
-        super().__init__(
-            profiles, horizon, time_step, start, profile, name, [SEED], [(name, "next_speed")]
-        )
-        self.perturbation = perturbation
-        self.streams = [stream_id(f"{name}.perturbation.{part}") for part in "cAtp"]
-        self.register_buffer("lengths", profiles.at_least(horizon).lengths)
-
-    def compute(
-        self, profile: Tensor, start: Tensor, speed: Tensor, step: Tensor, seed: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Return speed, acceleration and next speed at the moment reached."""
-        reached = self.speed_at(profile, start, step, seed)
-        following_speed = self.speed_at(profile, start, step + 1, seed)
-        return reached, (reached - speed) / self.time_step, following_speed
-
-    def speed_at(self, profile: Tensor, start: Tensor, step: Tensor, seed: Tensor) -> Tensor:
-        """Return the speed at a step of the episode; a record that is over keeps its last."""
-        sample = torch.minimum(start + step, self.lengths[profile] - 1)
-        speed = self.speeds[self.offsets[profile] + sample]
-        if not self.perturbation:
-            return speed
-        share, height, period, phase = (uniform(seed, 0, stream) for stream in self.streams)
-        angle = 2 * math.pi * (step * self.time_step / (4.0 + 16.0 * period) + phase)
-        factor = 1.0 + self.perturbation * 0.4 * (share - 0.5)
-        return (factor * speed + self.perturbation * height * angle.sin()).clamp(min=0.0)
-
-    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        super().begin(given, start)
-        seed, still = start.get(SEED), torch.zeros_like(start.get(SEED))
-        profile, first = (start.get(key) for key in self.choices)
-        start.set((self.name, "speed"), self.speed_at(profile, first, still, seed))
-        start.set((self.name, "next_speed"), self.speed_at(profile, first, still + 1, seed))

@@ -1,9 +1,10 @@
-"""Rewards: named, weighted terms, each logged by itself, and their sum.
+"""Rewards: named, weighted terms per automated vehicle, each logged by itself, and their sum.
 
-A new term is a class with the entries it reads and its formula::
+A term of your own is a class with the names it reads (:mod:`lcc_rl.pieces.views`) and its
+formula::
 
     class Comfort(RewardTerm):
-        reads = ("cav.jerk",)
+        reads = ("self.jerk",)
         def reward(self, jerk): return -jerk.abs()
 
 and ``+reward.terms.comfort={_target_: mymodule.Comfort, weight: 0.1}`` on the command line.
@@ -16,50 +17,53 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.safety import time_to_collision
 from lcc_rl.pieces.base import RewardPiece
+from lcc_rl.pieces.sections import Sections
+from lcc_rl.pieces.views import VEHICLES, Views
 
-TERMS = "reward_terms"
-REWARD = "reward"
+TERMS = (AUTOMATED, "reward_terms")
+REWARD = (AUTOMATED, "reward")
 
 
 class RewardTerm(RewardPiece):
-    """Base of all terms: writes ``("reward_terms", name)``, shape ``[*batch, 1]``.
+    """Base of all terms: writes ``("automated", "reward_terms", name)``, ``[*batch, A, 1]``.
 
     Args:
         name: name of the term; the key under ``reward.terms`` in the configuration.
         weight: factor of the term; 0 takes it out.
-        reads: entries read, where they depend on settings.
-        event_shape: shape of the term after the batch dimensions; ``(followers, 1)`` where every
-            follower of a platoon earns its own.
+        reads: names of what it reads, where they depend on settings.
+        string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
         ConfigError: if the weight is not a finite number.
     """
 
-    reads: ClassVar[tuple[NestedKey, ...]] = ()
-    # Maps the entries read to the unweighted term, [*batch, 1].
+    reads: ClassVar[tuple[str, ...]] = ()
+    # Maps what is read, one row per automated vehicle, to the unweighted term, [*batch, A, 1].
     reward: Callable[..., Tensor]
 
     def __init__(
         self,
         name: str,
         weight: float = 1.0,
-        reads: Sequence[NestedKey] | None = None,
-        event_shape: Sequence[int] = (1,),
+        reads: Sequence[str] | None = None,
+        string: VehicleString | None = None,
     ) -> None:
         if not math.isfinite(weight):
             raise ConfigError(f"reward.terms.{name}.weight must be finite, got {weight}")
-        super().__init__(self.reads if reads is None else reads, [(TERMS, name)], event_shape)
+        string = VehicleString() if string is None else string
+        self.views = Views(string, AUTOMATED, self.reads if reads is None else reads)
+        super().__init__(self.views.keys, [(*TERMS, name)], (string.count(AUTOMATED), 1))
         self.name, self.weight = name, weight
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the weighted term."""
-        return self.weight * self.reward(*entries)
+        return self.weight * self.reward(*self.views(*entries))
 
 
 class SafetyReward(RewardTerm):
@@ -70,12 +74,13 @@ class SafetyReward(RewardTerm):
     stays large.
 
     Args:
-        name, weight: see :class:`RewardTerm`.
+        name, weight, string: see :class:`RewardTerm`.
         threshold: time-to-collision that is safe enough [s].
         floor: time-to-collision below which the term no longer falls [s].
         margin: gap that counts as contact [m].
-        vehicle: namespace of the vehicle.
     """
+
+    reads = ("self.gap", "self.relative_speed")
 
     def __init__(
         self,
@@ -84,13 +89,13 @@ class SafetyReward(RewardTerm):
         threshold: float = 4.0,
         floor: float = 0.01,
         margin: float = 1.0,
-        vehicle: str = "cav",
+        string: VehicleString | None = None,
     ) -> None:
         if not 0 < floor < threshold:
             raise ConfigError(f"reward.terms.{name}: floor {floor} must be below {threshold}")
         if not margin >= 0:
             raise ConfigError(f"reward.terms.{name}.margin must not be negative, got {margin}")
-        super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "relative_speed")])
+        super().__init__(name, weight, string=string)
         self.threshold, self.floor, self.margin = threshold, floor, margin
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
@@ -103,19 +108,20 @@ class EfficiencyReward(RewardTerm):
     """R_eff = −1 where the time gap is at least the threshold, else 0 (A12–A13).
 
     Args:
-        name, weight: see :class:`RewardTerm`.
+        name, weight, string: see :class:`RewardTerm`.
         threshold: time gap that is too long [s].
-        vehicle: namespace of the vehicle.
     """
+
+    reads = ("self.time_gap",)
 
     def __init__(
         self,
         name: str = "efficiency",
         weight: float = 1.0,
         threshold: float = 2.5,
-        vehicle: str = "cav",
+        string: VehicleString | None = None,
     ) -> None:
-        super().__init__(name, weight, [(vehicle, "time_gap")])
+        super().__init__(name, weight, string=string)
         self.threshold = threshold
 
     def reward(self, time_gap: Tensor) -> Tensor:
@@ -128,13 +134,15 @@ class EnergyReward(RewardTerm):
 
     Args:
         time_step: duration of a step [s].
-        name, weight: see :class:`RewardTerm`.
+        name, weight, string: see :class:`RewardTerm`.
         scale: power that costs 1 per second [W].
-        vehicle: namespace of the vehicle.
-        power: entry that holds the power; ``"predicted_power"`` for the follower as estimated
-            (A16), ``"power"`` for the true one.
-        followers: the entry belongs to a string of followers, ``[*batch, followers, 1]``, and is
-            summed over it.
+        of: whose energy counts: ``"self"``; ``"behind"``: all vehicles behind, back to the next
+            automated one; ``"string"``: all vehicles of the string.
+        power: the power [W], dotted: ``"vehicles.power"``, or ``"human.predicted_power"`` for
+            that of human drivers as the automated vehicle estimates it (A16).
+
+    Raises:
+        ConfigError: if the scale is not positive, or ``of`` is unknown.
     """
 
     def __init__(
@@ -143,19 +151,29 @@ class EnergyReward(RewardTerm):
         name: str = "energy",
         weight: float = 1.0,
         scale: float = 20000.0,
-        vehicle: str = "cav",
-        power: str = "power",
-        followers: bool = False,
+        of: str = "self",
+        power: str = "vehicles.power",
+        string: VehicleString | None = None,
     ) -> None:
         if not scale > 0:
             raise ConfigError(f"reward.terms.{name}.scale must be positive, got {scale}")
-        super().__init__(name, weight, [(vehicle, power)])
-        self.factor, self.followers = time_step / scale, followers
+        if of not in ("self", "behind", "string"):
+            raise ConfigError(f"reward.terms.{name}.of must be self, behind or string, got {of!r}")
+        string = VehicleString() if string is None else string
+        space, _, entry = power.partition(".")
+        own = f"self.{entry}" if space == VEHICLES else power
+        self.sections = Sections(string, space)
+        reads = [own if of == "self" else power]
+        reads += [".".join(key) for key in self.sections.keys if of == "behind"]
+        super().__init__(name, weight, reads, string)
+        self.factor, self.of = time_step / scale, of
 
-    def reward(self, power: Tensor) -> Tensor:
+    def reward(self, power: Tensor, *indices: Tensor) -> Tensor:
         """Return the unweighted term."""
-        if self.followers:
-            power = power.sum(-2)
+        if self.of == "behind":
+            power = self.sections.sum(power, *indices)
+        elif self.of == "string":
+            power = power.sum(-2, keepdim=True).expand(*power.shape[:-2], *self.event_shape)
         return power * -self.factor
 
 
@@ -163,98 +181,110 @@ class CollisionPenalty(RewardTerm):
     """Minus the weight in the step that ends in a collision, so that a crash never pays.
 
     Every other term is at most 0 and ends with the episode; without this one an agent with a long
-    horizon learns that crashing early is cheap.
+    horizon learns that crashing early is cheap. It is paid by the automated vehicle that hit the
+    one ahead.
 
     Args:
-        name, weight: see :class:`RewardTerm`; the weight is the penalty.
+        name, weight, string: see :class:`RewardTerm`; the weight is the penalty.
+        behind: it is also paid for collisions behind, back to the next automated vehicle.
     """
 
-    reads = ("terminated",)
+    def __init__(
+        self,
+        name: str = "collision",
+        weight: float = 100.0,
+        behind: bool = True,
+        string: VehicleString | None = None,
+    ) -> None:
+        string = VehicleString() if string is None else string
+        self.sections, self.behind = Sections(string, VEHICLES), behind
+        indices = [".".join(key) for key in self.sections.keys]
+        super().__init__(name, weight, ["self.gap", "vehicles.gap", *indices], string)
 
-    def __init__(self, name: str = "collision", weight: float = 100.0) -> None:
-        super().__init__(name, weight)
-
-    def reward(self, terminated: Tensor) -> Tensor:
+    def reward(self, gap: Tensor, gaps: Tensor, *indices: Tensor) -> Tensor:
         """Return the unweighted term."""
-        return -terminated.to(torch.float32)
+        hit = gap <= 0.0
+        if self.behind:
+            hit = hit | (self.sections.sum((gaps <= 0.0).to(gap.dtype), *indices) > 0.0)
+        return -hit.to(torch.float32)
 
 
 class VelocityReward(RewardTerm):
-    """−|e_v(i,0)|/v_max of every follower of a platoon, at the state reached (HCFS H4–H5).
+    """−|e_v(i,0)|/v_max, at the state reached (HCFS H4–H5).
 
     Args:
-        name, weight: see :class:`RewardTerm`; ω1.
+        name, weight, string: see :class:`RewardTerm`; ω1.
         speed_scale: v_max [m/s].
-        followers: followers of the platoon.
-        platoon: its namespace.
     """
+
+    reads = ("self.leader_speed_error",)
 
     def __init__(
         self,
         name: str = "velocity",
         weight: float = 10.0,
         speed_scale: float = 27.1,
-        followers: int = 1,
-        platoon: str = "platoon",
+        string: VehicleString | None = None,
     ) -> None:
         if not speed_scale > 0:
             raise ConfigError(
                 f"reward.terms.{name}.speed_scale must be positive, got {speed_scale}"
             )
-        super().__init__(name, weight, [(platoon, "leader_speed_error")], (followers, 1))
+        super().__init__(name, weight, string=string)
         self.speed_scale = speed_scale
 
     def reward(self, speed_error: Tensor) -> Tensor:
-        """Return the unweighted term, ``[*batch, followers, 1]``."""
+        """Return the unweighted term."""
         return -speed_error.abs() / self.speed_scale
 
 
 class JerkReward(RewardTerm):
-    """−|jerk|/(2 a_max/T) of every follower of a platoon (HCFS H6).
+    """−|jerk|/(2 a_max/T) (HCFS H6).
 
     Args:
-        name, weight: see :class:`RewardTerm`; ω2.
+        name, weight, string: see :class:`RewardTerm`; ω2.
         jerk_scale: 2 a_max/T [m/s³].
-        followers: followers of the platoon.
-        platoon: its namespace.
     """
+
+    reads = ("self.jerk",)
 
     def __init__(
         self,
         name: str = "jerk",
         weight: float = 0.036,
         jerk_scale: float = 30.0,
-        followers: int = 1,
-        platoon: str = "platoon",
+        string: VehicleString | None = None,
     ) -> None:
         if not jerk_scale > 0:
             raise ConfigError(f"reward.terms.{name}.jerk_scale must be positive, got {jerk_scale}")
-        super().__init__(name, weight, [(platoon, "jerk")], (followers, 1))
+        super().__init__(name, weight, string=string)
         self.jerk_scale = jerk_scale
 
     def reward(self, jerk: Tensor) -> Tensor:
-        """Return the unweighted term, ``[*batch, followers, 1]``."""
+        """Return the unweighted term."""
         return -jerk.abs() / self.jerk_scale
 
 
 class TotalReward(RewardPiece):
-    """Writes ``"reward"``: the sum of all terms (A17, A19).
+    """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``.
 
     Args:
         terms: the terms, by name.
-        event_shape: shape of the reward after the batch dimensions; that of the terms.
+        string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
         ConfigError: if there is no term.
     """
 
     def __init__(
-        self, terms: Sequence[str] | Mapping[str, object], event_shape: Sequence[int] = (1,)
+        self, terms: Sequence[str] | Mapping[str, object], string: VehicleString | None = None
     ) -> None:
         names = list(terms)
         if not names:
             raise ConfigError("reward.terms is empty: an environment needs at least one term")
-        super().__init__([(TERMS, name) for name in names], [REWARD], event_shape)
+        string = VehicleString() if string is None else string
+        super().__init__([(*TERMS, name) for name in names], [REWARD], (string.count(AUTOMATED), 1))
+        self.terms, self.string = names, string
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from lcc_rl.errors import require_positive
+from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.rewards import RewardTerm
 
 
@@ -33,17 +34,18 @@ class SmoothSafety(RewardTerm):
     which lead back to safety.
 
     Args:
-        name, weight: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
+        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
         threshold: time-to-collision that is safe enough [s].
         width: range over which the logarithm bends.
         margin: gap that counts as contact [m].
         gap_width: range of gaps over which contact bends [m].
         rate_width: range of approach rates over which closing begins [m/s].
-        vehicle: namespace of the vehicle.
 
     Raises:
         ConfigError: if a threshold or width is not positive.
     """
+
+    reads = ("self.gap", "self.relative_speed")
 
     def __init__(
         self,
@@ -54,7 +56,7 @@ class SmoothSafety(RewardTerm):
         margin: float = 1.0,
         gap_width: float = 0.2,
         rate_width: float = 0.1,
-        vehicle: str = "cav",
+        string: VehicleString | None = None,
     ) -> None:
         require_positive(
             f"agent.surrogates.{name}",
@@ -63,7 +65,7 @@ class SmoothSafety(RewardTerm):
             gap_width=gap_width,
             rate_width=rate_width,
         )
-        super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "relative_speed")])
+        super().__init__(name, weight, string=string)
         self.log_threshold, self.width, self.margin = math.log(threshold), width, margin
         self.gap_width, self.rate_width = gap_width, rate_width
 
@@ -78,15 +80,16 @@ class SmoothEfficiency(RewardTerm):
     """−max(0, log(TG / threshold)), smooth (stands in for A12–A13).
 
     Args:
-        name, weight: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
+        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
         threshold: time gap that is too long [s].
         width: range over which the logarithm bends.
         speed_floor: speeds below this count as this [m/s].
-        vehicle: namespace of the vehicle.
 
     Raises:
         ConfigError: if a setting is not positive.
     """
+
+    reads = ("self.gap", "self.speed")
 
     def __init__(
         self,
@@ -95,12 +98,12 @@ class SmoothEfficiency(RewardTerm):
         threshold: float = 2.5,
         width: float = 0.1,
         speed_floor: float = 1.0,
-        vehicle: str = "cav",
+        string: VehicleString | None = None,
     ) -> None:
         require_positive(
             f"agent.surrogates.{name}", threshold=threshold, width=width, speed_floor=speed_floor
         )
-        super().__init__(name, weight, [(vehicle, "gap"), (vehicle, "speed")])
+        super().__init__(name, weight, string=string)
         self.threshold, self.width, self.speed_floor = threshold, width, speed_floor
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
@@ -117,12 +120,18 @@ class Smoothness(RewardTerm):
     car are long and say little.
 
     Args:
-        name, weight: see :class:`lcc_rl.pieces.rewards.RewardTerm`; the price of 1 (m/s³)².
-        vehicle: namespace of the vehicle.
+        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`; the price of 1 (m/s³)².
     """
 
-    def __init__(self, name: str = "smoothness", weight: float = 1.0, vehicle: str = "cav") -> None:
-        super().__init__(name, weight, [(vehicle, "jerk")])
+    reads = ("self.jerk",)
+
+    def __init__(
+        self,
+        name: str = "smoothness",
+        weight: float = 1.0,
+        string: VehicleString | None = None,
+    ) -> None:
+        super().__init__(name, weight, string=string)
 
     def reward(self, jerk: Tensor) -> Tensor:
         """Return the unweighted term."""

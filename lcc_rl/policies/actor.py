@@ -8,11 +8,15 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import SEED, STEP
+
+OBSERVATION, ACTION = (AUTOMATED, "observation"), (AUTOMATED, "action")
 
 
 def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:
@@ -39,30 +43,54 @@ def make_actor(
     return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
 
+def shared_policy(policy: TensorDictModule) -> TensorDictModule:
+    """Return a policy that drives every automated vehicle of a string by the same network.
+
+    Reads ``("automated", "observation")`` ``[*batch, A, n]`` and writes ``("automated",
+    "action")`` ``[*batch, A, 1]``; the weights are those of the policy given.
+
+    Args:
+        policy: a network that reads ``"observation"`` and writes ``"action"``.
+    """
+    return TensorDictModule(policy.module, in_keys=[OBSERVATION], out_keys=[ACTION])
+
+
 class GaussianExploration(TensorDictModuleBase):
-    """Adds N(0, sigma²) to ``"action"`` and holds it within [−1, 1].
+    """Adds N(0, sigma²) to actions and holds them within [−1, 1].
 
     The noise is a function of the episode's seed and step, so exploration needs no random state.
 
     Args:
         sigma: standard deviation; change it with ``exploration.sigma.fill_(…)``.
+        key: the action, ``[*batch, …, n]``.
     """
 
     sigma: Tensor
 
-    def __init__(self, sigma: float) -> None:
-        self.in_keys = ["action", SEED, STEP]
-        self.out_keys = ["action"]
+    def __init__(self, sigma: float, key: NestedKey = ACTION) -> None:
+        self.in_keys = [key, SEED, STEP]
+        self.out_keys = [key]
         super().__init__()
-        self.stream = stream_id("exploration")
+        self.key, self.stream = key, stream_id("exploration")
         self.register_buffer("sigma", torch.tensor(float(sigma)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the noisy action."""
-        action, seed, step = (tensordict.get(key) for key in self.in_keys)
-        # One action per episode, [*batch, n], or one per follower of a platoon, [*batch, N, n].
-        event = action.shape[tensordict.ndim :]
-        seed, step = (x.view(*x.shape[:-1], *(1 for _ in event)) for x in (seed, step))
-        entries = torch.arange(math.prod(event), device=action.device).view(event)
-        noise = normal(seed, step, self.stream + entries)
-        return tensordict.set("action", (action + self.sigma * noise).clamp(-1.0, 1.0))
+        action = tensordict.get(self.key)
+        noise = action_noise(action, tensordict, self.stream)
+        return tensordict.set(self.key, (action + self.sigma * noise).clamp(-1.0, 1.0))
+
+
+def action_noise(like: Tensor, tensordict: TensorDictBase, stream: int) -> Tensor:
+    """Draw N(0, 1) for every entry of an action by the seed and the step of its episode.
+
+    Args:
+        like: the action, ``[*batch, …, n]``.
+        tensordict: holds seed and step, ``[*batch, 1]``.
+        stream: the stream of the first entry; the others take those that follow.
+    """
+    seed, step = (tensordict.get(key) for key in (SEED, STEP))
+    event = like.shape[seed.ndim - 1 :]
+    seed, step = (x.view(*x.shape[:-1], *(1 for _ in event)) for x in (seed, step))
+    entries = torch.arange(math.prod(event), device=like.device).view(event)
+    return normal(seed, step, stream + entries)

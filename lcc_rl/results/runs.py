@@ -17,6 +17,8 @@ from lcc_rl.io.files import atomic_path, read_parquet, read_torch, write_torch
 
 CONFIG = "config.yaml"
 PRETRAINED = "pretrained"
+# Variants that build on the policy of another one.
+BUILDS_ON = {"hcfs": "ddpg"}
 # The rooms whose classes a stored configuration may name.
 REGISTRY = tuple(
     f"lcc_rl.{room}"
@@ -116,7 +118,7 @@ def pretrained_path(variant: str) -> Path:
         ConfigError: if none does.
     """
     shipped = Path(str(files("lcc_rl.assets"))) / "pretrained"
-    path = shipped / f"{variant}.pt"
+    path = shipped / f"{BUILDS_ON.get(variant, variant)}.pt"
     if not path.is_file():
         names = sorted(file.stem for file in shipped.glob("*.pt"))
         raise ConfigError(

@@ -43,7 +43,7 @@ class ProgressReporter:
 
     On a terminal a live bar, except in a sweep, which shows one table of all its runs
     (:mod:`lcc_rl.runs.sweeps`); elsewhere a plain line at most every ``every`` seconds. The log
-    file gets the plain lines in both cases, and ``folder/progress.json`` always holds the latest state.
+    file gets the plain lines in both cases; ``folder/progress.json`` holds the latest state.
 
     Args:
         title: what is being done.

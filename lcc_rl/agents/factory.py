@@ -1,0 +1,96 @@
+"""From a configuration to an agent and the loop that trains it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModule
+
+from lcc_rl.agents.analytic import Analytic
+from lcc_rl.agents.gradient import GradientTrainer
+from lcc_rl.agents.loop import TrainingLoop
+from lcc_rl.agents.replay import Trainer
+from lcc_rl.config import TARGET, build
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import string_of
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces import Piece
+from lcc_rl.pieces.controllers import Population
+from lcc_rl.results.runs import identity
+
+
+class Agent(Protocol):
+    """What learns: a policy and all that a training of it needs.
+
+    ``policy`` reads ``"observation"`` and writes ``"action"``.
+    """
+
+    policy: TensorDictModule
+
+    def anneal(self, share: float) -> float:
+        """Set the learning rates after this share of the training; return the policy's."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+
+
+def learns(cfg: DictConfig) -> bool:
+    """Whether anything is learned: the configuration has an agent."""
+    return isinstance(cfg.agent, Mapping | DictConfig) and TARGET in cfg.agent
+
+
+def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Agent:
+    """Build the agent of a configuration.
+
+    Raises:
+        ConfigError: naming the option at fault; if there is none, or nobody for it to drive.
+    """
+    string = string_of(cfg)
+    if not learns(cfg):
+        raise ConfigError(f"variant {cfg.variant} learns nothing: it has no agent")
+    if not string.count(AUTOMATED):
+        raise ConfigError(
+            f"scenario.string={cfg.scenario.string}: nobody is automated, so nothing can be "
+            "learned; say agent=none to evaluate it"
+        )
+    observation: Piece = build(cfg.observation, "observation", string=string)
+    agent: Agent = build(
+        cfg.agent,
+        "agent",
+        population=population,
+        observation_size=observation.event_shape[-1],
+        action_size=1,
+        seed=cfg.seed,
+        time_step=cfg.scenario.time_step,
+        string=string,
+        device=device,
+    )
+    return agent
+
+
+def load_weights(agent: Agent, weights: Mapping[str, torch.Tensor]) -> None:
+    """Load a policy's weights into an agent.
+
+    Raises:
+        RuntimeError: if they do not fit its network.
+    """
+    agent.policy.load_state_dict(dict(weights))
+
+
+def make_trainer(
+    cfg: DictConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
+) -> TrainingLoop:
+    """Build the training loop of an agent with its environment."""
+    env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
+    loop: Any = GradientTrainer if isinstance(agent, Analytic) else Trainer
+    trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+    return trained

@@ -1,0 +1,117 @@
+"""The loop of the analytic agent: play a batch of episodes with its gradient, and learn from it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.agents.analytic import Analytic
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.pieces.base import next_key
+from lcc_rl.pieces.rewards import REWARD, RewardTerm
+from lcc_rl.schemas import TrainingConfig
+
+log = logging.getLogger("lcc_rl")
+
+# Iterations from which on compiling the simulator pays for itself.
+WORTH_COMPILING = 100
+
+
+class GradientTrainer(TrainingLoop):
+    """Trains by the simulator's gradient; arguments as of :class:`TrainingLoop`.
+
+    A segment of the settings is the stretch through which gradients flow; the whole episode where
+    it is as long as the horizon.
+    """
+
+    advice = "Lower agent.learning_rate, agent.value_lr or agent.clip_norm"
+    watched = "loss_actor"
+
+    def __init__(
+        self,
+        agent: Analytic,
+        env: TransformedEnv,
+        settings: TrainingConfig,
+        seed: int,
+        folder: Path,
+        identity: str,
+    ) -> None:
+        super().__init__(agent, env, settings, seed, folder, identity)
+        self.terms = [piece for piece in pieces_of(env) if isinstance(piece, RewardTerm)]
+        self.objective = agent.objective(self.terms)
+        if not agent.settings.bootstrap and settings.segment < self.horizon:
+            log.warning(
+                "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
+                "say training.segment=%d for the gradient of whole episodes",
+                settings.segment,
+                self.horizon,
+            )
+
+    def _source(self) -> DifferentiableRollout:
+        compiled = self.agent.settings.compiled
+        if compiled is None:
+            compiled = self.settings.compiled
+        if compiled is None:
+            compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
+        return DifferentiableRollout(
+            self.env,
+            wanted=[key for term, _ in self.objective for _, key in term.sources],
+            observed=[REWARD, *(term.targets[0] for term in self.terms)],
+            compiled=compiled,
+        )
+
+    def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
+        """Play one batch of episodes, with a gradient step after every segment of them."""
+        rate = self.agent.anneal(self.iteration / self.iterations)
+        self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
+        state = source.start()
+        running = torch.ones(self.env.batch_size[0], 1, 1, device=self.env.device)
+        played, losses, spent = [], [], [0.0, 0.0]
+        for _ in range(self.horizon // self.settings.segment):
+            begun = time.perf_counter()
+            state, record = source.play(state, self.agent.policy.module, self.settings.segment)
+            data = source.assemble(record)
+            collected = time.perf_counter()
+            running, result = self._learn(data, running[:, -1:])
+            losses.append(result)
+            played.append(data.detach().select(*REPORTED))
+            state = {key: value.detach() for key, value in state.items()}
+            spent[0] += collected - begun
+            spent[1] += time.perf_counter() - collected
+        self.iteration += 1
+        self.updates += len(losses)
+        episodes = torch.cat(played, dim=1)
+        row = {
+            "iteration": float(self.iteration),
+            "episodes": float(self.iteration * self.env.batch_size[0]),
+            "transitions": float(self.iteration * episodes.numel()),
+            "updates": float(self.updates),
+            "learning_rate": rate,
+            **episode_statistics(episodes),
+            **{name: sum(float(x[name]) for x in losses) / len(losses) for name in losses[0]},
+        }
+        self._record(row, *spent)
+        return row
+
+    def _learn(self, data: TensorDictBase, running: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Take a gradient step on a segment; return which episodes go on after each step."""
+        crashed = data["next", "terminated"].cumsum(1) > 0
+        after = running * ~crashed
+        before = torch.cat([running, after[:, :-1]], 1)
+        total = torch.stack([factor * self._score(term, data) for term, factor in self.objective])
+        ahead = data.get(next_key(OBSERVATION))
+        moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
+        return after, self.agent.update(total.sum(0) * before, after, moments)
+
+    def _score(self, term: RewardTerm, data: TensorDictBase) -> Tensor:
+        """Return a term of the objective at every step of a segment, ``[batch, steps, A]``."""
+        entries = [data.get(next_key(key)) for _, key in term.sources]
+        return term.compute(*entries).squeeze(-1)

@@ -1,0 +1,158 @@
+"""The loop of off-policy agents: play a batch of episodes, learning from a replay buffer."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.off_policy import OffPolicy
+from lcc_rl.config import require
+from lcc_rl.envs import StringCollector
+from lcc_rl.pieces.rewards import REWARD
+from lcc_rl.policies import shared_policy
+from lcc_rl.policies.actor import ACTION, OBSERVATION
+from lcc_rl.schemas import TrainingConfig
+
+# What is learned from, as the environment names it and as the losses do.
+LEARNED_FROM = {
+    OBSERVATION: ("observation",),
+    ACTION: ("action",),
+    ("next", *OBSERVATION): ("next", "observation"),
+    ("next", *REWARD): ("next", "reward"),
+    ("next", "done"): ("next", "done"),
+    ("next", "terminated"): ("next", "terminated"),
+}
+
+# Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
+WORTH_COMPILING = 40_000
+COLLECTORS = ("string", "torchrl")
+
+
+class Trainer(TrainingLoop):
+    """Trains an off-policy agent and keeps its record; arguments as of :class:`TrainingLoop`."""
+
+    advice = "Lower agent.critic_lr or agent.actor_lr"
+
+    def __init__(
+        self,
+        agent: OffPolicy,
+        env: TransformedEnv,
+        settings: TrainingConfig,
+        seed: int,
+        folder: Path,
+        identity: str,
+    ) -> None:
+        super().__init__(agent, env, settings, seed, folder, identity)
+        require(
+            settings.collector in COLLECTORS,
+            f"training.collector must be one of {', '.join(COLLECTORS)}, got "
+            f"{settings.collector!r}",
+        )
+        self.exploration = agent.noise.to(env.device or "cpu")
+        self.sampler = torch.Generator()
+        self.buffer = ReplayBuffer(
+            storage=LazyTensorStorage(agent.settings.buffer_size, device=env.device or "cpu"),
+            batch_size=agent.settings.batch_size,
+            generator=self.sampler,
+        )
+
+    def _source(self) -> BaseCollector:
+        policy = TensorDictSequential(shared_policy(self.agent.policy), self.exploration)
+        frames = self.settings.segment * self.env.batch_size.numel()
+        if self.settings.collector == "torchrl":
+            return Collector(self.env, policy, frames_per_batch=frames, total_frames=-1)
+        keys = (*LEARNED_FROM, *REPORTED)
+        return StringCollector(
+            self.env, policy, frames_per_batch=frames, keys=keys, compiled=self._compiled()
+        )
+
+    def _compiled(self) -> bool:
+        """Whether to compile the environment: if left open, where the whole training pays for it.
+
+        The whole, not what remains, so that a resumed training computes what it would have.
+        """
+        if self.settings.compiled is not None:
+            return self.settings.compiled
+        return self.iterations * self.horizon >= WORTH_COMPILING
+
+    def _iterate(self, collector: BaseCollector) -> dict[str, float]:
+        """Play one batch of episodes, learning after every segment of them."""
+        sigma = self.agent.exploration.sigma(self.iteration / self.iterations)
+        self.exploration.sigma.fill_(sigma)
+        rate = self.agent.anneal(self.iteration / self.iterations)
+        self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
+        self.sampler.manual_seed(derived_seed(self.seed, self.iteration, "replay"))
+        collector.reset()
+        segments = iter(collector)
+        played, losses, spent = [], [], [0.0, 0.0]
+        for part in range(self.horizon // self.settings.segment):
+            begun = time.perf_counter()
+            batch = next(segments)
+            new = transitions(batch)
+            self.buffer.extend(new)
+            played.append(batch.select(*REPORTED))
+            collected = time.perf_counter()
+            before = self.iteration * (self.horizon // self.settings.segment) + part
+            losses.append(self._learn(before * len(new), len(new)))
+            spent[0] += collected - begun
+            spent[1] += time.perf_counter() - collected
+        episodes = torch.cat(played, dim=1)
+        learned = len(new) * len(played)
+        self.iteration += 1
+        row = {
+            "iteration": float(self.iteration),
+            "episodes": float(self.iteration * self.env.batch_size[0]),
+            "transitions": float(self.iteration * learned),
+            "updates": float(self.updates),
+            "exploration_sigma": sigma,
+            "learning_rate": rate,
+            **episode_statistics(episodes),
+            **{name: sum(loss[name] for loss in losses) / len(losses) for name in losses[0]},
+        }
+        self._record(row, *spent)
+        return row
+
+    def _learn(self, before: int, new: int) -> dict[str, float]:
+        """Take the updates that are due after ``new`` transitions on top of those ``before``."""
+        settings = self.agent.settings
+        ratio = settings.updates_per_transition
+        ready = len(self.buffer) >= settings.batch_size
+        count = int((before + new) * ratio) - int(before * ratio) if ready else 0
+        sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
+        for _ in range(count):
+            losses = self.agent.update(self.buffer.sample())
+            sums = {name: total + losses[name] for name, total in sums.items()}
+        self.updates += count
+        return {name: float(total) / max(count, 1) for name, total in sums.items()}
+
+    def _memory(self) -> dict[str, Any]:
+        return {"buffer": self.buffer.state_dict()}
+
+    def _remember(self, memory: dict[str, Any]) -> None:
+        self.buffer.load_state_dict(memory["buffer"])
+        self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
+
+
+def transitions(batch: TensorDictBase) -> TensorDictBase:
+    """Return what is learned from a batch ``[environments, steps]``, one transition a row.
+
+    Every automated vehicle's is a transition of its own, ``[environments × steps × A]``; all of
+    them end when the episode does.
+    """
+    shape = batch.get(("next", *REWARD)).shape[:-1]
+    rows = TensorDict(batch_size=[shape.numel()], device=batch.device)
+    for source, target in LEARNED_FROM.items():
+        entry = batch.get(source)
+        if entry.ndim == len(shape):
+            entry = entry.unsqueeze(-2).expand(*shape, 1)
+        rows.set(target, entry.reshape(-1, entry.shape[-1]))
+    return rows

@@ -1,0 +1,132 @@
+"""Checks of settings before anything expensive starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from lcc_rl.agents.factory import build_agent, learns, make_trainer
+from lcc_rl.config import build, load, require
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import constant_profile
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.evaluation.episodes import any_leader
+from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.schemas import TrainConfig
+
+# What a sweeper may optimise: columns of the summary that need no other strategy beside them.
+OBJECTIVES = {
+    "episodes": (
+        "kj_per_km",
+        "total_energy_kj",
+        "total_net_energy_kj",
+        "cav_energy_kj",
+        "hdv_energy_kj",
+        "collisions",
+        "min_ttc_s",
+        "share_ttc_unsafe",
+        "share_time_gap_long",
+        "rms_jerk_mps3",
+    ),
+    # Of the table of windows; it has no energies, the default is read as the first.
+    "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
+}
+MEASURED = ("ttc", "time_gap", "power")
+
+
+def check_settings(cfg: DictConfig, folder: Path) -> None:
+    """Check every setting of a training before the data are read, which may take long.
+
+    Everything is built once, around a leader at constant speed.
+
+    Raises:
+        ConfigError: naming the option.
+    """
+    check_sizes(cfg)
+    check_objective(cfg)
+    build_logger(cfg)
+    for key in ("data", "split"):
+        build(cfg[key], key)
+    population = build(cfg.drivers, "drivers")
+    check_variant(cfg)
+    trial = any_leader(cfg)
+    horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
+    profiles = constant_profile(10.0, horizon, time_step, "trial")
+    if learns(cfg):
+        agent = build_agent(cfg, population, cfg.device)
+        make_trainer(trial, agent, profiles, population, folder)
+    build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
+
+
+def build_logger(cfg: DictConfig):  # type: ignore[no-untyped-def]
+    """Build what is told every training row; nothing is where the run names none."""
+    from lcc_rl.runs.loggers import Silent
+
+    node = cfg.get("logger")
+    return Silent() if node is None else build(node, "logger")
+
+
+def check_variant(cfg: DictConfig) -> None:
+    """Refuse a learner under the name of a variant that learns nothing, and the reverse.
+
+    Raises:
+        ConfigError: naming both.
+    """
+    try:
+        own = load("train", [f"variant={cfg.variant}"])
+    except ConfigError:  # a variant of the user's own, known to this command line only
+        return
+    if learns(own) and not learns(cfg) and cfg.scenario.string == own.scenario.string:
+        raise ConfigError(
+            f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
+            "driver say variant=idm"
+        )
+    if learns(cfg) and not learns(own):
+        raise ConfigError(
+            f"variant={cfg.variant} learns nothing: remove agent=…, or choose a learned variant"
+        )
+
+
+def objectives(cfg: DictConfig) -> list[str]:
+    """Return the columns that ``objective`` names; a run made before there was any has none."""
+    wanted = cfg.get("objective", TrainConfig.objective)
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    vehicles = cfg.evaluation.rows == "vehicles"
+    return [OBJECTIVES["vehicles"][0]] if vehicles and names == [TrainConfig.objective] else names
+
+
+def check_objective(cfg: DictConfig) -> None:
+    """Check that ``objective`` names columns of the summary.
+
+    Raises:
+        ConfigError: naming the unknown one.
+    """
+    names = objectives(cfg)
+    require(bool(names), "objective is empty: name at least one column of the summary")
+    for name in names:
+        known = OBJECTIVES.get(cfg.evaluation.rows, ())
+        if name not in known:
+            raise unknown_name("objective", str(name), known)
+
+
+def check_sizes(cfg: DictConfig) -> None:
+    """Check, before anything runs, what would fail only at its end.
+
+    Raises:
+        ConfigError: naming the option.
+    """
+    sizes = {f"evaluation.{key}": cfg.evaluation[key] for key in ("profiles", "drivers")}
+    sizes["evaluation.batch_size"] = cfg.evaluation.batch_size
+    if not OmegaConf.is_missing(cfg.training, "environments"):
+        sizes["training.environments"] = cfg.training.environments
+    for name, value in sizes.items():
+        require(value is None or value >= 1, f"{name} must be at least 1, got {value}")
+    pieces = cfg.scenario.pieces
+    measured = [name for name in MEASURED if pieces.get(name) is None]
+    require(
+        not measured or cfg.evaluation.rows != "episodes",
+        f"scenario.pieces lacks {measured}, which the evaluation measures",
+    )
+    step = cfg.scenario.time_step
+    require(step > 0, f"scenario.time_step must be positive, got {step}")

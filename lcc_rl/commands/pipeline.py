@@ -1,0 +1,161 @@
+"""The main job: from trajectories over calibration and training to an evaluation with figures."""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from omegaconf import DictConfig, OmegaConf
+
+from lcc_rl import results
+from lcc_rl.commands import calibration, evaluation, training
+from lcc_rl.config import build, load, plain, require
+from lcc_rl.data.episodes import write_episodes
+from lcc_rl.errors import Interrupted
+from lcc_rl.io.files import atomic_path
+from lcc_rl.results.drawing import save
+from lcc_rl.results.figures import learning_curve
+from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.progress import watch
+
+log = logging.getLogger("lcc_rl")
+
+# Settings that only the pipeline has; all others are passed on to calibration and trainings.
+OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra")
+PATIENCE = 20.0  # a training ends after the iteration at hand [s]
+OVERRIDES, TRAJECTORIES = "overrides.json", "trajectories.parquet"
+
+
+def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFrame:
+    """Read trajectories, calibrate drivers, train the variants, evaluate and draw.
+
+    A folder that already holds parts of the same job is completed.
+
+    Args:
+        cfg: configuration of the entry point ``pipeline``.
+        folder: where everything goes: ``calibration``, a folder per variant, ``evaluation``.
+        overrides: what was typed on the command line; passed on to the parts.
+
+    Returns:
+        The rows of evaluation/episodes.parquet.
+
+    Raises:
+        LccError: one clear error for whatever is wrong with settings, data or files.
+    """
+    folder = Path(folder)
+    prepare_torch(cfg)
+    require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
+    require(cfg.jobs >= 1, f"jobs must be at least 1, got {cfg.jobs}")
+    shared = [item for item in overrides if root_key(item) not in OWN]
+    # Every part is composed before the first one runs: a typo must not cost an hour.
+    parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
+    final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
+    with atomic_path(folder / OVERRIDES) as temporary:
+        temporary.write_text(json.dumps(overrides))
+    drivers = calibrate_once(cfg, folder)
+    inputs = {
+        "data": {
+            "_target_": "lcc_rl.data.sources.EpisodesSource",
+            "path": str(folder / TRAJECTORIES),
+        },
+        "drivers": {
+            "_target_": "lcc_rl.drivers.population.bootstrap",
+            "path": str(drivers),
+        },
+    }
+    for part in (*parts.values(), final):
+        OmegaConf.set_struct(part, False)
+        part.update(inputs)
+    _train_all(parts, folder, cfg.jobs)
+    final.compare = [
+        str(folder / name) for name in cfg.variants if (folder / name / "policy.pt").exists()
+    ]
+    episodes = evaluation.run(final, folder / "evaluation", own=False)
+    if final.compare:
+        curve = learning_curve(results.load(folder, "training"))
+        save(curve, folder / "evaluation" / "figures" / "learning_curve.png")
+    return episodes
+
+
+def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
+    """Read the trajectories once, keep them, and calibrate; skip what is already there."""
+    table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
+    if not table.exists():
+        loaded = build(cfg.data, "data").load()
+        for line in loaded.report:
+            log.info(line)
+        write_episodes(loaded.episodes, table)
+    if not drivers.exists():
+        own = OmegaConf.create(plain(cfg))
+        assert isinstance(own, DictConfig)
+        own.data = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": str(table)}
+        calibration.run(own, drivers.parent)
+    return drivers
+
+
+def _train_all(parts: dict[str, DictConfig], folder: Path, jobs: int) -> None:
+    """Train the variants side by side, each in a process and a folder of its own."""
+    todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name)}
+    # A fresh interpreter per training: forking a process that has used torch's threads can hang.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max_workers=jobs, mp_context=context) as pool:
+        futures: dict[str, Future[None]] = {
+            name: pool.submit(_train_one, plain(cfg), str(folder / name))
+            for name, cfg in todo.items()
+        }
+        try:
+            watch({name: (folder / name, future) for name, future in futures.items()})
+            for future in futures.values():
+                future.result()
+        except (KeyboardInterrupt, Interrupted):
+            _stop_children(list(futures.values()))
+            raise Interrupted(
+                f"stopped; complete it with: python -m lcc_rl.pipeline resume={folder}"
+            ) from None
+
+
+def _stop_children(futures: list[Future[None]]) -> None:
+    """Let trainings that heard the interrupt save and end; then tell those that did not."""
+    _, running = wait(futures, PATIENCE)
+    for process in multiprocessing.active_children() if running else ():
+        process.terminate()
+
+
+def _train_one(settings: dict[str, Any], folder: str) -> None:
+    """Train one variant; runs in a process of its own, with a log file of its own."""
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    logging.basicConfig(
+        filename=target / "train.log",
+        level=logging.INFO,
+        format="[%(asctime)s][%(levelname)s] %(message)s",
+    )
+    cfg = OmegaConf.create(settings)
+    if (target / "checkpoint.pt").exists():
+        cfg.resume = folder
+    training.run(cfg, target, quiet=True)
+
+
+def _finished(folder: Path) -> bool:
+    return (folder / "episodes.parquet").exists()
+
+
+def root_key(override: str) -> str:
+    """Return the top-level key that an override changes."""
+    return override.lstrip("+~").split("=")[0].split(".")[0].split("@")[0]
+
+
+def known_settings(overrides: list[str], entry: str) -> list[str]:
+    """Keep the overrides that an entry point has settings for."""
+    return [item for item in overrides if root_key(item) in _settings_of(entry)]
+
+
+@cache
+def _settings_of(entry: str) -> frozenset[str]:
+    return frozenset(map(str, load(entry))) | {"experiment"}

@@ -1,0 +1,136 @@
+"""Trains the variant of a configuration, then evaluates it."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+from omegaconf import DictConfig
+
+from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
+from lcc_rl.commands.checks import build_logger, check_settings, objectives
+from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write
+from lcc_rl.config import require
+from lcc_rl.envs import Inputs, load_inputs
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.evaluation.strategies import Strategy, check_policy, deployed, with_weights
+from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
+from lcc_rl.policies import shared_policy
+from lcc_rl.results.runs import identity, load_config, load_policy, save_config, save_policy
+from lcc_rl.results.string_tables import case_table
+from lcc_rl.results.tables import summary
+from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.states import working
+
+log = logging.getLogger("lcc_rl")
+
+POLICIES, POLICY, CHECKPOINT = "policies", "policy.pt", "checkpoint.pt"
+
+
+def run(
+    cfg: DictConfig, folder: str | Path, quiet: bool = False, resume: bool = False
+) -> pd.DataFrame:
+    """Train the variant of a configuration, then evaluate it.
+
+    Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
+    and, last, episodes.parquet; the first four after config.yaml only where something is learned,
+    and policies/<iteration>.pt where training.keep_every says so.
+
+    Args:
+        cfg: configuration of the entry point ``train``; with ``resume`` in it the run in that
+            folder is resumed with its own settings instead.
+        folder: where the files go.
+        quiet: do not print the table.
+        resume: resume from a checkpoint of the same configuration where the folder has one.
+
+    Returns:
+        The rows of episodes.parquet.
+
+    Raises:
+        LccError: one clear error for whatever is wrong with settings, data or files; it is also
+            left in the folder as error.txt.
+    """
+    folder, named = Path(folder), cfg.resume is not None
+    if named:
+        folder = Path(cfg.resume)
+        cfg = load_config(folder, tuple(cfg.trust))
+    elif (folder / CHECKPOINT).exists() and not resume:
+        raise ConfigError(
+            f"{folder} already holds a training; go on with resume={folder} or choose another "
+            "hydra.run.dir"
+        )
+    with working(folder):
+        return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
+
+
+def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFrame:
+    prepare_torch(cfg)
+    check_settings(cfg, folder)
+    inputs = load_inputs(cfg)
+    for line in inputs.report:
+        log.info(line)
+    save_config(cfg, folder)
+    if not learns(cfg):
+        log.info("variant %s learns nothing: evaluating it", cfg.variant)
+        strategy = Strategy(cfg.variant, deployed(cfg))
+    elif cfg.get("policy") is not None:
+        strategy = _given(cfg, inputs, folder)
+    else:
+        agent = build_agent(cfg, inputs.population, cfg.device)
+        _train(cfg, agent, inputs, folder, resume)
+        strategy = Strategy(cfg.variant, deployed(cfg), shared_policy(agent.policy), cfg.seed)
+    return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+
+
+def _given(cfg: DictConfig, inputs: Inputs, folder: Path) -> Strategy:
+    """Build the strategy of a variant that builds on a trained policy."""
+    require(
+        cfg.deployed is not None,
+        f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
+        "or say python -m lcc_rl.evaluate to evaluate one",
+    )
+    weights, own = load_policy(cfg.policy, cfg.variant, tuple(cfg.get("trust") or ()))
+    check_policy(cfg, own)
+    cfg.agent = own.agent
+    save_config(cfg, folder)
+    save_policy(weights, cfg, folder / POLICY)
+    strategy = with_weights(cfg, weights, own.seed, str(cfg.policy), inputs.population)
+    return Strategy(cfg.variant, deployed(cfg), strategy.policy, own.seed)
+
+
+def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
+    """Train an agent to the end and write its policy."""
+    trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
+    if resume:
+        trainer.load()
+    remove_leftovers(folder / POLICIES)
+    trainer.on_keep = partial(keep_policy, agent, cfg, folder)
+    with build_logger(cfg).opened(folder) as trainer.on_row:
+        trainer.run()
+    save_policy(agent.policy.state_dict(), cfg, folder / POLICY)
+
+
+def keep_policy(agent: Agent, cfg: DictConfig, folder: Path, iteration: int) -> None:
+    """Write the policy as it is after an iteration to ``policies/<iteration>.pt``."""
+    path = folder / POLICIES / f"{iteration:06d}.pt"
+    save_policy(agent.policy.state_dict(), cfg, path)
+
+
+def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
+    """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
+    table = folder / EPISODES
+    if table.exists() and parquet_metadata(table).get("lcc_rl.config") == identity(cfg):
+        log.info("%s: finished before", folder.name)
+        return read_parquet(table)
+    return run(cfg, folder, quiet=True, resume=True)
+
+
+def objective(cfg: DictConfig, rows: pd.DataFrame) -> float | list[float]:
+    """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
+    # By its rows: a resumed run is not of the variant that the command line composed.
+    table = case_table(rows, WINDOWS) if "follower" in rows else summary(rows)
+    values = [float(table.iloc[-1][name]) for name in objectives(cfg)]
+    return values[0] if isinstance(cfg.objective, str) else values

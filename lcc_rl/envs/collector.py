@@ -1,0 +1,195 @@
+"""A TorchRL collector that plays an environment with as little bookkeeping as possible."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.collectors import BaseCollector
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.envs.single import SingleAgent, group_key
+from lcc_rl.envs.step import DONE, Compiled, Step, closure, entries, leaves, pieces_of
+from lcc_rl.errors import ConfigError
+from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
+
+
+class StringCollector(BaseCollector):
+    """Plays an environment without end and yields batches of so many frames.
+
+    The transitions are those of TorchRL's ``Collector``, an episode that is over being followed
+    by a new one. But TensorDicts are made once per batch, not several per step, and hold only
+    what is asked for, so that the policy and the physics are what takes the time.
+
+    Args:
+        create_env_fn: the environment, ``[batch]`` episodes side by side, or a function that
+            makes it.
+        policy: writes the action into a TensorDict with its ``in_keys``.
+        frames_per_batch: frames of one batch: steps times episodes side by side.
+        total_frames: frames after which iteration ends; −1: never.
+        keys: the entries of a batch, those of the moment reached under ``"next"``; a key of
+            several entries stands for all of them. None: all entries.
+        compiled: compile the step, policy included; where there is no compiler, one line of the
+            log says so and the plain step is used.
+
+    Raises:
+        ConfigError: if the frames are no multiple of the episodes side by side, or the
+            environment has transforms other than pieces and the single-agent view.
+    """
+
+    def __init__(
+        self,
+        create_env_fn: Any,
+        policy: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        total_frames: int = -1,
+        keys: Sequence[NestedKey] | None = None,
+        compiled: bool = False,
+    ) -> None:
+        super().__init__()
+        env = create_env_fn if isinstance(create_env_fn, TransformedEnv) else create_env_fn()
+        self.env, self.policy = env, policy
+        self.requested_frames_per_batch, self.total_frames = frames_per_batch, total_frames
+        self._frames, self._iter, self._iterator = 0, -1, None
+        self.trajs_per_batch = None
+        episodes = env.batch_size.numel()
+        if frames_per_batch < 1 or frames_per_batch % episodes:
+            raise ConfigError(
+                f"frames_per_batch ({frames_per_batch}) must be a multiple of the {episodes} "
+                "episodes side by side"
+            )
+        self.steps = frames_per_batch // episodes
+        self.single = _is_single(env)
+        self.action: Key = as_key(next(iter(env.full_action_spec.keys(True, True))))
+        self.reads = [as_key(key) for key in policy.in_keys if as_key(key) != self.action]
+        self.reset()
+        rewards = env.full_reward_spec.keys(True, True)
+        moment = [*self.state, *(as_key(key) for key in rewards)]
+        known = [self._shown(key) for key in [*self.state, self._inner(self.action)]]
+        asked = keys if keys is not None else [*known, *((NEXT, *self._shown(k)) for k in moment)]
+        every = [*known, *map(as_key, rewards)]
+        self.keys = list(dict.fromkeys(leaf for key in asked for leaf in leaves(key, every)))
+        wanted = {*(self._inner(root_key(key)) for key in self.keys), DONE}
+        wanted |= {self._inner(key) for key in self.reads}
+        # Pieces that none of this depends on, which only an evaluation measures, are left out.
+        self.step = Step(closure(pieces_of(env), wanted), env.base_env.horizon)
+        self.advance = Compiled(self._advance, "the environment", compiled)
+
+    def _inner(self, key: Key) -> Key:
+        """Return the key under which the pieces know an entry."""
+        return group_key(key) if self.single else key
+
+    def _shown(self, key: Key) -> Key:
+        """Return the key under which the environment shows an entry of the pieces."""
+        inner = self.single and key[:1] == ("automated",) and group_key(key[1:]) == key
+        return key[1:] if inner else key
+
+    def reset(self) -> None:
+        """Begin new episodes everywhere."""
+        self.state = self._entries(self.env.reset())
+
+    def _entries(self, td: TensorDictBase) -> State:
+        shown = entries(td)
+        return {
+            self._inner(key): value.unsqueeze(-2) if self._inner(key) != key else value
+            for key, value in shown.items()
+        }
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Yield batches ``[*batch, steps]`` until ``total_frames``."""
+        while self.total_frames < 0 or self._frames < self.total_frames:
+            yield self.collect()
+
+    @torch.no_grad()
+    def collect(self) -> TensorDictBase:
+        """Return the next batch, ``[*batch, steps]``."""
+        record = []
+        for _ in range(self.steps):
+            self.state, kept, over = self.advance(self.state)
+            record.append(kept)
+            if over:
+                self.state = self._renew(self.state)
+        self._frames += self.requested_frames_per_batch
+        self._iter += 1
+        batch = self.env.batch_size
+        segment = TensorDict(batch_size=[*batch, self.steps], device=self.env.device)
+        for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
+            segment.set(key, torch.stack(values, len(batch)))
+        return segment
+
+    def _advance(self, state: State) -> tuple[State, list[Tensor], Tensor]:
+        """Return the moment reached, the entries to keep and whether any episode is over."""
+        seen = TensorDict(batch_size=self.env.batch_size)
+        for key in self.reads:
+            seen.set(key, self._look(state, key))
+        action = self.policy(seen).get(self.action)
+        inner = self._inner(self.action)
+        before = {**state, inner: action if inner == self.action else action.unsqueeze(-2)}
+        reached = self.step(before)
+        kept = [
+            self._look(reached, key[1:]) if key[0] == NEXT else self._look(before, key)
+            for key in self.keys
+        ]
+        after = {key: reached.get(key, value) for key, value in state.items()}
+        return after, kept, reached[DONE].any()
+
+    def _look(self, state: State, key: Key) -> Tensor:
+        """Return an entry as the environment shows it."""
+        inner = self._inner(key)
+        return state[key] if inner == key else state[inner].squeeze(-2)
+
+    def _renew(self, state: State) -> State:
+        """Begin a new episode where one is over."""
+        moment = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
+        for key in state:
+            moment.set(self._shown(key), self._look(state, self._shown(key)))
+        return self._entries(self.env.maybe_reset(moment))
+
+    def update_policy_weights_(self, *_: Any, **__: Any) -> None:
+        """Do nothing: the policy is the caller's own object, in this process."""
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seed the environment and begin new episodes; return the next seed."""
+        following = self.env.set_seed(seed, static_seed)
+        self.reset()
+        return int(following)
+
+    def state_dict(self) -> OrderedDict[str, Any]:
+        """Return the moment at which the episodes are and the frames played."""
+        state = {".".join(key): value for key, value in self.state.items()}
+        return OrderedDict(frames=self._frames, iter=self._iter, state=state)
+
+    def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self._frames, self._iter = state_dict["frames"], state_dict["iter"]
+        self.state = {tuple(key.split(".")): value for key, value in state_dict["state"].items()}
+
+    def shutdown(
+        self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
+    ) -> None:
+        """Close the environment."""
+        if close_env and not self.env.is_closed:
+            self.env.close(raise_if_closed=False)
+
+
+def _is_single(env: TransformedEnv) -> bool:
+    """Whether an environment shows the single-agent view.
+
+    Raises:
+        ConfigError: if it has other transforms, whose effect a collector of pieces would lose.
+    """
+    others = [t for t in env.transform if t not in pieces_of(env)]
+    strange = [type(t).__name__ for t in others if not isinstance(t, SingleAgent)]
+    if strange:
+        raise ConfigError(
+            f"the environment has the transforms {', '.join(strange)}, which StringCollector does "
+            "not apply; use torchrl.collectors.Collector (training.collector=torchrl)"
+        )
+    return bool(others)

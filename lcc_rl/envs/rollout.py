@@ -1,0 +1,122 @@
+"""Rollouts that keep the graph of gradients, for learning by back-propagation through time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.envs.step import DONE, TERMINATED, Compiled, Step, closure, pieces_of, written
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.base import NEXT, SEED, STEP, Piece, State, StepTransform, as_key
+
+Network = Callable[[Tensor], Tensor]
+OBSERVATION, ACTION = (AUTOMATED, "observation"), (AUTOMATED, "action")
+
+
+class DifferentiableRollout:
+    """Plays an environment step by step without its bookkeeping, keeping the graph of gradients.
+
+    The pieces divide in two. Those that the motion itself depends on (everything that reaches the
+    policy's observation, or its own past) act in every step; all others, such as time gaps,
+    powers and reward terms, are applied once to the whole record, which by the pieces' contract
+    gives the same. Pieces that nothing depends on are left out. The entries equal those of
+    ``env.rollout``.
+
+    Args:
+        env: the environment, without the single-agent view.
+        wanted: entries of the moment reached that the record must hold, with their gradient.
+        observed: further entries that the record must hold; what only they need gets none.
+        compiled: compile the step, for a batch size once; where there is no compiler, one line
+            of the log says so and the plain step is used.
+    """
+
+    def __init__(
+        self,
+        env: TransformedEnv,
+        wanted: Iterable[NestedKey],
+        observed: Iterable[NestedKey] = (),
+        compiled: bool = False,
+    ) -> None:
+        self.env, self.horizon = env, env.base_env.horizon
+        pieces = pieces_of(env)
+        graded = {as_key(key) for key in wanted} | {OBSERVATION}
+        every = graded | {as_key(key) for key in observed} | {TERMINATED}
+        needed, self.graded = closure(pieces, every), closure(pieces, graded)
+        recurrent = [piece for piece in needed if _is_recurrent(piece)]
+        inside = closure(needed, {OBSERVATION}, recurrent)
+        self.after = [piece for piece in needed if piece not in inside]
+        self.step = Step(inside, self.horizon, self.graded)
+        self.carried = {SEED, STEP, *written(inside)}
+        entries = {key for piece in needed for _, key in piece.sources} | every
+        self.recorded = sorted(entries & {*self.carried, ACTION})
+        self.advance = Compiled(self._advance, "the simulator", compiled)
+
+    def start(self, given: TensorDictBase | None = None) -> State:
+        """Reset the environment, to given choices or drawn ones; return the first moment."""
+        td = self.env.reset(given)
+        return {key: td.get(key) for key in sorted(self.carried)}
+
+    def _advance(
+        self, network: Network, state: State, shift: Tensor | None = None
+    ) -> tuple[State, Tensor]:
+        """Return the moment reached and the action taken."""
+        action = network(state[OBSERVATION])
+        if shift is not None:
+            action = (action + shift).clamp(-1.0, 1.0)
+        reached = self.step({**state, ACTION: action})
+        return {key: reached[key] for key in state}, action
+
+    def play(
+        self, state: State, network: Network, steps: int, shifts: Tensor | None = None
+    ) -> tuple[State, list[list[Tensor]]]:
+        """Let a policy drive for some steps.
+
+        Args:
+            state: the moment to begin at.
+            network: from observation ``[batch, A, observations]`` to action in [−1, 1].
+            steps: how many.
+            shifts: added to the actions, which stay in [−1, 1], ``[steps, batch, A, 1]``.
+
+        Returns:
+            The last moment, and for each moment (``steps`` + 1) the :attr:`recorded` entries,
+            those of the last one with action zero.
+        """
+        record = []
+        for step in range(steps):
+            shift = None if shifts is None else shifts[step]
+            reached, action = self.advance(network, state, shift)
+            record.append(self._entries(state, action))
+            state = reached
+        record.append(self._entries(state, torch.zeros_like(action)))
+        return state, record
+
+    def assemble(self, record: Sequence[Sequence[Tensor]]) -> TensorDictBase:
+        """Make the record of a play a rollout ``[batch, steps]`` and apply the remaining pieces."""
+        columns = [torch.stack(values, 1) for values in zip(*record, strict=True)]
+        batch = columns[0][:, :-1].shape[:2]
+        data = TensorDict(batch_size=batch)
+        for key, column in zip(self.recorded, columns, strict=True):
+            data.set(key, column[:, :-1])
+            data.set((NEXT, *key), column[:, 1:])
+        step = data.get((NEXT, *STEP))
+        data.set((NEXT, *DONE), step >= self.horizon)
+        data.set((NEXT, *TERMINATED), torch.zeros_like(step, dtype=torch.bool))
+        for piece in self.after:
+            with torch.set_grad_enabled(torch.is_grad_enabled() and piece in self.graded):
+                piece(data if isinstance(piece, StepTransform) else data.get(NEXT))
+        return data
+
+    def _entries(self, state: State, action: Tensor) -> list[Tensor]:
+        return [action if key == ACTION else state[key] for key in self.recorded]
+
+
+def _is_recurrent(piece: Piece) -> bool:
+    """Whether a piece reads what it wrote one moment before."""
+    if not isinstance(piece, StepTransform):
+        return False
+    return bool({key for late, key in piece.sources if not late} & written([piece]))

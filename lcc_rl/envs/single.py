@@ -1,0 +1,84 @@
+"""The single-agent view of a string with one automated vehicle, as stock TorchRL scripts expect."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from torchrl.data import Composite
+from torchrl.envs.transforms import Transform
+
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.base import Key
+
+# Entries of the group that the view shows at the root, without the dimension of one.
+SHOWN = ("observation", "reward", "reward_terms")
+
+
+class SingleAgent(Transform):
+    """Presents the one automated vehicle's entries at the root, without the dimension of one.
+
+    ``("automated", "observation")``, ``[*batch, 1, n]``, becomes ``"observation"``, ``[*batch,
+    n]``; likewise ``"action"``, ``"reward"`` and ``("reward_terms", name)``. The last transform
+    of an environment.
+    """
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        group = next_tensordict.get(AUTOMATED, None)
+        if group is None:
+            return next_tensordict
+        group = group.copy()
+        for name in SHOWN:
+            entry = group.pop(name, None)
+            if entry is not None:
+                next_tensordict.set(name, _without(entry))
+        return next_tensordict.set(AUTOMATED, group)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action", None)
+        if action is not None:
+            tensordict.set((AUTOMATED, "action"), action.unsqueeze(-2))
+        return tensordict
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        return self._shown(input_spec.clone(), "full_action_spec", ("action",))
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        output_spec = self._shown(output_spec.clone(), "full_observation_spec", ("observation",))
+        return self._shown(output_spec, "full_reward_spec", ("reward", "reward_terms"))
+
+    def _shown(self, specs: Composite, part: str, names: tuple[str, ...]) -> Composite:
+        spec = specs[part]
+        group = spec[AUTOMATED]
+        for name in names:
+            if name in group.keys():  # noqa: SIM118  a spec is no dict
+                spec[name] = (
+                    group[name].squeeze(-2) if name != "reward_terms" else _flat(group[name])
+                )
+                del group[name]
+        if not len(list(group.keys())):
+            del spec[AUTOMATED]
+        specs[part] = spec
+        return specs
+
+
+def _without(entry: TensorDictBase) -> TensorDictBase:
+    """Return a tensor, or every tensor of a TensorDict, without the dimension of vehicles."""
+    if isinstance(entry, TensorDictBase):
+        return entry.apply(lambda x: x.squeeze(-2), batch_size=entry.batch_size)
+    return entry.squeeze(-2)
+
+
+def _flat(terms: Composite) -> Composite:
+    flat = Composite(shape=terms.shape, device=terms.device)
+    for name, spec in terms.items():
+        flat[name] = spec.squeeze(-2)
+    return flat
+
+
+def group_key(key: Key) -> Key:
+    """Return the key of the group that the view shows under a key of the root."""
+    return (AUTOMATED, *key) if key[0] in (*SHOWN, "action") else key

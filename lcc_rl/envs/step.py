@@ -1,0 +1,230 @@
+"""One step of an environment as a function of plain mappings of tensors.
+
+The TorchRL environment, the collector, the differentiable rollout and the evaluation all advance
+by :func:`tick` and the pieces' :meth:`~lcc_rl.pieces.base.Piece.apply`: a :class:`Step`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Size as BatchSize
+from torch import Tensor, compile, device, zeros_like
+from torch._dynamo.exc import TorchDynamoException
+from torch._inductor.exc import InductorError
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose, Transform
+
+from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
+from lcc_rl.pieces.rewards import RewardTerm, TotalReward
+
+log = logging.getLogger("lcc_rl")
+
+COMPILER_ERRORS = (TorchDynamoException, InductorError)
+DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
+
+
+def tick(seed: Tensor, step: Tensor, horizon: int) -> State:
+    """Return what the clock writes at a step of an episode, before any piece acts."""
+    truncated = step >= horizon
+    terminated = zeros_like(truncated)
+    return {SEED: seed, STEP: step, TRUNCATED: truncated, TERMINATED: terminated, DONE: truncated}
+
+
+class Step:
+    """Takes a batch of episodes one step further.
+
+    Args:
+        pieces: the pieces in the order in which they act.
+        horizon: steps per episode.
+        graded: the pieces whose results carry a gradient; None for all.
+    """
+
+    def __init__(
+        self, pieces: Sequence[Piece], horizon: int, graded: Iterable[Piece] | None = None
+    ) -> None:
+        chosen = set(pieces) if graded is None else set(graded)
+        self.pieces = [(piece, piece not in chosen) for piece in pieces]
+        self.horizon = horizon
+
+    def __call__(self, before: State) -> State:
+        """Return the entries of the moment reached.
+
+        Args:
+            before: the entries of the moment left that the pieces read, the action among them.
+        """
+        reached = tick(before[SEED], before[STEP] + 1, self.horizon)
+        for piece, detached in self.pieces:
+            piece.apply(before, reached, detached)
+        return reached
+
+
+class Compiled:
+    """A function compiled at its first call; where there is no compiler, the plain function.
+
+    Args:
+        function: what to compile, for one size of its arguments.
+        what: its name in the line of the log that says that it is not compiled.
+        compiled: False for the plain function.
+    """
+
+    def __init__(self, function: Callable[..., Any], what: str, compiled: bool) -> None:
+        self.plain, self.what = function, what
+        # One graph for each size: a graph for any size would be slower.
+        self.function = compile(function, dynamic=False) if compiled else function
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        if self.function is self.plain:
+            return self.plain(*arguments)
+        try:
+            return self.function(*arguments)
+        except COMPILER_ERRORS as error:
+            log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
+            self.function = self.plain
+            return self.plain(*arguments)
+
+
+def written(pieces: Iterable[Piece]) -> set[Key]:
+    """Return the keys that pieces write, without ``"next"``, their constants included."""
+    found: set[Key] = set()
+    for piece in pieces:
+        found |= set(piece.targets)
+        if isinstance(piece, StepTransform):
+            found |= set(piece.constants)
+    return found
+
+
+def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
+    """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
+    kept = list(chosen)
+    keys = set(wanted) | {key for piece in kept for _, key in piece.sources}
+    grown = True
+    while grown:
+        more = [piece for piece in pieces if piece not in kept and written([piece]) & keys]
+        keys |= {key for piece in more for _, key in piece.sources}
+        kept, grown = kept + more, bool(more)
+    return [piece for piece in pieces if piece in kept]
+
+
+def entries(td: TensorDictBase) -> State:
+    """Return the entries of a moment by their full keys."""
+    # Copies: entries that begin as one tensor would cost the compiler a graph of their own.
+    return {as_key(key): td.get(key).clone() for key in td.keys(True, True)}
+
+
+def leaves(key: NestedKey, known: Iterable[Key]) -> list[Key]:
+    """Return the keys of an entry, or of all entries below it, among those known."""
+    name, place = root_key(key), as_key(key)
+    prefix = place[: len(place) - len(name)]
+    return [prefix + entry for entry in known if entry[: len(name)] == name]
+
+
+def pieces_of(env: TransformedEnv) -> list[Piece]:
+    """Return the pieces of an environment."""
+    return [piece for piece in env.transform if isinstance(piece, Piece)]
+
+
+class Pieces(Compose):
+    """The pieces of an environment in the order in which they act, applied as one function.
+
+    No piece has an inverse, changes the device or the size of the batch, or looks at what a step
+    leaves behind. TorchRL asks for all this at every step; here only other transforms, which a
+    user may append, are asked. A reward term appended counts in the total reward.
+    """
+
+    def append(self, transform: Transform | Callable[[TensorDictBase], TensorDictBase]) -> None:
+        """Append a transform; a reward term goes before the sum of all terms."""
+        places = [i for i, piece in enumerate(self.transforms) if isinstance(piece, TotalReward)]
+        if not isinstance(transform, RewardTerm) or not places:
+            super().append(transform)
+            return
+        total: Any = self.transforms[places[-1]]
+        renewed = TotalReward([*total.terms, transform.name], total.string)
+        self.pop(places[-1])
+        super().append(transform)
+        super().append(renewed.to(self.parent.device) if self.parent is not None else renewed)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        waiting: list[Piece] = []
+        for transform in self.transforms:
+            if isinstance(transform, Piece):
+                waiting.append(transform)
+                continue
+            next_tensordict = _apply(waiting, tensordict, next_tensordict)
+            waiting = []
+            next_tensordict = transform._step(tensordict, next_tensordict)
+        return _apply(waiting, tensordict, next_tensordict)
+
+    def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Apply the inverse of what is not a piece, last first."""
+        tensordict = tensordict.copy()
+        for transform in reversed(self._others()):
+            tensordict = transform._inv_call(tensordict)
+        return tensordict
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        for transform in self._others():
+            tensordict, tensordict_ = transform._post_step_mdp_hooks(tensordict, tensordict_)
+        return tensordict, tensordict_
+
+    def transform_env_device(self, device: device) -> device:
+        """Return the device of the environment."""
+        for transform in self._others():
+            device = transform.transform_env_device(device)
+        return device
+
+    def transform_env_batch_size(self, batch_size: BatchSize) -> BatchSize:
+        """Return the size of the environment's batch."""
+        for transform in self._others():
+            batch_size = transform.transform_env_batch_size(batch_size)
+        return batch_size
+
+    def _others(self) -> list[Transform]:
+        return [transform for transform in self.transforms if not isinstance(transform, Piece)]
+
+
+class _Entries(dict[Key, Tensor]):
+    """The entries of a TensorDict, read when they are asked for."""
+
+    def __init__(self, td: TensorDictBase) -> None:
+        super().__init__()
+        self.td, self.found = td, State()
+
+    def __missing__(self, key: Key) -> Tensor:
+        # Kept apart from what the pieces write.
+        if key not in self.found:
+            self.found[key] = self.td.get(key)
+        return self.found[key]
+
+
+def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
+    """Apply pieces to two moments and add what they write to the second."""
+    if not pieces:
+        return next_td
+    before, reached = _Entries(td), _Entries(next_td)
+    for piece in pieces:
+        piece.apply(before, reached)
+    spaces: dict[str, dict[str, Any]] = {}
+    for key, value in reached.items():
+        if len(key) == 1:
+            next_td.set(key[0], value)
+        else:
+            _nest(spaces, key, value)
+    for space, values in spaces.items():
+        made = TensorDict(values, td.batch_size, device=td.device)
+        known = next_td.get(space, None)
+        next_td.set(space, made if known is None else known.update(made))
+    return next_td
+
+
+def _nest(target: dict[str, Any], key: Key, value: Tensor) -> None:
+    for name in key[:-1]:
+        target = target.setdefault(name, {})
+    target[key[-1]] = value

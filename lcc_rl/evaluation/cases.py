@@ -1,0 +1,147 @@
+"""Evaluation with one row per vehicle: cases, held-out windows and one whole record."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from lcc_rl.data.cycles import Case
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.evaluation.rollout import play, reset_options
+from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.connected import COUNTERS, HYBRID
+
+WINDOWS = "windows"
+RECORDED = ("speed", "gap", "acceleration", "jerk", "speed_error", "leader_speed_error")
+REWARD = (AUTOMATED, "reward")
+KEYS = [("leader", "speed"), *(("vehicles", name) for name in RECORDED), REWARD]
+KEYS += [(HYBRID, name) for name in ("winner", *COUNTERS)]
+# ``[time, runs, vehicles]``; of entries that only automated vehicles have, their rows alone.
+Series = dict[str, Tensor]
+
+
+def evaluate(
+    strategy: Strategy, cfg: DictConfig, inputs: Inputs
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Drive one strategy through every case, the held-out windows and the whole record.
+
+    Returns:
+        One row per run and vehicle, and the time series of the cases.
+    """
+    cases = [*inputs.cases, Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))]
+    if cfg.evaluation.full_length and inputs.full_length is not None:
+        cases.append(inputs.full_length)
+    rows, steps = [], []
+    for case in cases:
+        series = drive(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
+        frame = measure(series)
+        frame.insert(0, "strategy", strategy.name)
+        frame.insert(1, "training_seed", pd.Series([strategy.seed] * len(frame), dtype="Int64"))
+        frame.insert(2, "case", case.name)
+        frame.insert(3, "profile", [case.profile.names[i] for i in frame["run_id"]])
+        frame.insert(4, "followers", int(frame["follower"].max()))
+        rows.append(frame)
+        if case in inputs.cases:
+            drawn = trace(series, cfg.scenario.time_step)
+            drawn.insert(0, "strategy", strategy.name)
+            drawn.insert(1, "case", case.name)
+            steps.append(drawn)
+    trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
+    return pd.concat(rows, ignore_index=True), trails
+
+
+def of_case(cfg: DictConfig, case: Case) -> DictConfig:
+    """Return the configuration of a case; a platoon has the case's number of vehicles."""
+    cfg = cfg.copy()
+    OmegaConf.set_struct(cfg, False)
+    cfg.scenario.horizon = case.horizon
+    if set(string_of(cfg).names) == {AUTOMATED}:
+        cfg.scenario.string = f"{AUTOMATED}*{case.followers}"
+    return cfg
+
+
+def drive(
+    strategy: Strategy, case: Case, inputs: Inputs, seed: int = 0, device: str = "cpu"
+) -> Series:
+    """Drive a strategy behind every record of a case, side by side.
+
+    Returns:
+        ``leader`` ``[time + 1, runs, 1]``, speed ``[time + 1, runs, N]``; gap, acceleration,
+        jerk, errors ``[time, runs, N]``; reward and, of a hybrid, winner and counters, NaN for
+        vehicles that have none.
+    """
+    cfg = of_case(strategy.cfg, case)
+    runs = len(case.profile)
+    env = build_env(cfg, case.profile, inputs.population, runs, 0, device, True)
+    ids, drivers = torch.arange(runs, device=env.device), len(inputs.population.time_gap)
+    given = reset_options(env, ids, ids % drivers, seed, drivers)
+    record, _ = play(env, strategy.policy, given, KEYS)
+    string = string_of(cfg)
+    series = {"leader": record.pop(("leader", "speed"))}
+    for (space, name), entry in record.items():
+        entry = entry.squeeze(-1)
+        if space != "vehicles" and entry.shape[-1] != len(string):
+            full = torch.full((*entry.shape[:-1], len(string)), torch.nan, device=entry.device)
+            full[..., list(string.places(AUTOMATED))] = entry.to(full.dtype)
+            entry = full
+        series[name] = entry
+    return series
+
+
+def measure(series: Series) -> pd.DataFrame:
+    """Turn a record into one row per run and vehicle.
+
+    Speed errors are e_v(i,0), as in the paper's tables; ``energy_ratio`` is that of
+    Σ e_v(i,i−1)² to the same of the vehicle ahead (string stability: at most 1), missing for the
+    first vehicle and where nothing moves.
+    """
+    error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
+    energy = series["speed_error"].square().sum(0)
+    ratio = torch.full_like(energy, torch.nan)
+    ahead = energy[..., :-1]
+    ratio[..., 1:] = torch.where(ahead > 1e-3, energy[..., 1:] / ahead.clamp(min=1e-3), torch.nan)
+    columns = {
+        "speed_error_sum": error.sum(0),
+        "speed_error_squares": error.square().sum(0),
+        "jerk_sum": jerk.sum(0),
+        "jerk_squares": jerk.square().sum(0),
+        "reward": series["reward"].sum(0),
+        "min_gap_m": series["gap"].amin(0),
+        "peak_jerk_mps3": jerk.amax(0),
+        "energy_ratio": ratio,
+    }
+    if "winner" in series:
+        columns["learned_share"] = series["winner"].double().mean(0)
+        columns |= {name: series[name][-1] for name in COUNTERS}
+    runs, vehicles = energy.shape
+    frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
+    frame.insert(0, "run_id", np.repeat(np.arange(runs), vehicles))
+    frame.insert(1, "follower", np.tile(np.arange(1, vehicles + 1), runs))
+    frame["collided"] = frame["min_gap_m"] <= 0.0
+    frame["frames"] = len(jerk)
+    return frame
+
+
+def trace(series: Series, time_step: float) -> pd.DataFrame:
+    """Return the time series of the first run: a row per moment and vehicle, the leader's as 0."""
+    leader = series["leader"][1:, 0]
+    steps, vehicles = series["jerk"].shape[0], series["jerk"].shape[2]
+    columns = {"speed_mps": torch.cat([leader, series["speed"][1:, 0]], dim=-1)}
+    for name, label in (
+        ("gap", "gap_m"),
+        ("acceleration", "acceleration_mps2"),
+        ("jerk", "jerk_mps3"),
+        ("winner", "winner"),
+    ):
+        if name in series:
+            own = series[name][:, 0].to(leader.dtype)
+            columns[label] = torch.cat([torch.full_like(leader, torch.nan), own], dim=-1)
+    frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
+    frame.insert(0, "time_s", np.repeat(np.arange(1, steps + 1) * time_step, vehicles + 1))
+    frame.insert(1, "follower", np.tile(np.arange(vehicles + 1), steps))
+    return frame

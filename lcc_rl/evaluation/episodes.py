@@ -1,0 +1,209 @@
+"""Evaluation with one row per episode: every driver behind every profile, the same noise for all.
+
+Columns named ``cav_…`` belong to the automated vehicles of the string, ``hdv_…`` to all others;
+energies and distances add up over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from lcc_rl.config import require
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.evaluation.metrics import energy_measures, safety_measures
+from lcc_rl.evaluation.rollout import Record, play, reset_options
+from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.string import gather
+from lcc_rl.pieces.controllers import Population
+
+RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
+SUMMED = ("energy_kj", "net_energy_kj", "steady_energy_kj", "acceleration_loss_kj")
+# What a step of a sample episode says of its episode.
+SAMPLED = (
+    "strategy",
+    "training_seed",
+    "profile",
+    "driver_id",
+    "desired_speed_mps",
+    "time_gap_s",
+)
+KEYS = [("leader", name) for name in ("speed", "acceleration")]
+KEYS += [("vehicles", name) for name in RECORDED]
+INDEX = (AUTOMATED, "index")
+# The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
+Groups = dict[str, dict[str, Tensor]]
+
+
+def pairs(profiles: int, drivers: int, chosen: int | None) -> tuple[Tensor, Tensor]:
+    """Pair every profile with every driver (or ``chosen`` drivers, spread evenly).
+
+    Returns:
+        Profile and driver ids, each ``[episodes]``, profiles slowest.
+    """
+    limit = drivers if chosen is None else min(chosen, drivers)
+    ids = torch.from_numpy(np.linspace(0, drivers - 1, limit).round().astype(np.int64))
+    profile, driver = torch.meshgrid(torch.arange(profiles), ids, indexing="ij")
+    return profile.flatten(), driver.flatten()
+
+
+def evaluate(
+    strategy: Strategy,
+    inputs: Inputs,
+    drivers: int | None,
+    batch_size: int,
+    seed: int,
+    sample_episodes: int = 0,
+    device: str = "cpu",
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Run every episode of one strategy.
+
+    An episode's noise depends on ``seed`` and its profile and driver only: it is the same for
+    every strategy, and the batch size changes a row by no more than rounding.
+
+    Args:
+        strategy: who drives, and its environment's configuration.
+        inputs: held-out windows and drivers.
+        drivers: how many of the population, spread evenly; None for all.
+        batch_size: episodes side by side.
+        seed: seed of the noise.
+        sample_episodes: how many episodes to keep as time series.
+        device: where to compute.
+
+    Returns:
+        One row per episode, and one row per step of the sample episodes.
+
+    Raises:
+        ConfigError: if the batch size is not positive.
+    """
+    require(batch_size >= 1, f"evaluation.batch_size must be at least 1, got {batch_size}")
+    profiles, population = inputs.evaluation, inputs.population
+    count = len(population.time_gap)
+    profile, driver = pairs(len(profiles), count, drivers)
+    kept = set(np.linspace(0, len(profile) - 1, max(sample_episodes, 1)).round().astype(int))
+    string = string_of(strategy.cfg)
+    time_step = strategy.cfg.scenario.time_step
+    episodes, steps = [], []
+    for start in range(0, len(profile), batch_size):
+        part = slice(start, start + batch_size)
+        batch = len(profile[part])
+        env = build_env(any_leader(strategy.cfg), profiles, population, batch, 0, device, True)
+        given = reset_options(env, profile[part], driver[part], seed, count)
+        record, alive = play(env, strategy.policy, given, [*KEYS, INDEX])
+        groups = grouped(record, string)
+        table = measure(groups, alive, time_step)
+        described = describe(strategy, profiles, population, profile[part], driver[part])
+        episodes.append(pd.concat([described, table], axis=1))
+        if sample_episodes:
+            inside = [index - start for index in sorted(kept) if 0 <= index - start < len(table)]
+            steps += list(sample(groups, alive, episodes[-1], inside, time_step))
+    trace = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
+    return pd.concat(episodes, ignore_index=True), trace
+
+
+def any_leader(cfg):  # type: ignore[no-untyped-def]
+    """Return a configuration without the one record that its leader may be told to play.
+
+    That record is one to train on: with other profiles at hand its number means nothing.
+    """
+    cfg = cfg.copy()
+    leader = cfg.scenario.pieces.get("leader")
+    if leader is not None and "profile" in leader:
+        leader.profile = None
+    return cfg
+
+
+def grouped(record: Record, string: VehicleString) -> Groups:
+    """Divide the record of a string into that of its automated vehicles and of all others."""
+    groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
+    own = list(string.places(AUTOMATED))
+    others = [place for place in range(len(string)) if place not in own]
+    for (space, name), entry in record.items():
+        if space == "leader":
+            groups["leader"][name] = entry.unsqueeze(-2)
+        elif space == "vehicles" and not string.drawn:
+            for group, places in (("cav", own), ("hdv", others)):
+                if places:
+                    groups[group][name] = entry[..., places, :]
+        elif space == "vehicles":
+            index = record[INDEX][0]
+            place = torch.arange(len(string), device=index.device)
+            taken = (place == index.unsqueeze(-1)).any(-2)
+            order = taken.int().argsort(stable=True, dim=-1)
+            rest = order[..., : len(others)].sort(-1).values
+            for group, chosen in (("cav", index), ("hdv", rest)):
+                at = chosen.expand(entry.shape[0], *chosen.shape)
+                groups[group][name] = gather(entry, at)
+    return groups
+
+
+def measure(groups: Groups, alive: Tensor, time_step: float) -> pd.DataFrame:
+    """Turn the record of a batch into one row of measures per episode."""
+    columns: dict[str, Tensor] = {}
+    for group in ("cav", "hdv"):
+        series = groups[group]
+        if "power" not in series:
+            continue
+        measures = energy_measures(series["power"], series["speed"], alive.unsqueeze(-2), time_step)
+        columns |= {f"{group}_{name}": value.sum(-2) for name, value in measures.items()}
+    own = groups["cav"]
+    if "gap" in own:
+        columns |= safety_measures(own, alive.unsqueeze(-2), time_step)
+        for name in SUMMED:
+            keys = [f"{group}_{name}" for group in ("cav", "hdv")]
+            parts = [columns[key] for key in keys if key in columns]
+            if parts:
+                columns[f"total_{name}"] = torch.stack(parts).sum(0)
+    if "gap" in groups["hdv"]:
+        gap = groups["hdv"]["gap"].amin(-2)
+        columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)
+    frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
+    lowest = [frame[key] for key in ("min_gap_m", "hdv_min_gap_m") if key in frame]
+    frame["collided"] = np.minimum.reduce(lowest) <= 0.0
+    frame["steps"] = alive.sum(0).squeeze(-1).cpu().numpy()
+    return frame
+
+
+def describe(
+    strategy: Strategy,
+    profiles: Profiles,
+    population: Population,
+    profile: Tensor,
+    driver: Tensor,
+) -> pd.DataFrame:
+    """Say which episodes a batch holds: strategy, profile and driver."""
+    return pd.DataFrame(
+        {
+            "strategy": strategy.name,
+            "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
+            "profile": [profiles.names[i] for i in profile.tolist()],
+            "profile_id": profile.numpy(),
+            "driver_id": driver.numpy(),
+            "desired_speed_mps": population.desired_speed[driver].numpy(),
+            "time_gap_s": population.time_gap[driver].numpy(),
+        }
+    )
+
+
+def sample(
+    groups: Groups, alive: Tensor, episodes: pd.DataFrame, inside: list[int], time_step: float
+) -> Iterator[pd.DataFrame]:
+    """Yield the time series of chosen episodes of a batch, one row per step."""
+    for index in inside:
+        steps = int(alive[:, index].sum())
+        columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
+        for group, series in groups.items():
+            for name, values in series.items():
+                rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
+                for place in range(rows.shape[1]):
+                    label = group if rows.shape[1] == 1 else f"{group}{place + 1}"
+                    columns[f"{label}_{name}"] = rows[:, place].cpu().numpy()
+        described = episodes[list(SAMPLED)].iloc[[index] * steps].reset_index(drop=True)
+        yield pd.concat([described, pd.DataFrame(columns)], axis=1)

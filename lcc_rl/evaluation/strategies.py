@@ -1,0 +1,299 @@
+"""Strategies: what drives the automated vehicles of a string in an evaluation.
+
+All strategies of an evaluation share the scenario under study: its drivers, energy model, noise
+and pieces. A strategy differs in who drives the automated vehicles and what that one observes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from lcc_rl.agents.factory import build_agent, learns
+from lcc_rl.config import TARGET, load, plain, short_name
+from lcc_rl.envs.inputs import string_of
+from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.evaluation.rollout import Policy
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.controllers import Population
+from lcc_rl.policies import shared_policy
+from lcc_rl.results.runs import differing, flatten
+
+log = logging.getLogger("lcc_rl")
+
+# Pieces that belong to what a policy observes, not to the traffic.
+KNOWLEDGE = ("memory", "preview")
+GAINS = ("path", "paper_like", "tuned")
+# Baselines by name: the controller of the automated vehicles, by what makes it.
+BASELINES = {
+    "idm": ("variant=idm",),
+    **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
+    "deadbeat": ("variant=deadbeat",),
+    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
+}
+DIRECT = "direct"
+TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """A way to drive the automated vehicles.
+
+    Args:
+        name: how tables call it.
+        cfg: configuration of its environment.
+        policy: writes ``("automated", "action")``, deterministic; None where a rule drives.
+        seed: training seed, for the tables; None where nothing was learned.
+    """
+
+    name: str
+    cfg: DictConfig
+    policy: Policy | None = None
+    seed: int | None = None
+
+
+def _copy(cfg: DictConfig) -> DictConfig:
+    cfg = cfg.copy()
+    OmegaConf.set_struct(cfg, False)
+    return cfg
+
+
+def deployed(cfg: DictConfig) -> DictConfig:
+    """Return a configuration in which the automated vehicles drive as after training."""
+    if cfg.get("deployed") is None:
+        return cfg
+    return driven_by(cfg, cfg.deployed)
+
+
+def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
+    """Return a configuration in which another controller drives the automated vehicles."""
+    cfg = _copy(cfg)
+    cfg.scenario.controllers.automated = controller
+    cfg.deployed = None
+    return cfg
+
+
+def baselines(cfg: DictConfig) -> list[Strategy]:
+    """Build the baselines that an evaluation names, in the scenario under study.
+
+    Raises:
+        ConfigError: if there is none of a name.
+    """
+    return [baseline(cfg, name) for name in cfg.evaluation.baselines if applies(cfg, name)]
+
+
+def applies(cfg: DictConfig, name: str) -> bool:
+    """Whether a baseline means anything for a string: there must be somebody to drive."""
+    roles = set(string_of(cfg).names)
+    if name == DIRECT:
+        return bool(roles - {AUTOMATED})
+    oracle = name.endswith("oracle") and roles != {AUTOMATED}
+    return AUTOMATED in roles and not oracle
+
+
+def baseline(cfg: DictConfig, name: str) -> Strategy:
+    """Build a baseline in the scenario under study; its own settings where it is the one studied.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    if name == DIRECT:
+        return Strategy(name, without_automated(cfg))
+    if cfg.variant == name:
+        return Strategy(name, cfg)
+    return Strategy(name, without_filter(driven_by(cfg, baseline_controller(name))))
+
+
+def baseline_controller(name: str) -> Any:
+    """Return the node of a baseline's controller.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    if name not in BASELINES:
+        raise unknown_name("baseline", name, (DIRECT, *BASELINES))
+    return plain(load("evaluate", BASELINES[name]).scenario.controllers.automated)
+
+
+def without_filter(cfg: DictConfig) -> DictConfig:
+    """Return a configuration without a safety filter of the automated vehicles."""
+    cfg = _copy(cfg)
+    cfg.scenario.filters.pop(AUTOMATED, None)
+    return cfg
+
+
+def without_automated(cfg: DictConfig) -> DictConfig:
+    """Return a configuration whose string lacks the automated vehicles."""
+    roles = [role for role in string_of(cfg).roles if role != AUTOMATED]
+    cfg = without_filter(cfg)
+    cfg.scenario.string = " ".join(roles)
+    return cfg
+
+
+def studied(
+    cfg: DictConfig, policy: TrainedPolicy | None, population: Population
+) -> list[Strategy]:
+    """Build what the configuration asks for; of a hybrid, its parents and its oracle, too.
+
+    Args:
+        cfg: configuration of the entry point ``evaluate``.
+        policy: the policy read from ``cfg.policy``, where there is one.
+        population: the human drivers.
+
+    Raises:
+        ConfigError: if it needs a policy and none is given, or the policy does not fit.
+    """
+    if not learns(cfg):
+        nodes = [plain(s.cfg.scenario.controllers.automated) for s in baselines(cfg)]
+        known = plain(cfg.scenario.controllers.automated) in nodes
+        same = known and cfg.scenario.filters.get(AUTOMATED) is None
+        named = cfg.variant in cfg.evaluation.baselines
+        return [] if same or named else [Strategy(cfg.variant, cfg)]
+    if policy is None:
+        raise ConfigError(
+            f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
+            f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
+        )
+    weights, own_cfg = policy
+    check_policy(cfg, own_cfg)
+    cfg = _copy(cfg)
+    cfg.agent = own_cfg.agent
+    if cfg.scenario.filters.get(AUTOMATED) is None and own_cfg.scenario.filters.get(AUTOMATED):
+        log.info("policy=%s was trained with a filter and keeps it", cfg.policy)
+        cfg.scenario.filters.automated = own_cfg.scenario.filters.automated
+    strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
+    return [strategy] if cfg.deployed is None else hybrids(strategy)
+
+
+def check_policy(cfg: DictConfig, own: DictConfig) -> None:
+    """Check that a policy was trained for the variant and the observation under study.
+
+    Raises:
+        ConfigError: naming what differs.
+    """
+    hybrid = cfg.deployed is not None or own.get("deployed") is not None
+    if own.variant != cfg.variant and not hybrid:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
+            f"say variant={own.variant}"
+        )
+    trained_with, observed = (
+        dict(flatten(plain(node))) for node in (own.observation, cfg.observation)
+    )
+    changes = [
+        f"observation.{key}: {trained_with.get(key)}, got {observed.get(key)}"
+        for key in differing(trained_with, observed)
+    ]
+    if changes:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained with another observation than this: expected "
+            f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
+        )
+    remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
+    if remembered != asked:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained with another memory than this: "
+            f"expected scenario.pieces.memory={remembered}, got {asked}"
+        )
+
+
+def hybrids(strategy: Strategy) -> list[Strategy]:
+    """Build a hybrid strategy, the parents it is composed of, and its oracle."""
+    cfg = strategy.cfg
+    parent = driven_by(cfg, cfg.scenario.controllers.automated)
+    found = [replace(strategy, name=short_name(cfg.agent[TARGET]), cfg=parent)]
+    rule = plain(cfg.deployed).get("rule")
+    known = [plain(s.cfg.scenario.controllers.automated) for s in baselines(cfg)]
+    if rule is not None and rule not in known:
+        found.insert(0, Strategy("cacc", driven_by(cfg, rule)))
+    found.append(replace(strategy, cfg=deployed(cfg)))
+    if set(string_of(cfg).names) == {AUTOMATED}:
+        oracle = {**plain(cfg.deployed), "lookahead": "oracle"}
+        name = f"{strategy.name} oracle"
+        found.append(replace(strategy, name=name, cfg=driven_by(cfg, oracle)))
+    return found
+
+
+def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
+    """Build a trained strategy to compare with, in the scenario under study.
+
+    Args:
+        cfg: the configuration under study.
+        path: where the policy comes from, for messages.
+        policy: its weights and configuration.
+        population: the human drivers.
+
+    Raises:
+        ConfigError, ResultsError: if the policy does not fit the scenario or its own network.
+    """
+    weights, own = policy
+    other = _copy(cfg)
+    if own.scenario.name != cfg.scenario.name:
+        raise ConfigError(
+            f"policy={path} was trained as variant {own.variant}, in the scenario "
+            f"{own.scenario.name}, not in {cfg.scenario.name}"
+        )
+    for key in ("variant", "agent", "observation"):
+        other[key] = own[key]
+    other.deployed = own.get("deployed")
+    other.scenario.controllers.automated = own.scenario.controllers.automated
+    if other.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
+        other.scenario.filters.automated = own.scenario.filters.automated
+    for name, node in own.scenario.pieces.items():
+        if name in KNOWLEDGE or name not in other.scenario.pieces:
+            other.scenario.pieces[name] = node
+    strategy = with_weights(other, weights, own.seed, path, population)
+    return replace(strategy, cfg=deployed(strategy.cfg))
+
+
+def with_weights(
+    cfg: DictConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
+) -> Strategy:
+    """Build a strategy and load its policy's weights.
+
+    Raises:
+        ResultsError: if the weights do not fit the network.
+    """
+    agent = build_agent(cfg, population, cfg.device)
+    try:
+        agent.policy.load_state_dict(dict(weights))
+    except RuntimeError as error:
+        raise ResultsError(f"{path}: the weights do not fit the policy network: {error}") from error
+    return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed)
+
+
+def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Add its agent to the name of a variant that more than one kind of agent has learned."""
+    kinds = [
+        short_name(strategy.cfg.agent[TARGET]) if strategy.policy is not None else ""
+        for strategy in strategies
+    ]
+    named = [(strategy.name, kind) for strategy, kind in zip(strategies, kinds, strict=True)]
+    learned_by = Counter(name for name, _ in set(named))
+    return [
+        replace(strategy, name=f"{name} {kind}") if learned_by[name] > 1 else strategy
+        for strategy, (name, kind) in zip(strategies, named, strict=True)
+    ]
+
+
+def check_distinct(strategies: Sequence[Strategy]) -> None:
+    """Refuse two policies that no row could tell apart.
+
+    Raises:
+        ConfigError: naming the variant and the seed.
+    """
+    seen = set()
+    for strategy in strategies:
+        key = (strategy.name, strategy.seed)
+        if key in seen:
+            seed = "" if strategy.seed is None else f" with training seed {strategy.seed}"
+            raise ConfigError(
+                f"policy and compare name two policies of variant {strategy.name}{seed}; their "
+                "rows could not be told apart: evaluate them one after the other"
+            )
+        seen.add(key)

@@ -1,0 +1,165 @@
+"""The hybrid car-following strategy: two candidates, the better one each step (HCFS H4–H14).
+
+Tensors of vehicles are ``[*batch, N, 1]``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lcc_rl.functional.kinematics import advance_speed
+
+
+@dataclass(frozen=True)
+class PlatoonReward:
+    """The paper's reward H4–H6: −ω1 |e_v(i,0)|/v_max − ω2 |jerk|/jerk_scale.
+
+    Table IV of the paper determines ω1/v_max = 0.369 s/m and ω2 = 0.036 (jerk_scale =
+    2 a_max/T = 30 m/s³).
+
+    Args:
+        velocity_weight: ω1.
+        speed_scale: v_max [m/s].
+        jerk_weight: ω2.
+        jerk_scale: 2 a_max/T [m/s³].
+    """
+
+    velocity_weight: float = 10.0
+    speed_scale: float = 27.1
+    jerk_weight: float = 0.036
+    jerk_scale: float = 30.0
+
+    def __call__(self, speed_error: Tensor, jerk: Tensor) -> Tensor:
+        """Return the reward of e_v(i,0) [m/s] and jerk [m/s³], of their broadcast shape."""
+        return (
+            -self.velocity_weight / self.speed_scale * speed_error.abs()
+            - self.jerk_weight / self.jerk_scale * jerk.abs()
+        )
+
+    def one_step(
+        self,
+        speed: Tensor,
+        last_acceleration: Tensor,
+        acceleration: Tensor,
+        leader_next: Tensor,
+        time_step: float,
+    ) -> Tensor:
+        """Return the reward that an acceleration will earn, ``[*batch, N, 1]`` (H12)."""
+        reached, executed = advance_speed(speed, acceleration, time_step)
+        jerk = (executed - last_acceleration) / time_step
+        return self(leader_next - reached, jerk)
+
+
+def safe_acceleration(
+    gap: Tensor,
+    speed: Tensor,
+    ahead: Tensor,
+    time_step: float,
+    braking: float,
+    margin: float,
+) -> Tensor:
+    """Compute the largest acceleration after which braking still avoids the vehicle ahead.
+
+    The vehicle ahead brakes at ``braking`` to standstill from now on; the follower executes this
+    acceleration for one step, then brakes at ``braking`` too and ends ``margin`` behind it.
+
+    Args:
+        gap: bumper-to-bumper gap as received [m].
+        speed: own speed [m/s].
+        ahead: speed of the vehicle ahead [m/s].
+        time_step: T [s].
+        braking: b [m/s²].
+        margin: g [m].
+
+    Returns:
+        The cap [m/s²], of the arguments' shape; it may lie below −b where it is too late.
+    """
+    ahead_next = (ahead - braking * time_step).clamp(min=0.0)
+    room = gap + 0.5 * time_step * (ahead + ahead_next) + ahead_next**2 / (2.0 * braking) - margin
+    q = 0.5 * time_step * speed - room
+    root = (0.25 * time_step**2 - 2.0 * q / braking).clamp(min=0.0).sqrt()
+    reached = braking * (root - 0.5 * time_step)
+    return (reached - speed) / time_step
+
+
+class Decision(NamedTuple):
+    """What the hybrid strategy decides, each ``[*batch, N, 1]``.
+
+    acceleration [m/s²]; winner: 0 for the rule, 1 for the learned policy; switched, clamped,
+    capped: whether the winner changed, the jerk bound cut a candidate, the safe cap the result.
+    """
+
+    acceleration: Tensor
+    winner: Tensor
+    switched: Tensor
+    clamped: Tensor
+    capped: Tensor
+
+
+def jerk_interval(
+    last_acceleration: Tensor, jerk_bound: float, time_step: float, max_acceleration: float
+) -> tuple[Tensor, Tensor]:
+    """Return the accelerations between which |jerk| stays within the bound (HCFS step 1)."""
+    reach = jerk_bound * time_step
+    low = (last_acceleration - reach).clamp(min=-max_acceleration)
+    return low, (last_acceleration + reach).clamp(max=max_acceleration)
+
+
+def hybrid_decision(
+    rule: Tensor,
+    learned: Tensor,
+    speed: Tensor,
+    last_acceleration: Tensor,
+    last_winner: Tensor | None,
+    leader_next: Tensor,
+    interval: tuple[Tensor, Tensor] | None,
+    cap: Tensor | None,
+    reward: PlatoonReward,
+    time_step: float,
+    max_acceleration: float,
+) -> Decision:
+    """Decide between two candidate accelerations, per follower (H12–H14).
+
+    1. Clamp both to the interval of the jerk bound and, from above, to the safe cap.
+    2. The one whose one-step reward is larger wins; the rule wins ties.
+    3. In the frame in which the winner changes, the two are blended half and half.
+
+    The theorem H15–H21 assumes that each candidate keeps the jerk bound relative to the
+    acceleration executed last; without step 1 that is not so.
+
+    Args:
+        rule, learned: the candidates [m/s²].
+        speed: v_i [m/s].
+        last_acceleration: a_{k−1} as executed [m/s²].
+        last_winner: winner of the frame before, negative where there was none; None likewise.
+        leader_next: the predicted speed of each vehicle's leader [m/s].
+        interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
+        cap: see :func:`safe_acceleration`; None leaves it out.
+        reward: the reward to compare by.
+        time_step: T [s].
+        max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
+    """
+    candidates = torch.stack([rule, learned])
+    free = candidates
+    if interval is not None:
+        candidates = candidates.clamp(*interval)
+    clamped = (candidates != free).any(0)
+    capped = torch.zeros_like(clamped)
+    if cap is not None:
+        bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
+        capped = (bounded != candidates).any(0)
+        candidates = bounded
+    rule, learned = candidates.unbind(0)
+    earned = reward.one_step(speed, last_acceleration, candidates, leader_next, time_step)
+    winner = (earned[1] > earned[0]).to(torch.int64)
+    if last_winner is None:
+        switched = torch.zeros_like(clamped)
+    else:
+        switched = (last_winner >= 0) & (winner != last_winner)
+    chosen = torch.where(winner.bool(), learned, rule)
+    chosen = torch.where(switched, 0.5 * (rule + learned), chosen)
+    return Decision(chosen, winner, switched, clamped, capped)

@@ -1,0 +1,107 @@
+"""The control barrier function (CBF) safety filter between a controller and its vehicles."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.pieces.base import StepTransform
+from lcc_rl.pieces.views import Views
+
+SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
+
+
+class CBFFilter(StepTransform):
+    """Changes a command as little as needed for the vehicle to stay between two limits.
+
+    Two functions of the state are to stay positive: ``gap − margin − τ·(v − v_ahead)``, which
+    keeps time-to-collision above τ, and ``longest(v) − gap``, which keeps the time gap below
+    ``time_gap``. Each may fall at most at its rate times its value per second, which bounds the
+    acceleration from above and from below; within the bounds the controller decides. Where they
+    contradict each other, safety wins. This is the quadratic programme of Ames, Grizzle and
+    Tabuada ("Control barrier function based quadratic programs with application to adaptive
+    cruise control", CDC 2014), whose solution for one number is a clamp. The vehicle ahead is
+    expected to keep its last measured acceleration.
+
+    Behind a leader at standstill both limits are about the same number, gap / speed, so who comes
+    from afar must break one. With a ``full_speed``, ``longest(v)`` is ``time_gap·v`` from there on
+    and falls with the square of the speed below: the vehicle is near before its leader stands, and
+    pays for it with energy.
+
+    Reads and replaces ``("command", role)``, ``[*batch, n, 1]`` [m/s²]. Differentiable.
+
+    Args:
+        time_step: duration of a step [s].
+        max_acceleration: bound of the acceleration in both directions [m/s²].
+        time_to_collision: shortest allowed [s].
+        rate: how fast that limit may be approached [1/s].
+        margin: gap that counts as contact [m].
+        time_gap: longest allowed [s]; None: no limit.
+        time_gap_rate: how fast that limit may be approached [1/s].
+        full_speed: speed below which the longest time gap falls in proportion; 0: it does not
+            [m/s].
+        least_gap: gap that the limit of the time gap always allows [m].
+        string: the string of vehicles; one automated vehicle where not given.
+        role: whose commands are filtered.
+
+    Raises:
+        ConfigError: if a limit, a rate or the acceleration is not positive, or the speed negative.
+    """
+
+    def __init__(
+        self,
+        time_step: float,
+        max_acceleration: float = 3.0,
+        time_to_collision: float = 4.0,
+        rate: float = 3.0,
+        margin: float = 0.2,
+        time_gap: float | None = 2.45,
+        time_gap_rate: float = 0.2,
+        full_speed: float = 0.0,
+        least_gap: float = 2.0,
+        string: VehicleString | None = None,
+        role: str = AUTOMATED,
+    ) -> None:
+        where = f"scenario.filters.{role}"
+        limits = {"time_to_collision": time_to_collision, "rate": rate}
+        limits |= {"time_gap_rate": time_gap_rate, "max_acceleration": max_acceleration}
+        require_positive(where, **limits)
+        if time_gap is not None:
+            require_positive(where, time_gap=time_gap)
+        if full_speed < 0:
+            raise ConfigError(f"{where}.full_speed must not be negative, got {full_speed}")
+        string = VehicleString((role,)) if string is None else string
+        seen = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
+        self.views = Views(string, role, [f"next.command.{role}", *seen])
+        super().__init__(self.views.keys, [("command", role)], event_shape=(string.count(role), 1))
+        self.time_step, self.max_acceleration = time_step, max_acceleration
+        self.shortest, self.rate, self.margin = time_to_collision, rate, margin
+        self.longest, self.time_gap_rate = time_gap, time_gap_rate
+        self.full_speed, self.least_gap = max(full_speed, SLOWEST), least_gap
+
+    def compute(self, *entries: Tensor) -> Tensor:
+        """Return the commands that the vehicles obey."""
+        return self.filtered(*self.views(*entries))
+
+    def filtered(
+        self, wanted: Tensor, speed: Tensor, gap: Tensor, ahead: Tensor, ahead_acceleration: Tensor
+    ) -> Tensor:
+        """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²]."""
+        closing = speed - ahead
+        if self.longest is not None:
+            allowed, slope = self._longest_gap(speed, self.longest)
+            least = (-closing - self.time_gap_rate * (allowed - gap)) / slope
+            wanted = torch.maximum(wanted, least)
+        room = gap - self.margin - self.shortest * closing
+        slower = (self.rate * room - closing) / (self.shortest + 0.5 * self.time_step)
+        wanted = torch.minimum(wanted, ahead_acceleration + slower)
+        return wanted.clamp(-self.max_acceleration, self.max_acceleration)
+
+    def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
+        """Return the longest gap at a speed, and how it grows with the speed."""
+        moving = speed.clamp(min=SLOWEST)
+        share = (moving / self.full_speed).clamp(max=1.0)
+        slope = time_gap * torch.where(share < 1.0, 2.0 * share, share)
+        return (time_gap * share * moving).clamp(min=self.least_gap), slope

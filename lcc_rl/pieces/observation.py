@@ -1,0 +1,113 @@
+"""What a policy observes: entries of the string as each automated vehicle sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.pieces.base import Feature
+from lcc_rl.pieces.views import BEHIND, PRESENT, Views
+
+OBSERVATION = "observation"
+
+
+class Observation(Feature):
+    """Gathers entries, each times a fixed constant, into ``("automated", "observation")``.
+
+    Writes ``[*batch, A, entries]``, one row per automated vehicle. Where a vehicle may have
+    fewer than ``visible`` vehicles behind, their entries are zero and one more entry per vehicle
+    behind says whether it is there (1 or 0).
+
+    Args:
+        scales: constant of each entry, nested by view (:mod:`lcc_rl.pieces.views`), in the order
+            of the observation, e.g. ``{"self": {"speed": 0.1}, "ahead": {"speed": 0.1}}``.
+        visible: how many vehicles behind are seen, the nearest first.
+        widths: for views whose entries are wider than one number their width, or a list as long
+            as they are wide, e.g. the horizons of a preview.
+        relative_to: for views whose entries are seen as differences, from what, dotted:
+            ``{"preview": "ahead.speed"}``, or one for each of as many equal parts; None: as they
+            are. What matters is then not hidden in a small difference of large numbers.
+        string: the string of vehicles; one automated vehicle where not given.
+
+    Raises:
+        ConfigError: if there is no entry, a scale is zero or a difference is that of no entry.
+    """
+
+    constants: Tensor
+
+    def __init__(
+        self,
+        scales: Mapping[str, Mapping[str, float]],
+        visible: int = 1,
+        widths: Mapping[str, int | Sequence[float]] | None = None,
+        relative_to: Mapping[str, str | Sequence[str] | None] | None = None,
+        string: VehicleString | None = None,
+    ) -> None:
+        string = VehicleString() if string is None else string
+        flat = {(view, name): x for view, names in scales.items() for name, x in names.items()}
+        if not flat or not all(flat.values()):
+            raise ConfigError("observation.scales must name at least one entry, none with scale 0")
+        if visible < 1:
+            raise ConfigError(f"observation.visible must be at least 1, got {visible}")
+        wide = {
+            view: width if isinstance(width, int) else len(width)
+            for view, width in (widths or {}).items()
+        }
+        counts = [visible if view == BEHIND else wide.get(view, 1) for view, _ in flat]
+        bases = _bases(relative_to or {}, flat, counts)
+        values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]
+        seen = list(flat)
+        if BEHIND in scales and not Views(string, AUTOMATED, [], visible).sees_all_behind():
+            seen.append((BEHIND, PRESENT))
+            values += [1.0] * visible
+            bases.append([])
+            counts.append(visible)
+        names = list(dict.fromkeys([*seen, *(key for keys in bases for key in keys)]))
+        self.views = Views(string, AUTOMATED, [".".join(name) for name in names], visible)
+        super().__init__(
+            self.views.keys,
+            [(AUTOMATED, OBSERVATION)],
+            (string.count(AUTOMATED), len(values)),
+        )
+        self.bases = [[names.index(key) for key in keys] for keys in bases]
+        self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
+        self.register_buffer("constants", torch.tensor(values))
+
+    def compute(self, *entries: Tensor) -> Tensor:
+        """Return the scaled observation, ``[*batch, A, entries]``."""
+        values = self.views(*entries)
+        seen = values[: len(self.bases)]
+        for place, (bases, repeat) in enumerate(zip(self.bases, self.repeats, strict=True)):
+            if bases:
+                base = torch.cat([values[i] for i in bases], -1)
+                seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
+        vehicles = max(entry.shape[-2] for entry in seen)
+        # Where all see the same, such as a preview of the leader, there is one row for all.
+        rows = [entry.expand(*entry.shape[:-2], vehicles, -1) for entry in seen]
+        return torch.cat(rows, dim=-1) * self.constants
+
+
+def _bases(
+    relative_to: Mapping[str, str | Sequence[str] | None],
+    flat: Mapping[tuple[str, str], float],
+    counts: Sequence[int],
+) -> list[list[tuple[str, ...]]]:
+    """Return what is subtracted from each entry, in equal parts; nothing from most."""
+    for view in relative_to:
+        if view == BEHIND or view not in {name for name, _ in flat}:
+            where = f"observation.relative_to.{view}"
+            raise ConfigError(f"{where}: expected a view of observation.scales other than behind")
+    found = []
+    for (view, _), count in zip(flat, counts, strict=True):
+        given = relative_to.get(view) or ()
+        keys = [tuple(key.split(".")) for key in ([given] if isinstance(given, str) else given)]
+        if keys and count % len(keys):
+            raise ConfigError(
+                f"observation.relative_to.{view}: {len(keys)} entries do not divide its {count}"
+            )
+        found.append(keys)
+    return found

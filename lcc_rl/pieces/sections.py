@@ -1,0 +1,68 @@
+"""Sections of a string: each automated vehicle and those behind it, back to the next one."""
+
+from __future__ import annotations
+
+from torch import Tensor, cat
+from torch.nn.functional import pad
+
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.string import sum_ranges
+from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.views import VEHICLES
+
+
+class Sections:
+    """Sums an entry over the vehicles behind each automated one, back to the next automated one.
+
+    On a ring road the section of the last automated vehicle goes on at the front.
+
+    Args:
+        string: the string of vehicles.
+        of: whose entry: ``"vehicles"`` for all, or the one role that has it.
+
+    Attributes:
+        keys: entries that :meth:`sum` needs besides the one summed; none where places are fixed.
+    """
+
+    def __init__(self, string: VehicleString, of: str) -> None:
+        self.string, self.of = string, of
+        self.keys: list[Key] = []
+        if string.drawn:
+            self.keys = [(role, "index") for role in (AUTOMATED, *({of} - {VEHICLES}))]
+        own = string.places(AUTOMATED)
+        ends = [*own[1:], len(string)]
+        self.first = [self._rank(place + 1) for place in own]
+        self.last = [self._rank(place) for place in ends] if own else []
+        # On a ring: what is ahead of the first automated vehicle is behind the last one.
+        self.wrapped = self._rank(own[0]) if own and string.ring else 0
+
+    def _rank(self, place: int) -> int:
+        """Return how many of those counted are ahead of a place."""
+        roles = self.string.roles[:place]
+        return place if self.of == VEHICLES else roles.count(self.of)
+
+    def sum(self, entry: Tensor, *indices: Tensor) -> Tensor:
+        """Return the sums, ``[*batch, A, 1]``, of an entry ``[*batch, n, 1]``."""
+        if self.string.drawn:
+            return self._sum_drawn(entry, *indices)
+        parts = [
+            entry[..., first:last, :].sum(-2, keepdim=True)
+            for first, last in zip(self.first, self.last, strict=True)
+        ]
+        if self.wrapped:
+            parts[-1] = parts[-1] + entry[..., : self.wrapped, :].sum(-2, keepdim=True)
+        if not parts:
+            return entry[..., :0, :]
+        return parts[0] if len(parts) == 1 else cat(parts, -2)
+
+    def _sum_drawn(self, entry: Tensor, own: Tensor, *others: Tensor) -> Tensor:
+        first, last = own + 1, pad(own[..., 1:], (0, 1), value=len(self.string))
+        for index in others:
+            ahead = index.unsqueeze(-2)
+            first, last = ((ahead < place.unsqueeze(-1)).sum(-1) for place in (first, last))
+        total = sum_ranges(entry, first, last)
+        if self.string.ring:
+            start = first[..., :1] - (0 if others else 1)
+            front = sum_ranges(entry, start.new_zeros(start.shape), start)
+            total = total + pad(front, (0, 0, total.shape[-2] - 1, 0))
+        return total

@@ -1,0 +1,121 @@
+"""How the vehicles of a role start: their speeds and gaps at reset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.functional.idm import equilibrium_gap
+from lcc_rl.functional.random import stream_id, uniform
+from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.controllers import Population, stream_name
+
+
+def draw(start: TensorDictBase, name: str, like: Tensor) -> Tensor:
+    """Draw from U[0, 1) for every vehicle of a role, by the seed of its episode."""
+    index = torch.arange(like.shape[-2], device=like.device).unsqueeze(-1)
+    return uniform(start.get(SEED).unsqueeze(-2), 0, stream_id(name) + index)
+
+
+class TimeGapStart:
+    """A gap that grows with the speed: standstill gap + time gap · speed, at the leader's speed.
+
+    Args:
+        standstill_gap: gap when standing [m].
+        time_gap: further time gap; the ALCC paper is silent on it [s].
+        gap_range: the gap is that times a factor drawn evenly from this range by the episode's
+            seed, so that training meets what good driving never does; evaluation takes 1.
+        nominal: take the factor 1, as an evaluation does.
+
+    Raises:
+        ConfigError: if ``standstill_gap`` or the range is not positive, or the time gap negative.
+    """
+
+    def __init__(
+        self,
+        standstill_gap: float = 2.0,
+        time_gap: float = 1.5,
+        gap_range: Sequence[float] = (0.1, 1.5),
+        nominal: bool = False,
+    ) -> None:
+        require_positive("scenario.start", standstill_gap=standstill_gap)
+        if time_gap < 0:
+            raise ConfigError(f"scenario.start: time_gap must not be negative, got {time_gap}")
+        if len(gap_range) != 2 or not 0 < gap_range[0] <= gap_range[1]:
+            raise ConfigError(
+                "scenario.start: gap_range must be two increasing positive factors, got "
+                f"{list(gap_range)}"
+            )
+        self.standstill_gap, self.time_gap = standstill_gap, time_gap
+        self.lowest, self.highest = (1.0, 1.0) if nominal else map(float, gap_range)
+
+    def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
+        uniformly = draw(start, f"{stream_name(role)}.gap_factor", speed)
+        factor = self.lowest + (self.highest - self.lowest) * uniformly
+        return speed, factor * (self.standstill_gap + self.time_gap * speed)
+
+
+class EquilibriumStart:
+    """The gap at which the role's own drivers neither brake nor accelerate, at the leader's speed.
+
+    Args:
+        population: the drivers, for the parameters that they share.
+        cap_time_gap: bounds the gap, see :func:`lcc_rl.functional.idm.equilibrium_gap` [s].
+
+    Raises:
+        ConfigError: if ``cap_time_gap`` is not positive.
+    """
+
+    def __init__(self, population: Population, cap_time_gap: float = 3.0) -> None:
+        require_positive("scenario.start", cap_time_gap=cap_time_gap)
+        self.drivers, self.cap_time_gap = population.constants, cap_time_gap
+
+    def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
+        desired_speed, time_gap = (
+            start.get((role, name)) for name in ("desired_speed", "desired_time_gap")
+        )
+        gap = equilibrium_gap(speed, desired_speed, time_gap, self.drivers, self.cap_time_gap)
+        return speed, gap
+
+
+class HeadwayStart:
+    """A fixed gap at the leader's speed, in training with deviations from both (HCFS).
+
+    Args:
+        headway: h, the gap at equilibrium [m]; the paper is silent on it.
+        gap_spread: largest deviation of a gap from it [m].
+        speed_spread: largest deviation of a speed from the leader's [m/s].
+        nominal: no deviations, as in an evaluation.
+
+    Raises:
+        ConfigError: if a setting is out of range.
+    """
+
+    def __init__(
+        self,
+        headway: float = 5.0,
+        gap_spread: float = 2.0,
+        speed_spread: float = 1.0,
+        nominal: bool = False,
+    ) -> None:
+        require_positive("scenario.start", headway=headway)
+        if not (0 <= gap_spread < headway and speed_spread >= 0):
+            raise ConfigError(
+                f"scenario.start: gap_spread {gap_spread} must lie in [0, {headway}) and "
+                f"speed_spread {speed_spread} must not be negative"
+            )
+        self.headway = headway
+        self.gap_spread, self.speed_spread = (0.0, 0.0) if nominal else (gap_spread, speed_spread)
+
+    def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
+        shift = 2.0 * draw(start, "platoon.gap", speed) - 1.0
+        gap = self.headway + self.gap_spread * shift
+        shift = 2.0 * draw(start, "platoon.speed", speed) - 1.0
+        return (speed + self.speed_spread * shift).clamp(min=0.0), gap

@@ -1,0 +1,189 @@
+"""The string of vehicles: where the roles drive, how vehicles start, and how all of them move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+
+from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.random import stream_id, uniform
+from lcc_rl.functional.string import Motion, advance_string, blocks_of, entries_ahead, take
+from lcc_rl.pieces.base import SEED, Key, StepTransform, next_key
+from lcc_rl.pieces.views import LEADER, VEHICLES
+
+COMMAND = "command"
+LEADER_SPEED = (LEADER, "speed")
+
+
+class Places(StepTransform):
+    """Writes which vehicles have which role, ``(role, "index")``, ``[*batch, n]``, int64.
+
+    Of a string whose places are drawn, for every role and anew in every episode, by its seed;
+    else for the automated vehicles alone. The places are constant within an episode.
+
+    Args:
+        string: the string of vehicles.
+    """
+
+    index: Tensor
+
+    def __init__(self, string: VehicleString) -> None:
+        roles = string.names if string.drawn else tuple({AUTOMATED} & set(string.names))
+        super().__init__([], [], constants=[(role, "index") for role in roles])
+        self.string, self.roles = string, roles
+        self.stream = stream_id("string.places")
+        self.register_buffer("index", torch.arange(len(string)))
+
+    def compute(self) -> tuple[()]:
+        """Return nothing: places are constant within an episode."""
+        return ()
+
+    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        return {
+            (role, "index"): Unbounded(
+                shape=(*batch, self.string.count(role)), dtype=torch.int64, device=device
+            )
+            for role in self.roles
+        }
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        if not self.string.drawn:
+            for role in self.roles:
+                places = torch.tensor(self.string.places(role), device=start.device)
+                start.set((role, "index"), places.expand(*start.batch_size, len(places)).clone())
+            return
+        draw = uniform(start.get(SEED), 0, self.stream + self.index)
+        order, begun = draw.argsort(-1), 0
+        for role in self.roles:
+            count = self.string.count(role)
+            start.set((role, "index"), order[..., begun : begun + count].sort(-1).values)
+            begun += count
+
+
+class Start(Protocol):
+    """How the vehicles of one role start."""
+
+    def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return speed [m/s] and gap [m] of every vehicle of the role, ``[*batch, n, 1]``.
+
+        Args:
+            start: the first moment of the episodes.
+            role: the role.
+            speed: the leader's speed, ``[*batch, n, 1]`` [m/s].
+        """
+
+
+class StringMotion(StepTransform):
+    """Moves all vehicles by their commands (A18): the one place with physics.
+
+    Writes under ``"vehicles"``, ``[*batch, N, 1]``: speed [m/s], gap to the vehicle ahead,
+    bumper to bumper [m], relative_speed v_ahead − v [m/s], the executed acceleration [m/s²], its
+    jerk [m/s³], and the command [m/s²].
+
+    Args:
+        string: the string of vehicles.
+        time_step: duration of a step [s].
+        start: how the vehicles of each role start.
+        circumference: of a ring road [m].
+        vehicle_length: length of every vehicle, of use on a ring road only [m].
+        initial_speed: speed of all vehicles at the start on a ring road, where there is no leader
+            to take it from [m/s].
+
+    Raises:
+        ConfigError: if a role has no start, or the ring is too short for its vehicles.
+    """
+
+    def __init__(
+        self,
+        string: VehicleString,
+        time_step: float,
+        start: Mapping[str, Start],
+        circumference: float | None = None,
+        vehicle_length: float = 5.0,
+        initial_speed: float = 0.0,
+    ) -> None:
+        self.string, self.time_step, self.start = string, time_step, start
+        commands = [next_key((COMMAND, role)) for role in string.names]
+        own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
+        leader = [] if string.ring else [LEADER_SPEED, next_key(LEADER_SPEED)]
+        indices = [(role, "index") for role in string.names] if string.drawn else []
+        super().__init__(
+            [*own, *leader, *commands, *indices],
+            [(VEHICLES, name) for name in (*Motion._fields, COMMAND)],
+            event_shape=(len(string), 1),
+        )
+        self.ring_start: tuple[float, float] | None = None
+        if string.ring:
+            self.ring_start = _ring_start(string, circumference, vehicle_length, initial_speed)
+        elif missing := [role for role in string.names if role not in start]:
+            raise ConfigError(f"scenario.start lacks {', '.join(missing)}: how do they start?")
+        order = [place for role in string.names for place in string.places(role)]
+        self.blocks = blocks_of([order.index(place) for place in range(len(order))])
+
+    def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
+        """Return the motion at the moment reached, and the commands that led there."""
+        leader, reached = (None, None) if self.string.ring else more[:2]
+        parts = more[0 if self.string.ring else 2 :]
+        roles = len(self.string.names)
+        command = self._assemble(parts[:roles], parts[roles:])
+        motion = advance_string(speed, gap, acceleration, command, leader, reached, self.time_step)
+        return (*motion, command)
+
+    def _assemble(self, parts: tuple[Tensor, ...], indices: tuple[Tensor, ...]) -> Tensor:
+        """Return one entry of every vehicle, front to back, from that of every role."""
+        joined = parts[0] if len(parts) == 1 else torch.cat(parts, -2)
+        if indices:
+            order = torch.cat(indices, -1).unsqueeze(-1)
+            return torch.zeros_like(joined).scatter(-2, order.expand_as(joined), joined)
+        return take(joined, self.blocks)
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        shape = (*start.batch_size, len(self.string), 1)
+        if self.ring_start is not None:
+            speed = torch.full(shape, self.ring_start[0], device=start.device)
+            gap = torch.full(shape, self.ring_start[1], device=start.device)
+            relative = torch.zeros_like(speed)
+        else:
+            leader = start.get(LEADER_SPEED)
+            roles = self.string.names
+            placed = [
+                self.start[role](start, role, _spread(leader, self.string.count(role)))
+                for role in roles
+            ]
+            indices = [start.get((role, "index")) for role in roles] if self.string.drawn else []
+            speed, gap = (
+                self._assemble(tuple(part), tuple(indices)) for part in zip(*placed, strict=True)
+            )
+            relative = entries_ahead(leader, speed) - speed
+        still = torch.zeros_like(speed)
+        values = (speed, gap, relative, still, still.clone(), still.clone())
+        for key, value in zip(self.targets, values, strict=True):
+            start.set(key, value.contiguous())
+
+
+def _spread(leader: Tensor, count: int) -> Tensor:
+    return leader.unsqueeze(-2).expand(*leader.shape[:-1], count, 1)
+
+
+def _ring_start(
+    string: VehicleString, circumference: float | None, length: float, speed: float
+) -> tuple[float, float]:
+    """Return speed and gap at which vehicles begin, evenly spread over a ring."""
+    if circumference is None:
+        raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
+    require_positive("scenario", circumference=circumference, vehicle_length=length)
+    gap = circumference / len(string) - length
+    if gap <= 0:
+        raise ConfigError(
+            f"scenario.circumference={circumference} is too short for {len(string)} vehicles of "
+            f"{length} m: it must exceed {len(string) * length} m"
+        )
+    if not speed >= 0:
+        raise ConfigError(f"scenario.initial_speed must not be negative, got {speed}")
+    return speed, gap

@@ -1,0 +1,127 @@
+"""Schemas of the configurations: which keys exist and of which type; values stand in conf/."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+
+@dataclass
+class ScenarioConfig:
+    """A scenario: its clock, its string of vehicles and its pieces."""
+
+    name: str = MISSING
+    horizon: int = MISSING
+    time_step: float = MISSING
+    string: Any = MISSING
+    road: str = MISSING
+    circumference: float | None = None
+    vehicle_length: float = MISSING
+    initial_speed: float = MISSING
+    controllers: dict[str, Any] = field(default_factory=dict)
+    start: dict[str, Any] = field(default_factory=dict)
+    filters: dict[str, Any] = field(default_factory=dict)
+    pieces: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class RewardConfig:
+    """The reward: named terms."""
+
+    terms: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class TrainingConfig:
+    """Length and bookkeeping of a training; the algorithm's own settings are the agent's."""
+
+    episodes: int = MISSING
+    environments: int = MISSING
+    segment: int = MISSING
+    checkpoint_every: int = MISSING
+    keep_every: int | None = None
+    compiled: bool | None = None
+    collector: str = "string"
+    gap_range: list[float] = MISSING
+
+
+@dataclass
+class EvaluationConfig:
+    """Size of an evaluation, and what a row of its table is: an episode or a vehicle."""
+
+    rows: str = MISSING
+    baselines: list[str] = MISSING
+    profiles: int | None = MISSING
+    drivers: int | None = MISSING
+    batch_size: int = MISSING
+    seed: int = MISSING
+    sample_episodes: int = MISSING
+    full_length: bool = False
+
+
+@dataclass
+class StudyConfig:
+    """What every entry point that drives vehicles shares."""
+
+    variant: str = MISSING
+    seed: int = MISSING
+    device: str = MISSING
+    threads: int = MISSING
+    matmul_precision: str = "highest"
+    data: Any = MISSING
+    drivers: Any = MISSING
+    split: Any = MISSING
+    leader: Any = None
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
+    observation: Any = MISSING
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    agent: Any = MISSING
+    gains: Any = None
+    # Drives the automated vehicles once the policy is trained; None: the policy itself.
+    deployed: Any = None
+    # Here, not in TrainConfig, so that one recipe serves every entry point.
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    trust: list[str] = field(default_factory=list)
+
+
+@dataclass
+class TrainConfig(StudyConfig):
+    """``python -m lcc_rl.train``."""
+
+    resume: str | None = None
+    sweep: str | None = None
+    objective: Any = "total_net_energy_kj"
+    policy: str | None = None
+    logger: Any = MISSING
+
+
+@dataclass
+class EvaluateConfig(StudyConfig):
+    """``python -m lcc_rl.evaluate``."""
+
+    policy: str | None = None
+    compare: list[str] = field(default_factory=list)
+
+
+@dataclass
+class PipelineConfig(TrainConfig):
+    """``python -m lcc_rl.pipeline``."""
+
+    calibration: Any = MISSING
+    variants: list[str] = MISSING
+    jobs: int = MISSING
+
+
+def register_schemas() -> None:
+    """Make the schemas known to Hydra; each yaml names its own first in its defaults."""
+    store = ConfigStore.instance()
+    for name, schema in (
+        ("train_schema", TrainConfig),
+        ("evaluate_schema", EvaluateConfig),
+        ("pipeline_schema", PipelineConfig),
+    ):
+        store.store(name=name, node=schema)

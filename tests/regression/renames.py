@@ -1,0 +1,30 @@
+"""How the options of the former release are spelt today."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+OPTIONS = {
+    "variant=barrier": "variant=cbf",
+    "+filter=barrier": "+filter=cbf",
+    "scenario.followers=5": "scenario.string='automated human*5'",
+    "scenario.pieces.memory.sources=[leader.speed,cav.gap]": (
+        "scenario.pieces.memory.sources=[ahead.speed,self.gap]"
+    ),
+    "agent.sampled=true": (
+        "scenario.controllers.automated.desired_speed=null,"
+        "scenario.controllers.automated.time_gap=null"
+    ),
+    "agent.lookahead=oracle": "scenario.controllers.automated.lookahead=oracle",
+    "controller.lookahead=oracle": "deployed.lookahead=oracle",
+    "controller.jerk_bound=10": "deployed.jerk_bound=10",
+}
+
+
+def renamed(overrides: Sequence[str]) -> list[str]:
+    """Return overrides of the former release as those of today."""
+    found: list[str] = []
+    for item in overrides:
+        new = OPTIONS.get(item, item)
+        found += new.split(",") if new.count("scenario.controllers") > 1 else [new]
+    return found
