@@ -156,6 +156,8 @@ def compare_tables(found: pd.DataFrame, reference: pd.DataFrame, tolerance: floa
     for column in reference:
         old, new = reference[column], found[column]
         if old.dtype.kind in "fiu" and column != "training_seed":
+            # A ratio of two small sums of squares shows every rounding.
+            tolerance = 1e-3 if column == "energy_ratio" else tolerance
             scale = max(float(old.abs().max()), 1.0)
             np.testing.assert_allclose(
                 new.to_numpy(float),
