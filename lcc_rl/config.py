@@ -20,6 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from lcc_rl.config_checks import check_ignored, renamed_option
 from lcc_rl.config_errors import check_keys, explain, refused_key
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
@@ -67,6 +68,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(str(explained(error, entry, overrides))) from error
     check_keys(cfg)
+    check_ignored(cfg, overrides)
     return cfg
 
 
@@ -84,6 +86,9 @@ def is_sweep() -> bool:
 
 def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Exception:
     """Return a clearer error for what Hydra refused, naming the nearest option that exists."""
+    renamed = renamed_option(overrides)
+    if renamed is not None:
+        return renamed
     key = refused_key(error)
     hydra = key is not None and key.startswith("hydra.")
     # What exists may depend on the other overrides: leave out only those that fail.

@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config import explained, is_sweep
+from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible
@@ -49,6 +50,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def job(config: DictConfig) -> Any:
             def checked(config: DictConfig) -> Any:
                 check_keys(config)
+                check_ignored(config, HydraConfig.get().overrides.task, is_sweep())
                 return function(config)
 
             if is_sweep():
