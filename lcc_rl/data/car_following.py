@@ -16,8 +16,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.episodes import PLAUSIBLE_SPEED
-from lcc_rl.data.ngsim import Trajectories
 from lcc_rl.data.places import find_leaders
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError, DataError
 
@@ -154,7 +154,7 @@ def extract(
     """Extract episodes of car following.
 
     Args:
-        trajectories: samples in the shape of :class:`lcc_rl.data.ngsim.Trajectories`.
+        trajectories: samples in the shape of :class:`lcc_rl.data.trajectories.Trajectories`.
         criteria: what counts as an episode.
 
     Returns:

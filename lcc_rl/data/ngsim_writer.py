@@ -1,4 +1,4 @@
-"""NGSIM writer room: SI samples become a file in the official 18-column layout."""
+"""Writer of NGSIM files in the official 18-column layout."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def write_ngsim(samples: pd.DataFrame, path: str | Path) -> None:
     Local_X is a lane centre; Global_X and Global_Y are 0 and v_Width 6.4 ft, as fillers.
 
     Args:
-        samples: rows with the columns of :class:`lcc_rl.data.ngsim.Trajectories`, in any order;
-            ``segment`` and ``time_s`` are not needed, and ``space_headway_m`` is taken from the
-            positions where the column is absent.
+        samples: rows with the columns of :class:`lcc_rl.data.trajectories.Trajectories`, in any
+            order; ``segment`` and ``time_s`` are not needed, and ``space_headway_m`` is derived
+            from the positions where the column is absent.
         path: destination; compressed where it ends in ``.gz``.
 
     Raises:

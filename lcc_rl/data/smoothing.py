@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from lcc_rl.data.ngsim import Trajectories
 from lcc_rl.data.places import find_leaders
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError
 

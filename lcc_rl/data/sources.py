@@ -11,7 +11,8 @@ import pandas as pd
 
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import read_episodes
-from lcc_rl.data.ngsim import Trajectories, read_ngsim
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import ConfigError, DataError
 
 

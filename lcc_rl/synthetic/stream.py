@@ -46,7 +46,7 @@ class Stream:
 
     Args:
         samples: one row per vehicle and frame in SI units, with the columns that
-            :func:`lcc_rl.data.ngsim.write_ngsim` needs; time_s as well. Positions are of the
+            :func:`lcc_rl.data.ngsim_writer.write_ngsim` needs; time_s as well. Positions are of the
             front bumper; acceleration is the one that took the vehicle to its speed.
         truth: one row per IDM driver: recording, vehicle, preceding, and its parameters
             desired_speed_mps, time_gap_s, acceleration_mps2, deceleration_mps2, min_gap_m.

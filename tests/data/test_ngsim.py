@@ -19,8 +19,10 @@ from ngsim_text import (
     portal_text,
 )
 
-from lcc_rl.data.ngsim import Trajectories, read_ngsim, write_ngsim
-from lcc_rl.data.ngsim_layouts import BLOCK_BYTES
+from lcc_rl.data import ngsim_blocks
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.ngsim_writer import write_ngsim
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 
 FOOT = 0.3048
@@ -107,23 +109,26 @@ def test_thousands_separators_are_numbers(tmp_path: Path) -> None:
     assert samples["preceding"].tolist() == [1_000_000, 0]
 
 
-def test_files_larger_than_a_block_lose_no_row(tmp_path: Path) -> None:
-    rows = [cells(vehicle, k) for vehicle in range(1, 61) for k in range(700)]
-    text = csv_text(rows)
-    assert len(text) < BLOCK_BYTES
-    text = csv_text(rows + [cells(vehicle, k) for vehicle in range(61, 121) for k in range(700)])
-    assert len(text) > BLOCK_BYTES
-    for content in (text, native_text([line.split(",") for line in text.splitlines()[1:]])):
+def test_files_larger_than_a_block_lose_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ngsim_blocks, "BLOCK_BYTES", 10_000)
+    rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
+    for content in (csv_text(rows), native_text(rows)):
+        assert len(content) > 5 * ngsim_blocks.BLOCK_BYTES
         read_back = read(tmp_path, content)
-        assert read_back.report.rows_kept == 84_000
-        assert read_back.report.segments == read_back.report.vehicles == 120
-        assert read_back.samples["position_m"].iloc[-1] == pytest.approx(6990 * FOOT)
+        assert read_back.report.rows_kept == 840
+        assert read_back.report.segments == read_back.report.vehicles == 12
+        assert read_back.samples["position_m"].iloc[-1] == pytest.approx(690 * FOOT)
 
 
-def test_error_in_a_later_block_names_the_line_of_the_file(tmp_path: Path) -> None:
-    rows = [cells(vehicle, k) for vehicle in range(1, 121) for k in range(700)]
-    rows[80_000] = cells(1, 0, v_Vel="fast")
-    with pytest.raises(DataError, match=r"file\.csv: line 80002, column 'v_Vel' holds 'fast'"):
+def test_error_in_a_later_block_names_the_line_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ngsim_blocks, "BLOCK_BYTES", 10_000)
+    rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
+    rows[800] = cells(1, 0, v_Vel="fast")
+    with pytest.raises(DataError, match=r"file\.csv: line 802, column 'v_Vel' holds 'fast'"):
         read(tmp_path, csv_text(rows))
 
 
