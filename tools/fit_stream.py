@@ -22,8 +22,8 @@ from scipy.optimize import differential_evolution, minimize
 
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
+from lcc_rl.synthetic.lane import Lane
 from lcc_rl.synthetic.stop_and_go import StopAndGo
-from lcc_rl.synthetic.stream import Lane
 
 BOUNDS = {
     "mean_speed_mps": (4.0, 7.0),

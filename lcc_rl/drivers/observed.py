@@ -1,4 +1,4 @@
-"""Calibration room: observed car-following episodes as tensors, longest first."""
+"""Observed car-following episodes as tensors, longest first."""
 
 from __future__ import annotations
 

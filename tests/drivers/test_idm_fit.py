@@ -7,11 +7,13 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.drivers import idm_fit
+from lcc_rl.drivers import speed_error
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.genetic import GeneticSettings
-from lcc_rl.drivers.idm_fit import MODES, SpeedError, fit
+from lcc_rl.drivers.idm_fit import fit
 from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.drivers.parameters import DEFAULT_BOUNDS, MODES
+from lcc_rl.drivers.speed_error import SpeedError
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 
@@ -42,11 +44,11 @@ def reference_error(observed, candidates, constants, names):
 @pytest.mark.parametrize("pieces", ["exact", "padded"])
 def test_error_is_that_of_the_plain_simulation(mode, pieces, monkeypatch, uneven_lengths):
     # The padded pieces are those of the compiled simulation, run here without the compiler.
-    monkeypatch.setattr(idm_fit, "_compiled_advance", lambda: idm_fit._advance)
+    monkeypatch.setattr(speed_error, "_compiled_advance", lambda: speed_error._advance)
     observed = observe(uneven_lengths)
     names = MODES[mode]
-    low = torch.tensor([idm_fit.DEFAULT_BOUNDS[name][0] for name in names]).double()
-    high = torch.tensor([idm_fit.DEFAULT_BOUNDS[name][1] for name in names]).double()
+    low = torch.tensor([DEFAULT_BOUNDS[name][0] for name in names]).double()
+    high = torch.tensor([DEFAULT_BOUNDS[name][1] for name in names]).double()
     share = torch.rand(3, 6, len(names), generator=torch.Generator().manual_seed(1)).double()
     candidates = low + share * (high - low)
     error = SpeedError(observed, IDMConstants(), names, compiled=pieces == "padded")(candidates)
@@ -167,7 +169,7 @@ def test_unfit_episodes_are_dropped_and_counted(make_episodes):
 
 def test_only_the_first_seconds_are_used(uneven_lengths):
     selection = Selection(max_duration_s=15.0)
-    drivers = fit(uneven_lengths, selection=selection, genetic=QUICK).drivers
+    drivers = fit(observe(uneven_lengths, selection), genetic=QUICK).drivers
     assert drivers["samples"].tolist() == [151, 151, 151]
 
 
