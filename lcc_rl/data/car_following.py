@@ -1,4 +1,4 @@
-"""Car-following room: stretches of one vehicle behind another, filtered by stated criteria.
+"""Extraction of car-following episodes from trajectories.
 
 A candidate is a maximal stretch of consecutive frames in which a vehicle names the same preceding
 vehicle and both have a row. Each criterion then removes whole candidates, in a fixed order, and

@@ -1,4 +1,4 @@
-"""Episode room: the one table of car-following episodes that everything downstream reads."""
+"""Table of car-following episodes: schema, reading, writing and validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recording room: tells apart the recordings in which vehicle ids are used again.
+"""Identification of the recordings that NGSIM rows belong to, as vehicle ids are reused.
 
 Within a recording the clock runs 100 ms a frame, so Global_Time − 100·Frame_ID, the time of frame
 0, is the same in every row of it and differs between recordings by minutes. Published clocks are

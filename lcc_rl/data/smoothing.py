@@ -1,4 +1,4 @@
-"""Smoothing room: positions are smoothed; speeds and accelerations follow from them.
+"""Smoothing of trajectories: positions are smoothed, then differentiated.
 
 Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Each class here is
 called with trajectories and returns smoothed ones: per stretch without a missing frame, the

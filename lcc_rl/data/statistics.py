@@ -1,4 +1,4 @@
-"""Statistics room: what the leaders of a set of car-following episodes drive like.
+"""Statistics of speed, acceleration and energy of car-following episodes.
 
 The same definitions hold for real and synthetic episodes. Speed: every sample of every episode.
 Acceleration: forward difference of speed within an episode. Energy: the sum of P·T by A2 over

@@ -1,4 +1,4 @@
-"""File room: every file is written whole or not at all, and says what wrote it."""
+"""Atomic writing and checked reading of parquet tables and tensors."""
 
 from __future__ import annotations
 

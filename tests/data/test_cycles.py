@@ -9,15 +9,9 @@ import torch
 from omegaconf import OmegaConf
 
 from lcc_rl.config import build, load
-from lcc_rl.data.cycles import (
-    RecordLeaders,
-    lively,
-    read_speed_record,
-    resample,
-    shipped_cycles,
-    stretch,
-)
+from lcc_rl.data.cycles import RecordLeaders, lively, stretch
 from lcc_rl.data.profiles import from_records
+from lcc_rl.data.speed_records import read_speed_record, resample, shipped_cycles
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 

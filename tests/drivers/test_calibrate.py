@@ -1,14 +1,13 @@
 """The calibrate command: files, report, and one clear line for whatever is wrong."""
 
 import io
-import os
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import lcc_rl.conf
 import pandas as pd
 import pytest
+from commands import run_command
 from omegaconf import OmegaConf
 from rich.console import Console
 
@@ -154,35 +153,29 @@ def test_device_and_threads_are_prepared():
     assert prepare_torch(cfg).type == "cpu"
 
 
-def command(source, *overrides):
-    paths = [str(source), os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    return subprocess.run(
-        [sys.executable, "-m", "lcc_rl.calibrate", "--config-dir", str(source), *overrides],
-        cwd=source,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+@pytest.fixture
+def command(source, monkeypatch):
+    """Function that runs the command in the folder of the data source."""
+    monkeypatch.chdir(source)
+    return partial(run_command, "lcc_rl.calibrate", "--config-dir", str(source))
 
 
-def test_command_writes_into_the_run_folder(source):
-    quick = "calibration.local_genetic.generations=2"
-    done = command(source, "data=own", "data.path=episodes.parquet", quick, "hydra.run.dir=here")
-    assert done.returncode == 0, done.stderr
+def test_command_writes_into_the_run_folder(source, command):
+    quick = [f"calibration.local_genetic.{name}" for name in ("generations=2", "population=8")]
+    paths = ["data.path=episodes.parquet", "hydra.run.dir=here"]
+    status, out, err = command("data=own", *paths, *quick)
+    assert status == 0, err
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
-    assert "v0 on a bound" in done.stdout
+    assert "v0 on a bound" in out
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [("data.path=/no/such", "/no/such: no such file"), ("calibration=locl", "'locl'")],
 )
-def test_command_ends_bad_input_with_one_line_and_code_two(source, override, message):
-    done = command(source, "data=own", override)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_command_ends_bad_input_with_one_line_and_code_two(command, override, message):
+    status, _, err = command("data=own", override)
+    assert status == 2
+    assert message in err
+    assert err.count("\n") == 1
