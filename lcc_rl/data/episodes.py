@@ -99,21 +99,6 @@ def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
     return frame.astype({**SCHEMA, "recording": str})
 
 
-def split_episodes(frame: pd.DataFrame) -> list[dict[str, NDArray]]:
-    """Split a validated table into one dictionary of arrays per episode, without copying rows.
-
-    Returns:
-        For each episode, in order: every column of the table as an array of shape ``[time]``.
-    """
-    starts = _starts(frame["episode"].to_numpy())
-    stops = [*starts[1:], len(frame)]
-    arrays = {str(name): frame[name].to_numpy() for name in frame.columns}
-    return [
-        {name: values[start:stop] for name, values in arrays.items()}
-        for start, stop in zip(starts, stops, strict=True)
-    ]
-
-
 def _check_columns(frame: pd.DataFrame, source: str) -> None:
     present = [str(name) for name in frame.columns]
     for name in COLUMNS:
@@ -139,19 +124,17 @@ def _checked_numbers(column: pd.Series, source: str) -> pd.Series:
         numbers = pd.to_numeric(column, errors="coerce").astype("float64")
     except (TypeError, ValueError) as error:
         raise DataError(f"{source}: column {name!r} does not hold numbers: {error}") from error
-    wrong = ~np.isfinite(numbers.to_numpy())
-    if wrong.any():
-        shown = column.iloc[int(np.argmax(wrong))]
-        raise _at(source, wrong, name, f"holds {shown!r}; expected a finite number")
+    checks = [(np.isfinite(numbers), "a finite number")]
     if SCHEMA[name].startswith("int"):
         limit = np.iinfo(SCHEMA[name]).max if SCHEMA[name] == "int32" else 2**53
-        wrong = ((numbers != np.rint(numbers)) | (numbers.abs() > limit)).to_numpy()
-        if wrong.any():
-            shown = column.iloc[int(np.argmax(wrong))]
-            raise _at(source, wrong, name, f"holds {shown!r}; expected a whole number")
-    elif (wrong := (numbers.abs() > LARGEST).to_numpy()).any():
-        shown = column.iloc[int(np.argmax(wrong))]
-        raise _at(source, wrong, name, f"holds {shown!r}; expected at most {LARGEST:g}")
+        whole = (numbers == np.rint(numbers)) & (numbers.abs() <= limit)
+        checks.append((whole, "a whole number"))
+    else:
+        checks.append((numbers.abs() <= LARGEST, f"at most {LARGEST:g}"))
+    for valid, expected in checks:
+        if not valid.all():
+            shown = column.iloc[int(np.argmin(valid))]
+            raise _at(source, ~valid, name, f"holds {shown!r}; expected {expected}")
     return numbers
 
 

@@ -84,10 +84,4 @@ class Calibrator:
         report = list(observed.report)
         for mode, part in zip(self.modes, parts, strict=True):
             report += [f"{mode}: {line}" for line in part.report[len(observed.report) :]]
-        return Calibration(
-            drivers=pd.concat([part.drivers for part in parts], ignore_index=True),
-            report=report,
-            constants=parts[0].constants,
-            generations=sum(part.generations for part in parts),
-            evaluations=sum(part.evaluations for part in parts),
-        )
+        return Calibration(pd.concat([part.drivers for part in parts], ignore_index=True), report)

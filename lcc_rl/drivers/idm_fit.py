@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.drivers.genetic import Evolution, GeneticSettings, Progress, minimise
+from lcc_rl.drivers.genetic import GeneticSettings, Progress, minimise
 from lcc_rl.drivers.observed import Observed, observe
 from lcc_rl.drivers.parameters import (
     COLUMNS,
@@ -41,16 +42,10 @@ class Calibration:
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
         report: what was dropped, chosen and found, in plain lines.
-        constants: the constants that all drivers share in local mode.
-        generations: generations that the genetic algorithm ran.
-        evaluations: simulated trajectories per driver.
     """
 
     drivers: pd.DataFrame
     report: list[str]
-    constants: IDMConstants
-    generations: int
-    evaluations: int
 
 
 def fit(
@@ -131,26 +126,17 @@ class _Search:
         error = SpeedError(self.observed, constants, names, self.compiled)
         lower, upper = self.box(names)
         found = minimise(error, lower, upper, exact.count, self.generator(), genetic, self.progress)
-        drivers = _table(exact, found, constants, mode, self.limits)
-        report += _findings(drivers, self.limits)
-        return Calibration(drivers, report, constants, found.generations, found.evaluations)
+        drivers = _table(exact, found.best, constants, mode, self.limits)
+        return Calibration(drivers, report + _findings(drivers, self.limits))
 
     def chosen_constants(self, constants: IDMConstants) -> IDMConstants:
         """Choose (a, b, s0): an outer search whose objective is the mean error of local fits."""
         lower, upper = self.box(SHARED)
-        generator = self.generator()
-        found = minimise(
-            lambda candidates: self.mean_error(candidates, constants),
-            lower,
-            upper,
-            1,
-            generator,
-            OUTER,
-            self.progress,
-        )
+        error = partial(self.mean_error, constants)
+        found = minimise(error, lower, upper, 1, self.generator(), OUTER, self.progress)
         return replace(constants, **dict(zip(SHARED, found.best[0].tolist(), strict=True)))
 
-    def mean_error(self, candidates: Tensor, constants: IDMConstants) -> Tensor:
+    def mean_error(self, constants: IDMConstants, candidates: Tensor) -> Tensor:
         """Mean error of local fits, ``[1, candidates]`` of constants ``[1, candidates, 3]``."""
         drivers, count = self.observed.count, candidates.shape[1]
 
@@ -178,14 +164,14 @@ class _Search:
 
 def _table(
     observed: Observed,
-    found: Evolution,
+    best: Tensor,
     constants: IDMConstants,
     mode: str,
     limits: Limits,
 ) -> pd.DataFrame:
     """Fitted parameters and errors, one row per driver."""
     names = MODES[mode]
-    best = found.best.to("cpu", torch.float64)
+    best = best.to("cpu", torch.float64)
     exact = SpeedError(observed.to("cpu", torch.float64), constants, names)
     columns: dict[str, Any] = {str(name): values for name, values in observed.identity.items()}
     fitted = dict(zip(names, best.numpy().T, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -68,13 +67,15 @@ class DriverPopulation:
 
     def select(self, index: Tensor) -> DriverPopulation:
         """Return the drivers at ``index`` ``[chosen]``, in that order, repetitions included."""
-        index = index.to(self.desired_speed.device)
-        ids = tuple(self.ids[place] for place in index.tolist())
-        return self._mapped(lambda values: values[index], ids)
-
-    def to(self, device: torch.device | str) -> DriverPopulation:
-        """Return the same drivers on another device."""
-        return self._mapped(lambda values: values.to(device), self.ids)
+        constants = vars(self.constants).items()
+        own = {name: value[index] for name, value in constants if isinstance(value, Tensor)}
+        return DriverPopulation(
+            self.desired_speed[index],
+            self.time_gap[index],
+            self.constants.with_(**own),
+            tuple(self.ids[place] for place in index.tolist()),
+            self.at_bound[index],
+        )
 
     def summary(self) -> dict[str, float]:
         """Mean, standard deviation and correlation of (v0, T), and the share of v0 at a bound."""
@@ -100,18 +101,6 @@ class DriverPopulation:
             name: torch.as_tensor(values, dtype=torch.float64, device=device).expand(len(self))
             for name, values in own.items()
         }
-
-    def _mapped(self, change: Callable[[Tensor], Tensor], ids: tuple[str, ...]) -> DriverPopulation:
-        """Apply a function to every tensor ``[drivers]``."""
-        constants = vars(self.constants).items()
-        own = {name: change(value) for name, value in constants if isinstance(value, Tensor)}
-        return DriverPopulation(
-            change(self.desired_speed),
-            change(self.time_gap),
-            self.constants.with_(**own),
-            ids,
-            change(self.at_bound),
-        )
 
 
 def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.DataFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -13,7 +13,6 @@ from torch import Tensor
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import DriverPopulation
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
@@ -43,66 +42,35 @@ class Stream:
     truth: pd.DataFrame
 
 
-@dataclass(frozen=True)
-class Lane:
-    """One lane on which platoons are recorded one after another.
+def drive_platoons(
+    leader: StopAndGo,
+    drivers: DriverPopulation,
+    vehicles: int,
+    seen: NDArray[np.int64],
+    noise: float,
+    generator: np.random.Generator,
+) -> Stream:
+    """Simulate platoons that drive one after another on one lane.
 
     Args:
-        platoons: number of platoons.
-        vehicles: vehicles per platoon, the stochastic leader included.
-        duration_s: range of the uniformly distributed time for which a platoon is recorded [s].
-        leader: the stochastic leader.
-        noise: the executed acceleration of a driver is a(1 + ξ), ξ ~ U(0, noise) (A18).
-
-    Raises:
-        ConfigError: if an argument is out of range, naming it.
+        leader: stochastic leader of every platoon.
+        drivers: population from which the followers are drawn.
+        vehicles: vehicles per platoon, the leader included.
+        seen: recorded steps of every platoon ``[platoons]``.
+        noise: relative noise of the drivers' acceleration (A18).
+        generator: source of all randomness.
     """
-
-    platoons: int = 30
-    vehicles: int = 4
-    duration_s: tuple[float, float] = (60.0, 90.0)
-    leader: StopAndGo = field(default_factory=StopAndGo)
-    noise: float = 0.05
-
-    def __post_init__(self) -> None:
-        at_least("platoons", self.platoons, 1)
-        at_least("vehicles", self.vehicles, 2)
-        try:
-            low, high = (float(entry) for entry in self.duration_s)
-        except (TypeError, ValueError):
-            raise ConfigError(
-                f"stream: 'duration_s' must be two numbers, got {self.duration_s!r}"
-            ) from None
-        if not 1.0 <= low <= high < float("inf"):
-            raise ConfigError(
-                f"stream: 'duration_s' must be a range from 1 s up, got {low}, {high}"
-            )
-        if not isinstance(self.noise, (int, float)) or not 0.0 <= self.noise < 1.0:
-            raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise!r}")
-
-    def drive(self, drivers: DriverPopulation, name: str, generator: np.random.Generator) -> Stream:
-        """Drive one recording.
-
-        Args:
-            drivers: population to draw from.
-            name: name of the recording.
-            generator: source of all randomness.
-
-        Returns:
-            The recording; its vehicles count from 1, platoon by platoon, front to back.
-        """
-        warm_up = round(WARM_UP_S / FRAME)
-        low, high = (round(value / FRAME) for value in self.duration_s)
-        seen = generator.integers(low, high + 1, self.platoons)
-        steps = warm_up + int(seen.max())
-        ahead, level = self.leader.drive(self.platoons, steps, FRAME, generator)
-        shape = (self.vehicles - 1, self.platoons)
-        ranks = [drivers.select(row) for row in draw_drivers(drivers, level, shape, generator)]
-        xi = torch.from_numpy(generator.uniform(0.0, self.noise, (steps, *shape)))
-        speed, gap = follow(torch.from_numpy(ahead), ranks, xi)
-        length = _lengths((self.vehicles, self.platoons), generator)
-        samples = _samples(speed, _positions(speed, gap, length), length, warm_up, seen)
-        return Stream(samples.assign(recording=name), _truth(ranks).assign(recording=name))
+    warm_up = round(WARM_UP_S / FRAME)
+    steps = warm_up + int(seen.max())
+    ahead, level = leader.drive(len(seen), steps, FRAME, generator)
+    shape = (vehicles - 1, len(seen))
+    ranks = [drivers.select(row) for row in draw_drivers(drivers, level, shape, generator)]
+    xi = torch.from_numpy(generator.uniform(0.0, noise, (steps, *shape)))
+    speed, gap = follow(torch.from_numpy(ahead), ranks, xi)
+    mean, spread, shortest, longest = LENGTHS_M
+    length = generator.normal(mean, spread, (vehicles, len(seen))).clip(shortest, longest)
+    samples = _samples(speed, _positions(speed, gap, length), length, warm_up, seen)
+    return Stream(samples, _truth(ranks))
 
 
 def draw_drivers(
@@ -162,12 +130,6 @@ def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _lengths(shape: tuple[int, int], generator: np.random.Generator) -> Array:
-    """Lengths of automobiles [m]."""
-    mean, spread, shortest, longest = LENGTHS_M
-    return np.clip(generator.normal(mean, spread, shape), shortest, longest)
-
-
 def _positions(speed: Array, gap: Array, length: Array) -> Array:
     """Front bumpers ``[time, vehicles, platoons]`` [m]; the last vehicle starts at its length."""
     step = 0.5 * FRAME * (speed[1:, 0] + speed[:-1, 0])
@@ -186,9 +148,7 @@ def _samples(
 ) -> pd.DataFrame:
     """Rows of the recorded part; platoon after platoon along the time of the recording."""
     vehicles, platoons = length.shape
-    elapsed = np.arange(warm_up, len(speed))
-    kept = elapsed[:, None] < warm_up + seen
-    time, platoon = np.nonzero(kept)
+    time, platoon = np.nonzero(np.arange(len(speed) - warm_up)[:, None] < seen)
     start = np.concatenate([[0], np.cumsum(seen + round(PAUSE_S / FRAME))[:-1]])
     row = time + warm_up
     entry = position[warm_up, -1] - length[-1]
@@ -212,9 +172,3 @@ def _samples(
     ]
     samples = pd.concat(parts).sort_values(["vehicle", "frame"], ignore_index=True)
     return samples.assign(time_s=samples["frame"] * FRAME)
-
-
-def at_least(name: str, value: object, least: int) -> None:
-    """Raise a ConfigError where a setting is not a whole number of at least ``least``."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ConfigError(f"stream: {name!r} must be a whole number from {least} up, got {value!r}")

@@ -19,9 +19,11 @@ import pandas as pd
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
+from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
+from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
-from lcc_rl.synthetic.lane import Lane, Stream, at_least
+from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
@@ -38,9 +40,9 @@ class StreamSource:
         recordings: number of recordings; their leaders, drivers and vehicle ids are independent.
         platoons: platoons per recording.
         vehicles: vehicles per platoon, the stochastic leader included.
-        duration_s: range of the time for which a platoon is recorded [s].
+        duration_s: range of the uniformly distributed time for which a platoon is recorded [s].
         seed: seed of all randomness; the same seed gives the same file, byte for byte.
-        noise: relative noise of the drivers' acceleration, see :class:`Lane`.
+        noise: the executed acceleration of a driver is a(1 + ξ), ξ ~ U(0, noise) (A18).
         leader: the stochastic leader; by default the one fitted to I-80.
         drivers: the population; by default the shipped I-80 drivers.
         criteria: what counts as car following; by default that of the real files.
@@ -63,31 +65,50 @@ class StreamSource:
     keep: str | None = None
 
     def __post_init__(self) -> None:
-        at_least("recordings", self.recordings, 1)
-        at_least("seed", self.seed, 0)
-        self._lane()
+        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2), ("seed", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+                raise ConfigError(
+                    f"stream: {name!r} must be a whole number from {least} up, got {value!r}"
+                )
+        try:
+            low, high = map(float, self.duration_s)
+        except (TypeError, ValueError):
+            low = high = float("nan")
+        if not 1.0 <= low <= high < float("inf"):
+            raise ConfigError(
+                "stream: 'duration_s' must be two numbers, a range from 1 s up, "
+                f"got {self.duration_s!r}"
+            )
+        if not isinstance(self.noise, (int, float)) or not 0.0 <= self.noise < 1.0:
+            raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise!r}")
 
     def generate(self) -> Stream:
-        """Drive all recordings.
+        """Simulate all recordings.
 
         Raises:
             DataError: if the shipped drivers cannot be read.
         """
-        lane, drivers = self._lane(), self.drivers or bootstrap()
         made = [
-            lane.drive(drivers, recording_name(index), np.random.default_rng([self.seed, index]))
+            self.drive(recording_name(index), np.random.default_rng([self.seed, index]))
             for index in range(self.recordings)
         ]
         samples = pd.concat([one.samples for one in made], ignore_index=True)
         return Stream(samples, pd.concat([one.truth for one in made], ignore_index=True))
 
+    def drive(self, name: str, generator: np.random.Generator) -> Stream:
+        """Simulate one recording; vehicle ids count from 1, platoon by platoon, front to back."""
+        low, high = (round(value / FRAME) for value in self.duration_s)
+        seen = generator.integers(low, high + 1, self.platoons)
+        leader, drivers = self.leader or StopAndGo(), self.drivers or bootstrap()
+        made = drive_platoons(leader, drivers, self.vehicles, seen, self.noise, generator)
+        return Stream(made.samples.assign(recording=name), made.truth.assign(recording=name))
+
     def write(self, path: str | Path) -> Stream:
-        """Drive all recordings and write them in the official NGSIM layout.
+        """Generate the stream and write it in the official NGSIM layout.
 
-        The truth is written beside the file, ``stream.csv`` getting ``stream_truth.parquet``.
-
-        Returns:
-            What was written.
+        The parameters of the drivers are written beside the file: ``stream_truth.parquet`` for
+        ``stream.csv``.
 
         Raises:
             DataError: if the shipped drivers cannot be read.
@@ -113,17 +134,13 @@ class StreamSource:
         line = f"synthetic stream: {size} vehicles, seed {self.seed}"
         return replace(loaded, report=[line, *loaded.report])
 
-    def _lane(self) -> Lane:
-        leader = self.leader or StopAndGo()
-        return Lane(self.platoons, self.vehicles, self.duration_s, leader, self.noise)
-
 
 def truth_path(path: str | Path) -> Path:
-    """Where the ground truth of a stream file lies."""
+    """Path of the true parameters of a stream file's drivers."""
     path = Path(path)
     return path.with_name(f"{path.name.removesuffix('.gz').removesuffix('.csv')}_truth.parquet")
 
 
 def recording_name(index: int) -> str:
-    """Name of a recording as the reader gives it: its start, an hour after the one before."""
+    """Name of a recording as the reader gives it: its start, one hour apart."""
     return (FIRST_START + timedelta(hours=index)).strftime("%Y-%m-%dT%H:%M:%SZ")

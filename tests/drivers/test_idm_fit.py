@@ -94,7 +94,7 @@ def test_constants_are_chosen_by_the_same_objective(make_episodes):
     given = fit(episodes)
     chosen = fit(episodes, choose_constants=True)
     assert chosen.drivers["rmspe"].mean() < 0.5 * given.drivers["rmspe"].mean()
-    assert chosen.constants.acceleration == chosen.drivers["acceleration_mps2"][0]
+    assert chosen.drivers["acceleration_mps2"].nunique() == 1
     assert any("constants chosen" in line for line in chosen.report)
 
 

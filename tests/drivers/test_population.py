@@ -63,7 +63,6 @@ def test_global_population_has_constants_of_its_own():
         population.constants.min_gap[place].item() for place in (3, 3, 7)
     ]
     assert chosen.ids == tuple(population.ids[place] for place in (3, 3, 7))
-    assert chosen.to("cpu").constants.deceleration.shape == (3,)
 
 
 def test_draws_follow_the_seed_and_keep_pairs_together():
