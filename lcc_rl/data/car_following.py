@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Criteria:
-    """What counts as an episode of car following.
+    """Criteria of a car-following episode.
 
     Args:
         min_duration_s: shortest episode [s].
@@ -36,8 +36,8 @@ class Criteria:
         min_gap_m: smallest gap at any time [m], bumper to bumper; None for no limit.
         max_gap_m: largest gap at any time [m], beyond which a driver does not follow; None for no
             limit.
-        passenger_cars_only: both vehicles are of class 2 throughout. Where the class of every
-            vehicle is unknown there is nothing to filter on: all stay and the report says so.
+        passenger_cars_only: both vehicles are of class 2 throughout. Where no vehicle has a class
+            this criterion is skipped, with a note in the report.
         lane_changes: both vehicles share one lane throughout. ``split`` cuts a candidate where
             they do not and judges the parts; ``reject`` removes a candidate with any lane change.
 
@@ -62,8 +62,13 @@ class Criteria:
                 f"criteria: 'min_duration_s' must be at least {FRAME:g} s, two samples, got "
                 f"{self.min_duration_s}"
             )
-        _ordered("min_duration_s", self.min_duration_s, "max_duration_s", self.max_duration_s)
-        _ordered("min_gap_m", self.min_gap_m, "max_gap_m", self.max_gap_m)
+        for quantity in ("duration_s", "gap_m"):
+            low, high = (getattr(self, f"{end}_{quantity}") for end in ("min", "max"))
+            if low is not None and high is not None and not low <= high:
+                raise ConfigError(
+                    f"criteria: 'min_{quantity}' ({low}) must not be above "
+                    f"'max_{quantity}' ({high})"
+                )
         if self.lane_changes not in LANE_CHANGES:
             raise ConfigError(
                 f"criteria: 'lane_changes' must be one of {', '.join(LANE_CHANGES)}, got "
@@ -71,16 +76,9 @@ class Criteria:
             )
 
 
-def _ordered(low_name: str, low: float | None, high_name: str, high: float | None) -> None:
-    if low is not None and high is not None and not low <= high:
-        raise ConfigError(
-            f"criteria: {low_name!r} ({low}) must not be above {high_name!r} ({high})"
-        )
-
-
 @dataclass
 class ExtractionReport:
-    """What the extraction kept and why it removed the rest.
+    """Counts of what the extraction kept and removed.
 
     Args:
         candidates: stretches of one vehicle behind another.
@@ -89,7 +87,7 @@ class ExtractionReport:
         rows: samples in the episodes.
         unseen: samples that name a preceding vehicle which has no row in that frame.
         other_lane: samples that name a preceding vehicle on another lane, left out by ``split``.
-        notes: anything else worth a line.
+        notes: further remarks, one a line.
     """
 
     candidates: int = 0
@@ -171,11 +169,9 @@ def extract(
     pairs = _pairs(samples, criteria, report)
     keep = np.ones(len(pairs.starts), dtype=bool)
     for name, passes in _criteria(samples, pairs, criteria, report):
-        left = keep & passes
-        report.removed[name] = int(keep.sum() - left.sum())
-        keep = left
+        report.removed[name] = int((keep & ~passes).sum())
+        keep &= passes
         if not keep.any():
-            report.rows = 0
             raise DataError(f"no episode is left after the criterion {name!r}:\n{report}")
     episodes = _episodes(samples, pairs, keep)
     report.kept, report.rows = int(keep.sum()), len(episodes)
@@ -237,15 +233,10 @@ def _criteria(
         yield "lane_changes: reject", one_lane & pairs.always(own == lane[pairs.leader])
     # Half a frame of slack: durations are sums of inexact tenths.
     duration = (pairs.lengths - 1) * FRAME
-    yield (
-        f"min_duration_s: {criteria.min_duration_s:g}",
-        duration > criteria.min_duration_s - FRAME / 2,
-    )
-    if criteria.max_duration_s is not None:
-        yield (
-            f"max_duration_s: {criteria.max_duration_s:g}",
-            duration < criteria.max_duration_s + FRAME / 2,
-        )
+    shortest, longest = criteria.min_duration_s, criteria.max_duration_s
+    yield f"min_duration_s: {shortest:g}", duration > shortest - FRAME / 2
+    if longest is not None:
+        yield f"max_duration_s: {longest:g}", duration < longest + FRAME / 2
     if criteria.passenger_cars_only:
         yield from _class_criterion(samples["vehicle_class"].to_numpy(), pairs, report)
     speed = samples["speed_mps"].to_numpy()

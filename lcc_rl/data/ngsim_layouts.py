@@ -9,39 +9,16 @@ from difflib import get_close_matches
 
 from lcc_rl.errors import DataError
 
-OFFICIAL = (
-    "Vehicle_ID",
-    "Frame_ID",
-    "Total_Frames",
-    "Global_Time",
-    "Local_X",
-    "Local_Y",
-    "Global_X",
-    "Global_Y",
-    "v_Length",
-    "v_Width",
-    "v_Class",
-    "v_Vel",
-    "v_Acc",
-    "Lane_ID",
-    "Preceding",
-    "Following",
-    "Space_Headway",
-    "Time_Headway",
+HEADER = (
+    "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,"
+    "v_Width,v_Class,v_Vel,v_Acc,Lane_ID,Preceding,Following,Space_Headway,Time_Headway"
 )
-NEEDED = (
-    "Vehicle_ID",
-    "Frame_ID",
-    "Local_Y",
-    "v_Length",
-    "v_Class",
-    "v_Vel",
-    "v_Acc",
-    "Lane_ID",
-    "Preceding",
-)
-OPTIONAL = ("Global_Time", "Space_Headway", "Location")
-# Other spellings met in the documents of the four sites, already folded.
+REQUIRED = "Vehicle_ID,Frame_ID,Local_Y,v_Length,v_Class,v_Vel,v_Acc,Lane_ID,Preceding"
+OPTIONAL = "Global_Time,Space_Headway,Location"
+OFFICIAL = HEADER.split(",")
+NEEDED = REQUIRED.split(",")
+KNOWN = NEEDED + OPTIONAL.split(",")
+# Other spellings in the documents of the four sites, in lower case without separators.
 ALIASES = {
     "spacehdwy": "Space_Headway",
     "spacing": "Space_Headway",
@@ -57,7 +34,7 @@ ALIASES = {
 
 @dataclass(frozen=True)
 class Layout:
-    """How one file is laid out.
+    """Layout of one file.
 
     Args:
         width: number of columns of a row.
@@ -73,7 +50,7 @@ class Layout:
 
 
 def detect_layout(name: str, lines: bytes) -> tuple[Layout, bytes]:
-    """Tell the layout from the first line; returns the lines that hold rows."""
+    """Detect the layout from the first line; returns it and the lines that hold rows."""
     first, _, rest = lines.partition(b"\n")
     try:
         text = first.decode("utf-8")
@@ -84,7 +61,10 @@ def detect_layout(name: str, lines: bytes) -> tuple[Layout, bytes]:
     if "\0" in text:
         raise DataError(f"{name}: is a binary file; expected an NGSIM text table, plain or .gz")
     spaced = "," not in text
-    cells = text.split() if spaced else [cell.strip() for cell in _split_commas(name, text)]
+    try:
+        cells = text.split() if spaced else [cell.strip() for cell in next(csv.reader([text]))]
+    except csv.Error as error:
+        raise DataError(f"{name}: the first line is not a CSV header: {error}") from error
     if not cells or not _is_number(cells[0]):
         return Layout(len(cells), _places(name, cells), header=True, spaced=spaced), rest
     if len(cells) != len(OFFICIAL):
@@ -92,20 +72,13 @@ def detect_layout(name: str, lines: bytes) -> tuple[Layout, bytes]:
             f"{name}: the first line has {len(cells)} columns and no header; expected the "
             f"{len(OFFICIAL)} columns of the native layout"
         )
-    places = {column: place for place, column in enumerate(OFFICIAL) if column in NEEDED + OPTIONAL}
+    places = {column: place for place, column in enumerate(OFFICIAL) if column in KNOWN}
     return Layout(len(OFFICIAL), places, header=False, spaced=spaced), lines
-
-
-def _split_commas(name: str, line: str) -> list[str]:
-    try:
-        return next(csv.reader([line]))
-    except csv.Error as error:
-        raise DataError(f"{name}: the first line is not a CSV header: {error}") from error
 
 
 def _places(name: str, header: list[str]) -> dict[str, int]:
     """Where the known columns are in a header, whatever its letter case and separators."""
-    known = {_folded(column): column for column in NEEDED + OPTIONAL} | ALIASES
+    known = {_folded(column): column for column in KNOWN} | ALIASES
     places: dict[str, int] = {}
     for place, cell in enumerate(header):
         column = known.get(_folded(cell))
@@ -116,16 +89,12 @@ def _places(name: str, header: list[str]) -> dict[str, int]:
         places[column] = place
     for column in NEEDED:
         if column not in places:
-            raise DataError(_missing_message(name, column, header))
+            folded = {_folded(cell): cell for cell in header}
+            near = get_close_matches(_folded(column), folded, n=1)
+            hint = f"; the nearest is {folded[near[0]]!r}" if near else ""
+            shown = ", ".join(header[:30])[:400]
+            raise DataError(f"{name}: the header has no column {column!r}{hint}. It has: {shown}")
     return places
-
-
-def _missing_message(name: str, column: str, header: list[str]) -> str:
-    folded = {_folded(cell): cell for cell in header}
-    near = get_close_matches(_folded(column), folded, n=1)
-    hint = f"; the nearest is {folded[near[0]]!r}" if near else ""
-    shown = ", ".join(header[:30])[:400]
-    return f"{name}: the header has no column {column!r}{hint}. It has: {shown}"
 
 
 def _folded(cell: str) -> str:

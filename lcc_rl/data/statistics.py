@@ -18,7 +18,7 @@ from lcc_rl.functional.power import motor_power
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 WINDOW_S = 30.0
 UNITS = {"speed": "m/s", "acceleration": "m/s²", "energy": "kJ"}
-# What is compared beside the quantiles; the mean of acceleration is zero but for end effects.
+# Compared beside the quantiles; the mean of acceleration is close to zero.
 LEVEL = {"speed": "mean", "acceleration": "std", "energy": "mean"}
 ROLES = ("leader", "follower")
 
@@ -85,10 +85,10 @@ def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataF
     """
     rows = []
     for quantity, unit in UNITS.items():
-        span = _cell(reference, quantity, "q95") - _cell(reference, quantity, "q05")
+        first, second = reference.loc[quantity], other.loc[quantity]
         for statistic in (LEVEL[quantity], *map(_label, QUANTILES)):
-            one, two = (_cell(table, quantity, statistic) for table in (reference, other))
-            scale = one if statistic == LEVEL[quantity] else span
+            one, two = float(first[statistic]), float(second[statistic])
+            scale = one if statistic == LEVEL[quantity] else float(first["q95"] - first["q05"])
             deviation = (two - one) / scale if scale else np.nan
             rows.append((quantity, statistic, unit, one, two, deviation))
     columns = ["quantity", "statistic", "unit", "reference", "other", "deviation"]
@@ -126,11 +126,6 @@ def _summary(values: NDArray[np.float64]) -> dict[str, float]:
         return {"count": 0, **dict.fromkeys(("mean", "std", *map(_label, QUANTILES)), np.nan)}
     quantiles = zip(map(_label, QUANTILES), np.quantile(values, QUANTILES), strict=True)
     return {"count": len(values), "mean": values.mean(), "std": values.std(), **dict(quantiles)}
-
-
-def _cell(table: pd.DataFrame, quantity: str, statistic: str) -> float:
-    """One number of a table of statistics."""
-    return float(table[statistic].to_dict()[quantity])
 
 
 def _label(quantile: float) -> str:

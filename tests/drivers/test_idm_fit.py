@@ -12,7 +12,7 @@ from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.idm_fit import fit
 from lcc_rl.drivers.observed import Selection, observe
-from lcc_rl.drivers.parameters import DEFAULT_BOUNDS, MODES
+from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, MODES
 from lcc_rl.drivers.speed_error import SpeedError
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
@@ -104,22 +104,10 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
     assert drivers["follower_id"].tolist() == [100, 101, 102]
     assert drivers["samples"].tolist() == [238, 401, 315]
     assert drivers.columns.tolist() == [
-        "episode",
-        "recording",
-        "follower_id",
-        "leader_id",
-        "desired_speed_mps",
-        "time_gap_s",
-        "acceleration_mps2",
-        "deceleration_mps2",
-        "min_gap_m",
-        "rmspe",
-        "samples",
-        "desired_speed_at_bound",
-        "time_gap_at_bound",
-        "acceleration_at_bound",
-        "deceleration_at_bound",
-        "min_gap_at_bound",
+        *("episode", "recording", "follower_id", "leader_id"),
+        *COLUMNS.values(),
+        *("rmspe", "samples"),
+        *(f"{name}_at_bound" for name in COLUMNS),
         "mode",
     ]
 
