@@ -136,8 +136,7 @@ def fetch(portal: Portal, output: Path, page_rows: int = PAGE_ROWS) -> int:
         The number of rows downloaded.
 
     Raises:
-        FetchError: if the portal does not answer, answers with anything but the table, or the
-            number of rows is not the one it counts.
+        FetchError: if the portal does not deliver the table, with the rows that it counts.
     """
     partial = output.with_name(f".{output.name}.part")
     state_file = output.with_name(f".{output.name}.state")

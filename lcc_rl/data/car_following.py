@@ -119,7 +119,7 @@ class ExtractionReport:
 
 @dataclass
 class _Pairs:
-    """Samples of followers that see their leader, and the candidates they form.
+    """Samples of followers whose leader has a row in the frame, grouped into candidates.
 
     Args:
         follower, leader: rows of the samples table, one entry per sample of a candidate.
@@ -132,14 +132,6 @@ class _Pairs:
     starts: NDArray[np.intp]
     lengths: NDArray[np.intp]
     gap: NDArray[np.float32]
-
-    def least(self, values: NDArray) -> NDArray:
-        """Smallest value of each candidate."""
-        return np.minimum.reduceat(values, self.starts)
-
-    def largest(self, values: NDArray) -> NDArray:
-        """Largest value of each candidate."""
-        return np.maximum.reduceat(values, self.starts)
 
     def always(self, holds: Mask) -> Mask:
         """Candidates in which a condition holds throughout."""
@@ -228,9 +220,9 @@ def _criteria(
     """Name of each criterion and which candidates pass it, in the order of application."""
     if criteria.lane_changes == "reject":
         lane = samples["lane"].to_numpy()
-        own = lane[pairs.follower]
-        one_lane = pairs.least(own) == pairs.largest(own)
-        yield "lane_changes: reject", one_lane & pairs.always(own == lane[pairs.leader])
+        first = np.repeat(lane[pairs.follower[pairs.starts]], pairs.lengths)
+        one_lane = (lane[pairs.follower] == first) & (lane[pairs.leader] == first)
+        yield "lane_changes: reject", pairs.always(one_lane)
     # Half a frame of slack: durations are sums of inexact tenths.
     duration = (pairs.lengths - 1) * FRAME
     shortest, longest = criteria.min_duration_s, criteria.max_duration_s
@@ -238,28 +230,23 @@ def _criteria(
     if longest is not None:
         yield f"max_duration_s: {longest:g}", duration < longest + FRAME / 2
     if criteria.passenger_cars_only:
-        yield from _class_criterion(samples["vehicle_class"].to_numpy(), pairs, report)
+        kind = samples["vehicle_class"].to_numpy()
+        if kind.any():
+            car = kind == PASSENGER_CAR
+            yield "passenger_cars_only", pairs.always(car[pairs.follower] & car[pairs.leader])
+        else:
+            report.notes.append(
+                "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
+                "there is nothing to filter on and every vehicle stays"
+            )
     speed = samples["speed_mps"].to_numpy()
     plausible = (speed >= 0) & (speed <= PLAUSIBLE_SPEED)
     name = f"speeds of 0 to {PLAUSIBLE_SPEED:g} m/s"
     yield name, pairs.always(plausible[pairs.follower] & plausible[pairs.leader])
     if criteria.min_gap_m is not None:
-        yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.least(pairs.gap) >= criteria.min_gap_m
+        yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.always(pairs.gap >= criteria.min_gap_m)
     if criteria.max_gap_m is not None:
-        yield f"max_gap_m: {criteria.max_gap_m:g}", pairs.largest(pairs.gap) <= criteria.max_gap_m
-
-
-def _class_criterion(
-    kind: NDArray[np.int8], pairs: _Pairs, report: ExtractionReport
-) -> Iterator[tuple[str, Mask]]:
-    if not kind.any():
-        report.notes.append(
-            "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so there "
-            "is nothing to filter on and every vehicle stays"
-        )
-        return
-    car = kind == PASSENGER_CAR
-    yield "passenger_cars_only", pairs.always(car[pairs.follower] & car[pairs.leader])
+        yield f"max_gap_m: {criteria.max_gap_m:g}", pairs.always(pairs.gap <= criteria.max_gap_m)
 
 
 def _episodes(samples: pd.DataFrame, pairs: _Pairs, keep: Mask) -> pd.DataFrame:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -128,7 +129,7 @@ def _checked_numbers(column: pd.Series, source: str) -> pd.Series:
         numbers = pd.to_numeric(column, errors="coerce").astype("float64")
     except (TypeError, ValueError) as error:
         raise DataError(f"{source}: column {name!r} does not hold numbers: {error}") from error
-    checks = [(np.isfinite(numbers), "a finite number")]
+    checks: list[tuple[Any, str]] = [(np.isfinite(numbers), "a finite number")]
     if SCHEMA[name].startswith("int"):
         limit = np.iinfo(SCHEMA[name]).max if SCHEMA[name] == "int32" else 2**53
         whole = (numbers == np.rint(numbers)) & (numbers.abs() <= limit)

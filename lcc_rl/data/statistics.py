@@ -85,10 +85,10 @@ def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataF
     """
     rows = []
     for quantity, unit in UNITS.items():
-        first, second = reference.loc[quantity], other.loc[quantity]
+        first, second = (table.loc[quantity].to_dict() for table in (reference, other))
         for statistic in (LEVEL[quantity], *map(_label, QUANTILES)):
-            one, two = float(first[statistic]), float(second[statistic])
-            scale = one if statistic == LEVEL[quantity] else float(first["q95"] - first["q05"])
+            one, two = first[statistic], second[statistic]
+            scale = one if statistic == LEVEL[quantity] else first["q95"] - first["q05"]
             deviation = (two - one) / scale if scale else np.nan
             rows.append((quantity, statistic, unit, one, two, deviation))
     columns = ["quantity", "statistic", "unit", "reference", "other", "deviation"]
