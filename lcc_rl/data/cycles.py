@@ -144,7 +144,7 @@ class RecordLeaders:
         if self.full_length is not None:
             settings = self._checked(self.full_length, "leader.full_length", STRETCH)
             whole = Case("full length", stretch(time_step=time_step, **settings), followers)
-        windows = lively(held_out.windows(horizon), self.least_variation)
+        windows = varying(held_out.windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"]
         for group, profiles in (("training", training), ("held_out", held_out)):
             for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True):
@@ -202,11 +202,11 @@ class TrajectoryLeaders:
         loaded = self.source.load()
         profiles = at_step(leader_profiles(loaded.episodes, self.source_step), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
-        windows = lively(held_out.windows(horizon), self.least_variation)
+        windows = varying(held_out.windows(horizon), self.least_variation)
         return Leaders(training, windows, report=tuple(loaded.report))
 
 
-def lively(profiles: Profiles, least_variation: float) -> Profiles:
+def varying(profiles: Profiles, least_variation: float) -> Profiles:
     """Return the records whose speed changes by at least so much in total [m/s].
 
     Raises:

@@ -48,7 +48,7 @@ class Block:
         return name in self.table.column_names
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep only the rows where ``mask`` holds; line numbers in messages stay right."""
+        """Keep only the rows where ``mask`` holds; messages still name lines of the file."""
         kept = np.flatnonzero(mask)
         self._kept = kept if self._kept is None else self._kept[kept]
         self.table = self.table.filter(pa.array(mask))
@@ -187,19 +187,13 @@ class Block:
         )
 
     def _line_where(self, holds: Callable[[bytes], bool]) -> int | None:
-        for place, line in enumerate(self.lines.split(b"\n")):
-            if holds(line):
-                return self.first_line + place
-        return None
+        lines = enumerate(self.lines.split(b"\n"), self.first_line)
+        return next((number for number, line in lines if holds(line)), None)
 
     def _line_of_row(self, row: int) -> int:
         """Line number of a row; blank lines hold no row."""
-        seen = -1
-        for place, line in enumerate(self.lines.split(b"\n")):
-            seen += bool(line.strip(b"\r"))
-            if seen == row:
-                return self.first_line + place
-        return self.first_line
+        lines = enumerate(self.lines.split(b"\n"), self.first_line)
+        return [number for number, line in lines if line.strip(b"\r")][row]
 
 
 def read_blocks(path: str | Path) -> Iterator[Block]:
@@ -260,7 +254,7 @@ def _line_chunks(name: str) -> Iterator[bytes]:
 
 
 def _opened(name: str) -> IO[bytes]:
-    """Open a file, decompressing by content: suffixes get lost in downloads."""
+    """Open a file, decompressed where its first bytes are those of gzip."""
     with open(name, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
     return gzip.open(name, "rb") if packed else open(name, "rb")  # type: ignore[return-value]
@@ -274,20 +268,14 @@ def _is_text(lines: bytes) -> bool:
 
 
 def _single_spaces(lines: bytes) -> bytes:
-    """One space between columns and none around the row; the native files align by spaces."""
-    if b"\t" in lines:
-        lines = lines.replace(b"\t", b" ")
-    if b"  " in lines:
-        lines = re.sub(rb" {2,}", b" ", lines)
-    if b" \n" in lines or b" \r" in lines:
-        lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n")
-    if b"\n " in lines:
-        lines = lines.replace(b"\n ", b"\n")
+    """Lines with one space between columns and none around the row."""
+    lines = re.sub(rb" {2,}", b" ", lines.replace(b"\t", b" "))
+    lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n").replace(b"\n ", b"\n")
     return lines.strip(b" ")
 
 
 def _first_not_number(text: pa.Array) -> int:
-    """Index of the first cell that does not read as a number, by halving."""
+    """Index of the first cell that is not a number, by bisection."""
     low, high = 0, len(text)
     while high - low > 1:
         middle = (low + high) // 2

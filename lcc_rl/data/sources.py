@@ -91,7 +91,7 @@ class EpisodesSource:
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
-    """Files that a path, a pattern or a list of them stands for; a pattern's are sorted.
+    """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.

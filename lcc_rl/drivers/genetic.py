@@ -193,20 +193,16 @@ def _children(
     chosen = random.uniform(count, 1) < settings.difference_rate
     child = child + torch.where(chosen, random.uniform(count, 1), 0.0) * shift
     chosen = random.uniform(count, dims) < settings.mutation_rate
-    noise = random.normal(count, dims) * _mutation_strength(settings, generation)
+    share = (generation - 1) / max(settings.generations - 1, 1)
+    strength = settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
+    noise = random.normal(count, dims) * strength
     child = child + torch.where(chosen, noise, 0.0)
     # Clamped, not reflected: an optimum on a bound is then reached exactly and can be flagged.
     return child.clamp_(0.0, 1.0)
 
 
-def _mutation_strength(settings: GeneticSettings, generation: int) -> float:
-    """Standard deviation of the Gaussian mutation, falling geometrically."""
-    share = (generation - 1) / max(settings.generations - 1, 1)
-    return settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
-
-
 def _tournament(genes: Tensor, fitness: Tensor, random: _Random, size: int) -> Tensor:
-    """Draw one parent per place: the fittest of ``size`` random individuals."""
+    """Tournament selection: one parent per place, the fittest of ``size`` random individuals."""
     count = genes.shape[1]
     entrants = random.index(count, count, size)
     winner = fitness[:, entrants].argmin(-1, keepdim=True)
@@ -220,8 +216,7 @@ def _survivors(
     """Let the elite of the parents compete with the children; sorted, fittest first."""
     count = genes.shape[1]
     elites = max(1, round(settings.elites * count))
-    # The parents come sorted, so their elite stands first.
-    everyone = torch.cat([genes[:, :elites], children], 1)
+    everyone = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
     return _fittest(everyone, torch.cat([fitness[:, :elites], born], 1), count)
 
 
