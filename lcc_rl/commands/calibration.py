@@ -14,7 +14,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from lcc_rl.config import build, config_hash, plain
-from lcc_rl.drivers.idm_fit import COLUMNS, Calibration
+from lcc_rl.drivers.idm_fit import Calibration
+from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
