@@ -1,4 +1,4 @@
-"""Study room: the HCFS study, from drive cycles to every training and evaluation that it needs."""
+"""The HCFS study: trainings and evaluations from drive cycles to parquet files."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import pandas as pd
 from omegaconf import DictConfig
 
-from lcc_rl.config import load, require
+from lcc_rl.config import load
 from lcc_rl.envs.factory import Inputs, build_policy, load_inputs
 from lcc_rl.evaluation.monte_carlo import Strategy
 from lcc_rl.evaluation.platoon_cases import (
@@ -22,44 +21,35 @@ from lcc_rl.evaluation.platoon_cases import (
     yardsticks,
 )
 from lcc_rl.pipeline import known_settings
-from lcc_rl.results.runs import identity, load_config, save_config
+from lcc_rl.results.runs import save_config
 from lcc_rl.runs.cli import prepare_torch
-from lcc_rl.studies.runner import FINISHED, Outcome, Run, note, note_problems, run_all
-from lcc_rl.train import EPISODES
+from lcc_rl.studies.runner import (
+    EPISODES,
+    FINISHED,
+    BaseStudy,
+    Outcome,
+    Run,
+    note,
+    note_problems,
+    run_all,
+    up_to_date,
+)
 
 log = logging.getLogger("lcc_rl")
 
-YARDSTICKS = "yardsticks"
+BASELINES = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
 
 
 @dataclass(frozen=True)
-class Study:
-    """What to run, and where.
+class Study(BaseStudy):
+    """The settings of the HCFS study; its trainings are those of the DDPG parent."""
 
-    Args:
-        folder: where everything goes.
-        recipe: ``experiment`` of every training.
-        seeds: trainings of the DDPG parent, numbered from 0.
-        overrides: further settings of every run.
-        jobs: trainings at a time.
-        accept: settings in which a run found in the folder may differ.
-    """
-
-    folder: Path
-    recipe: str = "paper_hcfs"
-    seeds: int = 8
-    overrides: tuple[str, ...] = ()
-    jobs: int = 2
-    accept: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("seeds", "jobs"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1")
+    recipe: str | None = "paper_hcfs"
 
     def runs(self) -> list[Run]:
         """Return a training of the DDPG parent per seed."""
-        # Every strategy drives the whole record in the evaluation; a training need not.
+        # Only the study's evaluation drives the full-length record.
         own = (f"experiment={self.recipe}", f"variant={LEARNED}", *self.overrides)
         return [
             Run(
@@ -76,14 +66,14 @@ class Study:
 
 
 def run(study: Study, command: str = "") -> list[Outcome]:
-    """Train the DDPG parents and evaluate every strategy; whatever is finished is skipped.
+    """Train the DDPG parents and evaluate every strategy; finished runs are skipped.
 
     Args:
-        study: what to run.
-        command: what was typed, to be kept in the folder.
+        study: the settings.
+        command: the command line, stored in the folder's notes.
 
     Returns:
-        What became of every training.
+        The outcome of every training.
 
     Raises:
         LccError: one clear error for wrong settings or files.
@@ -96,10 +86,10 @@ def run(study: Study, command: str = "") -> list[Outcome]:
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     target = study.folder / "evaluation"
-    _evaluate(yardsticks(cfg), cfg, inputs, target / YARDSTICKS, None)
+    _evaluate(yardsticks(cfg), cfg, inputs, target / BASELINES)
     done = [outcome.run.folder for outcome in outcomes if outcome.status == FINISHED]
     for number, folder in enumerate(sorted(done)):
-        # The whole record is long: the first training drives it for all.
+        # Of the trainings only the first drives the full-length record, which takes long.
         own = study.evaluation(
             f"policy='{folder}'", *(() if number == 0 else ("evaluation.full_length=false",))
         )
@@ -110,11 +100,16 @@ def run(study: Study, command: str = "") -> list[Outcome]:
 
 
 def hybrid_strategies(cfg: DictConfig, learned: object, seed: int) -> list[Strategy]:
-    """Build the DDPG parent and every hybrid of it that the study compares.
+    """Build the DDPG parent and the hybrids that the study compares.
 
     ``hcfs``: as configured, with the tuned rule; ``hcfs untuned``: with the paper-like rule;
-    ``hcfs J=10``: a jerk bound that binds; ``hcfs literal``: without the clamp to that bound and
-    without the safe cap, as printed; ``hcfs oracle``: knows the leader's next speed.
+    ``hcfs J=10``: jerk bound of 10 m/s³; ``hcfs literal``: as printed, without the clamp to that
+    bound and without the safe cap; ``hcfs oracle``: knows the leader's next speed.
+
+    Args:
+        cfg: configuration of the evaluation of ``hcfs``.
+        learned: the trained policy.
+        seed: seed of its training.
     """
     untuned = cfg.copy()
     for name, gain in named_gains(UNTUNED).items():
@@ -133,24 +128,12 @@ def hybrid_strategies(cfg: DictConfig, learned: object, seed: int) -> list[Strat
 
 
 def _evaluate(
-    strategies: Sequence[Strategy],
-    cfg: DictConfig,
-    inputs: Inputs,
-    folder: Path,
-    trained: Path | None,
-) -> pd.DataFrame | None:
-    """Evaluate into a folder, unless it holds the same already."""
-    if _up_to_date(cfg, folder, trained):
-        return None
+    strategies: Sequence[Strategy], cfg: DictConfig, inputs: Inputs, folder: Path, *trained: Path
+) -> None:
+    """Evaluate into a folder, unless that is done."""
+    if up_to_date(cfg, folder, trained):
+        return
     log.info("evaluating %d strategies into %s", len(strategies), folder)
     (folder / EPISODES).unlink(missing_ok=True)  # never beside another configuration
     save_config(cfg, folder)
-    return evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)
-
-
-def _up_to_date(cfg: DictConfig, folder: Path, trained: Path | None) -> bool:
-    table = folder / EPISODES
-    if not table.exists() or identity(load_config(folder)) != identity(cfg):
-        return False
-    newest = 0.0 if trained is None else (trained / "policy.pt").stat().st_mtime
-    return table.stat().st_mtime >= newest
+    evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)
