@@ -7,10 +7,12 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pandas as pd
 import pytest
 import reproduce
+from matplotlib.figure import Figure
 from PIL import Image
 
 from lcc_rl import config, evaluate, train
@@ -28,7 +30,8 @@ MODULES = (train, evaluate, runner, alcc)
 TINY = (
     "data.platoons=4",
     "data.recordings=2",
-    "scenario.horizon=40",
+    "scenario.horizon=20",
+    "evaluation.drivers=2",
     "training.episodes=8",
     "agent.batch_size=64",
     "agent.hidden=[16,16]",
@@ -37,7 +40,6 @@ TINY = (
 )
 
 
-FEW_WINDOWS = (*TINY, "evaluation.profiles=2")
 START = runner._start
 
 
@@ -66,11 +68,19 @@ def in_this_process(runs: Sequence[Run], jobs: int) -> list[Outcome]:
     return outcomes
 
 
+def sketch(figure: Figure, path: Path, dpi: int) -> Path:
+    """Write a tiny picture in the place of a figure."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (1, 1)).save(path)
+    return path
+
+
 @pytest.fixture(scope="module", autouse=True)
 def quick() -> Iterator[pytest.MonkeyPatch]:
-    """Train in this process, with two filters, and compose each configuration once."""
+    """Train in this process, two filters only, each configuration once, no figures saved."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "_start", in_this_process)
+        patch.setattr(page, "save", sketch)
         for module in MODULES:
             if hasattr(module, "load"):
                 patch.setattr(module, "load", load)
@@ -87,25 +97,13 @@ def study(quick, tmp_path_factory) -> alcc.Study:
     outcomes = alcc.run(one, ["ablations"])
     assert "late" in report.write_results(folder).read_text()  # a part alone has a page
     outcomes += alcc.run(one, ["single"])
-    strings = replace(one, overrides=FEW_WINDOWS, followers=(1, 2))
+    strings = replace(one, followers=(1, 2))
     outcomes += alcc.run(strings, ["followers"])
     two = replace(one, seeds=2)
     outcomes += alcc.run(two, ["main", "filter"], "typed")
     assert [outcome.status for outcome in outcomes] == [FINISHED] * (2 + 2 + 5 + 6)
     report.write_results(folder)
     return two
-
-
-@pytest.fixture
-def sketched(monkeypatch) -> None:
-    """Pages with a tiny picture in the place of every figure."""
-
-    def save(figure, path, dpi):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (1, 1)).save(path)
-        return path
-
-    monkeypatch.setattr(page, "save", save)
 
 
 @pytest.fixture
@@ -167,13 +165,13 @@ def test_page_and_tables_have_every_part(study) -> None:
 def test_finished_runs_are_skipped(study) -> None:
     before = {p: p.stat().st_mtime_ns for p in study.folder.rglob("*.parquet")}
     parts = [(study, ["main", "filter"]), (replace(study, seeds=1), ["ablations", "single"])]
-    strings = replace(study, seeds=1, overrides=FEW_WINDOWS, followers=(1, 2))
+    strings = replace(study, seeds=1, followers=(1, 2))
     for settings, names in (*parts, (strings, ["followers"])):
         assert {outcome.status for outcome in alcc.run(settings, names)} == {FINISHED}
     assert before == {p: p.stat().st_mtime_ns for p in study.folder.rglob("*.parquet")}
 
 
-def test_the_page_needs_the_parquet_files_only(copied, sketched) -> None:
+def test_the_page_needs_the_parquet_files_only(copied) -> None:
     tables = {p.name: read_parquet(p) for p in (copied.folder / "tables").iterdir()}
     for path in (*copied.folder.rglob("*.pt"), *(copied.folder / "tables").iterdir()):
         path.unlink()
@@ -183,7 +181,7 @@ def test_the_page_needs_the_parquet_files_only(copied, sketched) -> None:
         pd.testing.assert_frame_equal(frame, again, check_exact=True)
 
 
-def test_foreign_and_broken_runs_do_not_stop_the_others(copied, sketched) -> None:
+def test_foreign_and_broken_runs_do_not_stop_the_others(copied) -> None:
     study = copied
     train_folder = study.folder / "train"
     broken, other = train_folder / "alcc" / "seed_0", train_folder / "alcc" / "seed_1"
@@ -210,9 +208,7 @@ def test_foreign_and_broken_runs_do_not_stop_the_others(copied, sketched) -> Non
     assert episodes["strategy"].nunique() == 5
 
 
-def test_the_command_resumes_a_training_in_a_process_of_its_own(
-    study, sketched, monkeypatch, caplog
-) -> None:
+def test_the_command_resumes_a_training_in_a_process_of_its_own(study, monkeypatch, caplog) -> None:
     caplog.set_level("INFO")
     monkeypatch.setattr(runner, "_start", START)
     folder = study.folder / "train" / "alcc" / "seed_0"
