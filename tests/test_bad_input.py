@@ -8,8 +8,8 @@ import os
 import pandas as pd
 import pytest
 import torch
+from commands import QUICK, tiny
 from omegaconf import OmegaConf
-from test_entry_points import tiny
 
 from lcc_rl import calibrate, evaluate, results, train
 from lcc_rl.config import load, plain
@@ -114,7 +114,7 @@ def test_asking_for_more_than_there_is_is_said(caplog, tmp_path) -> None:
 
 
 def test_calibration_says_what_it_was_made_with(tmp_path) -> None:
-    words = ["data.platoons=3", "data.recordings=1", "calibration.local_genetic.generations=2"]
+    words = ["data.platoons=3", "data.recordings=1", QUICK]
     calibrate.run(load("calibrate", words), tmp_path)
     assert results.load(tmp_path, "drivers")["data.platoons"].eq(3).all()
 
