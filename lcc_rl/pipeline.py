@@ -14,7 +14,8 @@ import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl import calibrate, evaluate, results, train
+from lcc_rl import evaluate, results, train
+from lcc_rl.commands import calibration
 from lcc_rl.config import build, load, plain, require
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.errors import ConfigError, Interrupted
@@ -96,7 +97,7 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
         own = OmegaConf.create(plain(cfg))
         assert isinstance(own, DictConfig)
         own.data = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": str(table)}
-        calibrate.run(own, drivers.parent)
+        calibration.run(own, drivers.parent)
     return drivers
 
 

@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from lcc_rl import calibrate
+from lcc_rl.commands import calibration
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import parquet_metadata
@@ -69,7 +69,7 @@ def cfg(source):
 
 def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     out = io.StringIO()
-    drivers = calibrate.run(cfg, tmp_path / "run", Console(file=out, width=100))
+    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     names = sorted(path.name for path in (tmp_path / "run").iterdir())
     assert names == ["calibration.png", "config.yaml", "drivers.parquet", "joint_distribution.png"]
     written = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
@@ -99,7 +99,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, error, message):
     OmegaConf.update(cfg, key, value)
     with pytest.raises(error, match=message):
-        calibrate.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
+        calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
     assert not (tmp_path / "run").exists()
 
 

@@ -1,0 +1,130 @@
+"""Calibration of IDM drivers from trajectories: rows, figures and a summary in a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from time import perf_counter
+
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from lcc_rl.config import build, config_hash, plain
+from lcc_rl.drivers.calibrator import Calibrator
+from lcc_rl.drivers.idm_fit import COLUMNS, Calibration
+from lcc_rl.drivers.population import from_table
+from lcc_rl.errors import ConfigError
+from lcc_rl.io.files import write_parquet
+from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
+from lcc_rl.results.drawing import save
+from lcc_rl.results.runs import save_config
+from lcc_rl.runs.cli import prepare_torch
+
+
+def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
+    """Calibrate the drivers of ``cfg.data`` as ``cfg.calibration`` says.
+
+    Writes ``config.yaml``, ``drivers.parquet``, ``calibration.png`` and ``joint_distribution.png``.
+
+    Args:
+        cfg: a configuration with data, calibration, seed, device and threads.
+        folder: where the files go.
+        console: where progress, report and summary go; by default the terminal.
+
+    Returns:
+        The calibrated drivers, as written.
+
+    Raises:
+        ConfigError: if a setting is unknown or impossible.
+        DataError: if the data cannot be read or hold no usable episode.
+        ResultsError: if a file cannot be written.
+    """
+    console, folder = console or Console(highlight=False), Path(folder)
+    device = prepare_torch(cfg)
+    missing = [key for key in sorted(OmegaConf.missing_keys(cfg)) if key.startswith("data.")]
+    if missing:
+        raise ConfigError(f"missing settings: give {', '.join(f'{key}=…' for key in missing)}")
+    # Settings are checked before the data are read, which may take long.
+    calibrator = build(cfg.calibration, "calibration")
+    dataset = build(cfg.data, "data").load()
+    _say(console, dataset.report)
+    start = perf_counter()
+    result = _calibrate(calibrator, dataset.episodes, cfg.seed, device, console)
+    seconds = perf_counter() - start
+    save_config(cfg, folder)
+    _say(console, result.report)
+    _write(result, cfg, folder)
+    console.print(_summary(result.drivers))
+    _say(console, [f"calibrated in {seconds:.1f} s; results in {folder}"])
+    return result.drivers
+
+
+def _calibrate(
+    calibrator: Calibrator,
+    episodes: pd.DataFrame,
+    seed: int,
+    device: torch.device,
+    console: Console,
+) -> Calibration:
+    """Calibrate with a progress bar on a terminal."""
+    with _progress(console) as bar:
+        task = bar.add_task("calibration")
+
+        def show(generation: int, total: int, text: str) -> None:
+            bar.update(task, completed=generation, total=total, description=text)
+
+        return calibrator(episodes, seed=seed, device=device, progress=show)
+
+
+def _write(result: Calibration, cfg: DictConfig, folder: Path) -> None:
+    settings = OmegaConf.masked_copy(cfg, ["data", "calibration", "seed"])
+    metadata = {
+        "config": json.dumps(plain(settings), default=str),
+        "config_hash": config_hash(settings),
+        "report": "\n".join(result.report),
+    }
+    write_parquet(result.drivers, folder / "drivers.parquet", metadata)
+    save(calibration_figure(result.drivers), folder / "calibration.png")
+    save(joint_figure(result.drivers), folder / "joint_distribution.png")
+
+
+def _say(console: Console, lines: list[str]) -> None:
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _summary(drivers: pd.DataFrame) -> Table:
+    """Mean and spread of the error and the parameters, by mode."""
+    modes = list(drivers["mode"].unique())
+    table = Table("", *modes, title="calibrated drivers, mean ± standard deviation")
+    parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
+    table.add_row("drivers", *(str(len(part)) for part in parts.values()))
+    table.add_row(escape("RMSPE [%]"), *(_spread(100.0 * part["rmspe"]) for part in parts.values()))
+    for column in COLUMNS.values():
+        name, _, unit = column.rpartition("_")
+        unit = unit.replace("mps", "m/s").replace("s2", "s²")
+        table.add_row(
+            escape(f"{name.replace('_', ' ')} [{unit}]"),
+            *(_spread(part[column]) for part in parts.values()),
+        )
+    populations = [from_table(part).summary() for part in parts.values()]
+    table.add_row("correlation of (v0, T)", *(f"{row['correlation']:.2f}" for row in populations))
+    shares = (f"{100 * row['share_at_bound']:.0f} %" for row in populations)
+    table.add_row("v0 on a bound", *shares)
+    return table
+
+
+def _spread(values: pd.Series) -> str:
+    if values.nunique() == 1:
+        return f"{values.iloc[0]:.2f} (all)"
+    return f"{values.mean():.2f} ± {values.std(ddof=0):.2f}"
