@@ -110,7 +110,8 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
 
 
 def test_sweep_as_typed(tmp_path) -> None:
-    words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "hydra.sweep.dir=sweep"]
+    words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "training.episodes=8"]
+    words.append("hydra.sweep.dir=sweep")
     done = run_command("lcc_rl.train", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     frame = results.load(tmp_path / "sweep")
