@@ -11,7 +11,7 @@ from commands import run_command
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from lcc_rl import calibrate
+from lcc_rl.commands import calibration
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import parquet_metadata
@@ -48,7 +48,7 @@ def cfg(source):
 
 def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     out = io.StringIO()
-    drivers = calibrate.run(cfg, tmp_path / "run", Console(file=out, width=100))
+    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     names = sorted(path.name for path in (tmp_path / "run").iterdir())
     assert names == ["calibration.png", "config.yaml", "drivers.parquet", "joint_distribution.png"]
     written = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
@@ -78,7 +78,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, error, message):
     OmegaConf.update(cfg, key, value)
     with pytest.raises(error, match=message):
-        calibrate.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
+        calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
     assert not (tmp_path / "run").exists()
 
 
@@ -134,10 +134,9 @@ def test_device_and_threads_are_prepared():
 
 
 @pytest.fixture
-def command(source, monkeypatch):
+def command(source):
     """Function that runs the command in the folder of the episode file."""
-    monkeypatch.chdir(source)
-    return partial(run_command, "lcc_rl.calibrate")
+    return partial(run_command, "lcc_rl.calibrate", cwd=source)
 
 
 def test_command_writes_into_the_run_folder(source, command):
@@ -146,11 +145,10 @@ def test_command_writes_into_the_run_folder(source, command):
     node = "_target_: lcc_rl.data.sources.EpisodesSource\npath: episodes.parquet\n"
     (source / "data" / "own.yaml").write_text(node)
     own = ["--config-dir", str(source), "data=own", "hydra.run.dir=here"]
-    status, out, err = command(*own, *quick)
-    assert status == 0, err
+    done = command(*own, *quick, check=True)
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
-    assert "v0 on a bound" in out
+    assert "v0 on a bound" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -158,7 +156,7 @@ def test_command_writes_into_the_run_folder(source, command):
     [("data.path=/no/such", "/no/such: no such file"), ("calibration=locl", "'locl'")],
 )
 def test_command_ends_bad_input_with_one_line_and_code_two(command, override, message):
-    status, _, err = command("data=episodes", "data.path=episodes.parquet", override)
-    assert status == 2
-    assert message in err
-    assert err.count("\n") == 1
+    done = command("data=episodes", "data.path=episodes.parquet", override)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
