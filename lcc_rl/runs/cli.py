@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config import explained, is_sweep
+from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible
