@@ -28,6 +28,11 @@ from lcc_rl.schemas import register_schemas
 
 TARGET = "_target_"
 CONF = "lcc_rl.conf"
+# Settings that do not change any row of a result.
+NOT_IDENTITY = (
+    *("resume", "compare", "jobs", "sweep", "objective", "logger", "trust"),
+    "training.keep_every",
+)
 
 
 def chosen_folder(resumed: str | None, fresh: str) -> str:
@@ -217,6 +222,20 @@ def config_hash(config: Any) -> str:
     """Return a short hash of what a configuration says, independent of the order of its keys."""
     text = json.dumps(plain(config), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def identity(cfg: DictConfig) -> str:
+    """Return the hash of everything in a configuration that determines the results."""
+    content = plain(cfg)
+    for key in NOT_IDENTITY:
+        *path, last = key.split(".")
+        node = content
+        for part in path:
+            node = node.get(part) or {}
+        node.pop(last, None)
+    if content.get("policy") is None:  # some entry points have no such setting
+        content.pop("policy", None)
+    return config_hash(content)
 
 
 def require(condition: bool, message: str) -> None:

@@ -26,10 +26,10 @@ from commands import (
 from omegaconf import OmegaConf
 
 from lcc_rl import evaluate, pipeline, results, train
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity, load_config, load_policy
+from lcc_rl.results.runs import load_config, load_policy
 from lcc_rl.runs.states import inspect_run
 
 

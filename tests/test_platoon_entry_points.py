@@ -12,11 +12,11 @@ from helpers import POPULATION
 from lcc_rl.agents.training import Trainer, transitions
 
 from lcc_rl import evaluate, results, train
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.envs.factory import build_agent, build_env, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity, load_policy
+from lcc_rl.results.runs import load_policy
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
 

@@ -14,7 +14,7 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.replay import Trainer
-from lcc_rl.config import TARGET, build
+from lcc_rl.config import TARGET, build, identity
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
@@ -22,7 +22,6 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Piece
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.runs import identity
 
 
 class Agent(Protocol):

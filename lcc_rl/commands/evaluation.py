@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_sizes
+from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation import cases, episodes
@@ -24,7 +25,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.figures import write_study_figures
-from lcc_rl.results.runs import PRETRAINED, identity, load_policy, save_config
+from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.string_figures import write_platoon_figures
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import torch
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
 # Changes of a table from one schema version to the next, by the older version.
@@ -86,8 +87,6 @@ def write_parquet(
     Raises:
         ResultsError: if the file cannot be written.
     """
-    from lcc_rl import __version__
-
     own = {
         "lcc_rl.schema": SCHEMA_VERSION,
         "lcc_rl.version": __version__,

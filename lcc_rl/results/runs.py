@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import TARGET, config_hash, find_target, plain
+from lcc_rl.config import TARGET, find_target, plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.files import atomic_path, read_parquet, read_torch, write_torch
 
@@ -23,25 +23,6 @@ BUILDS_ON = {"hcfs": "ddpg"}
 ROOMS = "agents data drivers evaluation functional pieces policies runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
-# Settings that do not change any row of a result.
-NOT_IDENTITY = (
-    *("resume", "compare", "jobs", "sweep", "objective", "logger", "trust"),
-    "training.keep_every",
-)
-
-
-def identity(cfg: DictConfig) -> str:
-    """Return the hash of everything in a configuration that determines the results."""
-    content = plain(cfg)
-    for key in NOT_IDENTITY:
-        *path, last = key.split(".")
-        node = content
-        for part in path:
-            node = node.get(part) or {}
-        node.pop(last, None)
-    if content.get("policy") is None:  # some entry points have no such setting
-        content.pop("policy", None)
-    return config_hash(content)
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:

@@ -22,9 +22,9 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from rich.console import Console
 from rich.live import Live
 
+from lcc_rl.config import NOT_IDENTITY, identity
 from lcc_rl.errors import Interrupted, LccError
 from lcc_rl.io.files import atomic_path
-from lcc_rl.results.runs import NOT_IDENTITY, identity
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.search import resume_search
 from lcc_rl.runs.states import Busy, one_line, record, survey

@@ -17,10 +17,9 @@ from commands import DATA, HORIZON, run_command, tiny
 from omegaconf import OmegaConf
 
 from lcc_rl import results, train
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity
 from lcc_rl.runs import cli
 from lcc_rl.runs.states import ERROR, Busy, claim
 from lcc_rl.runs.sweeps import (
