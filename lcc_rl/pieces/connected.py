@@ -19,6 +19,7 @@ from lcc_rl.functional.cacc import (
     next_leader_speed,
     platoon_errors,
 )
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.controllers import Controller
