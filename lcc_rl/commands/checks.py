@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -13,6 +14,7 @@ from lcc_rl.envs.inputs import constant_profile
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.runs.loggers import Silent
 from lcc_rl.schemas import TrainConfig
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
@@ -59,10 +61,8 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
 
 
-def build_logger(cfg: DictConfig):  # type: ignore[no-untyped-def]
-    """Build what is told every training row; nothing is where the run names none."""
-    from lcc_rl.runs.loggers import Silent
-
+def build_logger(cfg: DictConfig) -> Any:
+    """Build the logger of the training rows; a silent one where the run names none."""
     node = cfg.get("logger")
     return Silent() if node is None else build(node, "logger")
 

@@ -61,9 +61,21 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+    strategies, inputs = _strategies(cfg, own)
+    # The rows of an earlier evaluation must never stand beside the configuration of this one.
+    (folder / EPISODES).unlink(missing_ok=True)
+    save_config(cfg, folder)
+    rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
+    if not quiet:
+        draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
+        draw(folder)
+    return rows
+
+
+def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
+    """Build all strategies of an evaluation, and read what they are evaluated on."""
     # Before the data: a missing file should not be noticed after minutes of reading.
-    trust = tuple(cfg.trust)
-    policy = None
+    trust, policy = tuple(cfg.trust), None
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     compared = {path: load_policy(path, cfg.variant, trust) for path in cfg.compare}
@@ -76,14 +88,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
         strategies += studied(cfg, policy, inputs.population)
     strategies = named_apart(strategies)
     check_distinct(strategies)
-    # The rows of an earlier evaluation must never stand beside the configuration of this one.
-    (folder / EPISODES).unlink(missing_ok=True)
-    save_config(cfg, folder)
-    rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
-    if not quiet:
-        draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
-        draw(folder)
-    return rows
+    return strategies, inputs
 
 
 def evaluate_and_write(
