@@ -127,7 +127,9 @@ class Actor(TensorDictModuleBase):
         self.kind = kind
 
     def action(self, kind: str, td: TensorDictBase) -> Tensor:
-        speed, *heard = (td["vehicles", x] for x in ("speed", "leader_speed", "leader_acceleration"))
+        speed, *heard = (
+            td["vehicles", x] for x in ("speed", "leader_speed", "leader_acceleration")
+        )
         if kind in ("good", "hasty"):
             target = next_leader_speed([*heard, heard[0]], "causal", T)
             own = dead_beat_acceleration(speed, target, T, A_MAX) / A_MAX

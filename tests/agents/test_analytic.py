@@ -12,12 +12,11 @@ from helpers import POPULATION, REWARD, TERMS, compose, make_agent, string, wavy
 
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import derived_seed
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import identity
 
 SMALL = (
     "agent=analytic",

@@ -9,10 +9,10 @@ from helpers import ACTION, POPULATION, compose, make_agent, wavy_profiles
 from tensordict import TensorDict
 
 from lcc_rl.agents.replay import Trainer
+from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import identity
 
 SMALL = (
     "training.episodes=16",

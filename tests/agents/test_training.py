@@ -12,10 +12,10 @@ from helpers import ACTION, POPULATION, compose, make_agent, small_env, string, 
 from lcc_rl.agents.loop import episode_statistics
 from lcc_rl.agents.off_policy import Exploration
 from lcc_rl.agents.replay import Trainer, transitions
+from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_parquet, write_torch
-from lcc_rl.results.runs import identity
 
 SMALL = (
     "training.episodes=20",

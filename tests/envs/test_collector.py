@@ -114,7 +114,9 @@ def test_without_a_compiler_one_line_and_the_plain_step(monkeypatch, caplog) -> 
     monkeypatch.setattr("lcc_rl.envs.step.compile", broken)
     caplog.set_level("INFO", "lcc_rl")
     segment = first(small_env("alcc", 2), frames_per_batch=10, compiled=True)
-    assert torch.equal(segment["next", "automated", "reward"], expected["next", "automated", "reward"])
+    assert torch.equal(
+        segment["next", "automated", "reward"], expected["next", "automated", "reward"]
+    )
     assert ["not compiling" in line for line in caplog.messages] == [True]
 
 

@@ -143,7 +143,9 @@ def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
 def test_compiled_equals_eager_over_an_episode() -> None:
     network = make_actor(7, 1, (16,), 0).module
     plain, fast = (
-        DifferentiableRollout(small_env("alcc", 8, ["scenario.horizon=100"]), WANTED, OBSERVED, compiled=c)
+        DifferentiableRollout(
+            small_env("alcc", 8, ["scenario.horizon=100"]), WANTED, OBSERVED, compiled=c
+        )
         for c in (False, True)
     )
     rolls = [u.assemble(u.play(u.start(), network, 100)[1])["next"] for u in (plain, fast)]

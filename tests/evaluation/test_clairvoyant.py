@@ -80,7 +80,9 @@ def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
     ],
 )
 def test_misses(gap, relative_speed, speed, missed) -> None:
-    assert float(misses(moment(gap, relative_speed, speed), STRING)) == pytest.approx(missed, abs=1e-4)
+    assert float(misses(moment(gap, relative_speed, speed), STRING)) == pytest.approx(
+        missed, abs=1e-4
+    )
 
 
 def test_path_energy_at_constant_speed() -> None:

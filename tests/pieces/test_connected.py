@@ -342,7 +342,9 @@ def heard(delay: float, leader_sends: bool = True):
     entries = piece.compute(
         speed, gap, acceleration, torch.tensor([[13.0]]), torch.tensor([[-0.6]])
     )
-    return {key[1]: value.flatten().tolist() for key, value in zip(piece.out_keys, entries, strict=True)}
+    return {
+        key[1]: value.flatten().tolist() for key, value in zip(piece.out_keys, entries, strict=True)
+    }
 
 
 def test_behind_a_human_driver_that_one_leads_the_chain() -> None:
