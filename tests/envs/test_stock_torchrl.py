@@ -179,8 +179,7 @@ def test_multi_agent_ppo() -> None:
                 target_params=loss.target_critic_network_params,
             )
         assert data["advantage"].shape == shape
-        for _ in range(2):
-            losses.append(step(loss, data.reshape(-1), optimizer))
+        losses += [step(loss, data.reshape(-1), optimizer) for _ in range(2)]
     collector.shutdown()
     assert torch.tensor(losses).isfinite().all()
     assert not torch.equal(vector(policy), before)
