@@ -55,7 +55,8 @@ class Views:
         for name in self.names:
             if len(name) - (name[0] == NEXT) != 2:
                 raise ConfigError(f"expected a name such as self.gap, got {'.'.join(name)!r}")
-        self.drawn = string.drawn
+        # Only roles have places; what all vehicles see alike needs none.
+        self.drawn = string.drawn and role in string.names
         self.places = string.places(role)
         self.blocks = blocks_of(self.places)
         self.first_is_ahead = 0 in self.places and not self.drawn
