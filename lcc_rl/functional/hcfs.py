@@ -103,7 +103,7 @@ class Decision(NamedTuple):
 def jerk_interval(
     last_acceleration: Tensor, jerk_bound: float, time_step: float, max_acceleration: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the accelerations between which |jerk| stays within the bound (HCFS step 1)."""
+    """Return the accelerations between which |jerk| stays within the bound J of H15–H21."""
     reach = jerk_bound * time_step
     low = (last_acceleration - reach).clamp(min=-max_acceleration)
     return low, (last_acceleration + reach).clamp(max=max_acceleration)

@@ -20,7 +20,8 @@ class Observation(Feature):
 
     Writes ``[*batch, A, entries]``, one row per automated vehicle. Where a vehicle may have
     fewer than ``visible`` vehicles behind, their entries are zero and one more entry per vehicle
-    behind says whether it is there (1 or 0).
+    behind says whether it is there (1 or 0). HCFS observes the state H3, see
+    ``conf/observation/platoon.yaml``.
 
     Args:
         scales: constant of each entry, nested by view (:mod:`lcc_rl.pieces.views`), in the order
