@@ -72,7 +72,7 @@ def check_ignored(cfg: DictConfig, overrides: Sequence[str], sweep: bool = False
     for item in overrides:
         key = item.lstrip("+~").partition("=")[0].partition("@")[0]
         for prefix, reason in reasons.items():
-            if key == prefix or key.startswith(f"{prefix}."):
+            if (key == prefix or key.startswith(f"{prefix}.")) and item != "agent=none":
                 raise ConfigError(f"{item} has no effect: {reason}")
 
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
 from lcc_rl.config import build, load, require
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import constant_profile
+from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.strategies import deployed
@@ -54,7 +54,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     check_variant(cfg)
     trial = any_leader(cfg)
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
-    profiles = constant_profile(10.0, horizon, time_step, "trial")
+    profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if learns(cfg):
         agent = build_agent(cfg, population, cfg.device)
         make_trainer(trial, agent, profiles, population, folder)
