@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import torch
+from equations import EQUATIONS, PAPERS
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
@@ -17,7 +18,6 @@ from lcc_rl.envs import SingleAgent, build_env
 from lcc_rl.envs.inputs import constant_profiles, string_of
 from lcc_rl.envs.single import group_key
 from lcc_rl.envs.step import pieces_of, tick, written
-from lcc_rl.equations import EQUATIONS, PAPERS
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces import Handover

@@ -6,10 +6,10 @@ from pkgutil import resolve_name
 
 import entries as tool
 import pytest
+from equations import EQUATIONS, LAST, numbers_in
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.step import Pieces
-from lcc_rl.equations import EQUATIONS, LAST, numbers_in
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.base import Feature
