@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 LAST = {"A": 20, "H": 21}  # numbers of equations of ALCC and of HCFS
 PAPERS = """A1–A20: Wang et al., *Adaptive Leading Cruise Control in Mixed Traffic Considering
@@ -45,7 +45,8 @@ def numbers_in(text: str) -> set[str]:
 
 
 TABLE = Path(__file__).with_suffix(".toml")
+ROWS: list[dict[str, Any]] = tomllib.loads(TABLE.read_text())["equation"]
 EQUATIONS = tuple(
     Equation(**{key: tuple(x) if isinstance(x, list) else x for key, x in row.items()})
-    for row in tomllib.loads(TABLE.read_text())["equation"]
+    for row in ROWS
 )
