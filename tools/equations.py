@@ -46,7 +46,4 @@ def numbers_in(text: str) -> set[str]:
 
 TABLE = Path(__file__).with_suffix(".toml")
 ROWS: list[dict[str, Any]] = tomllib.loads(TABLE.read_text())["equation"]
-EQUATIONS = tuple(
-    Equation(**{key: tuple(x) if isinstance(x, list) else x for key, x in row.items()})
-    for row in ROWS
-)
+EQUATIONS = tuple(Equation(**{**row, "functions": tuple(row.get("functions", ()))}) for row in ROWS)
