@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.factory import build_env
+from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.policies import shared_policy
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
-VARIANTS = ("alcc", "reference", "own_energy", "barrier", "idm", "direct", *PLATOON)
+VARIANTS = ("alcc", "reference", "own_energy", "cbf", "idm", "direct", *PLATOON)
 POPULATION = bootstrap()
+ACTION, REWARD = ("automated", "action"), ("automated", "reward")
+OBSERVATION, TERMS = ("automated", "observation"), ("automated", "reward_terms")
 
 
 def wavy_profiles(count: int = 4, samples: int = 400) -> Profiles:
@@ -29,9 +35,29 @@ def wavy_profiles(count: int = 4, samples: int = 400) -> Profiles:
     return from_records(records, names, [f"rec{i % 2}" for i in range(count)], 0.1)
 
 
+def string(pattern: str) -> str:
+    """Return the override that makes a pattern the string of vehicles."""
+    return f"scenario.string='{pattern}'"
+
+
+def followers(count: int) -> str:
+    """Return the override for so many human drivers behind one automated vehicle."""
+    return string(f"automated human*{count}")
+
+
+@cache
+def _loaded(overrides: tuple[str, ...]) -> DictConfig:
+    return load("train", overrides)
+
+
+def composed(*overrides: str) -> DictConfig:
+    """Compose the configuration of a training; the same one is composed only once."""
+    return _loaded(overrides).copy()
+
+
 def compose(variant: str = "alcc", *overrides: str) -> DictConfig:
     """Compose the configuration of a training with short episodes."""
-    return load("train", [f"variant={variant}", "scenario.horizon=20", *overrides])
+    return composed(f"variant={variant}", "scenario.horizon=20", *overrides)
 
 
 def small_env(
@@ -39,7 +65,34 @@ def small_env(
     batch_size: Sequence[int] | int = (),
     overrides: Sequence[str] = (),
     seed: int = 0,
+    nominal: bool = False,
 ) -> TransformedEnv:
     """Build an environment on the wavy profiles and the shipped drivers."""
     cfg = compose(variant, *overrides)
-    return build_env(cfg, wavy_profiles(), POPULATION, batch_size, seed)
+    return build_env(cfg, wavy_profiles(), POPULATION, batch_size, seed, nominal=nominal)
+
+
+def single_env(
+    variant: str = "alcc",
+    batch_size: Sequence[int] | int = (),
+    overrides: Sequence[str] = (),
+    seed: int = 0,
+) -> TransformedEnv:
+    """Build the same with the single-agent view."""
+    return small_env(variant, batch_size, overrides, seed).append_transform(SingleAgent())
+
+
+def make_agent(cfg: DictConfig) -> Agent:
+    """Build the agent of a configuration for the shipped drivers."""
+    return build_agent(cfg, POPULATION)
+
+
+def network(cfg: DictConfig) -> TensorDictBase:
+    """Return the untrained policy of a configuration, for the group of automated vehicles."""
+    return shared_policy(make_agent(cfg).policy)
+
+
+def steady(value: float, env: TransformedEnv) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return the policy that always takes one action."""
+    shape = env.full_action_spec[ACTION].shape
+    return lambda td: td.set(ACTION, torch.full(shape, value))

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import torch
-from helpers import POPULATION
+from helpers import ACTION, POPULATION, composed, string
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from lcc_rl.config import load
-from lcc_rl.data.cycles import RecordLeaders, join, stretch
+from lcc_rl.data.cycles import Case, RecordLeaders, join, stretch
 from lcc_rl.data.profiles import Profiles, from_records
-from lcc_rl.envs.factory import build_env
-from lcc_rl.evaluation.platoon_cases import named_gains, nominal, roll
+from lcc_rl.envs import Inputs, build_env
+from lcc_rl.evaluation.cases import drive
+from lcc_rl.evaluation.strategies import Strategy, deployed
+from lcc_rl.functional.cacc import dead_beat_acceleration, next_leader_speed
 from lcc_rl.functional.random import uniform
 from lcc_rl.pieces.base import SEED, STEP
-from lcc_rl.policies import CACCPolicy, DeadBeatPolicy, HCFSPolicy
 
 T, A_MAX = 0.2, 3.0
 ACTORS = ("good", "bad", "random")
@@ -44,7 +45,7 @@ def ramps() -> Profiles:
 @cache
 def windows(limit: int | None = None) -> Profiles:
     """The held-out windows of the shipped default."""
-    cfg = load("train", ["variant=cacc"])
+    cfg = composed("variant=cacc")
     held = {k: dict(v) for k, v in cfg.leader.held_out.items()}
     found = RecordLeaders({"x": {"path": "udds"}}, held).load(T, 100, 6)
     return found.windows.spread(limit)
@@ -66,24 +67,43 @@ def repeated(profiles: Profiles, times: int) -> Profiles:
     return profiles.select([i for _ in range(times) for i in range(len(profiles))])
 
 
-def env_of(profiles: Profiles, followers: int = 6, *overrides: str, horizon: int | None = None):
+@dataclass(frozen=True)
+class Driver:
+    """Who drives a platoon: the options that say so, and a policy where one acts."""
+
+    overrides: tuple[str, ...]
+    policy: Any = None
+
+
+def cacc(name: str = "tuned") -> Driver:
+    return Driver(("variant=cacc", f"gains={name}"))
+
+
+def deadbeat(mode: str = "causal") -> Driver:
+    return Driver(("variant=deadbeat", f"scenario.controllers.automated.lookahead={mode}"))
+
+
+def hcfs(learned: Any = "good", rule: str = "tuned", **settings: Any) -> Driver:
+    """The hybrid of CACC and an actor."""
+    actor = Actor(learned) if isinstance(learned, str) else learned
+    own = (f"deployed.{name}={value}" for name, value in settings.items())
+    return Driver(("variant=hcfs", f"gains={rule}", *own), actor)
+
+
+def env_of(profiles: Profiles, driver: Driver, vehicles: int = 6, horizon: int | None = None):
     """The platoon's environment, a slot for every record, as in an evaluation."""
-    cfg = load("train", ["variant=cacc", *overrides])
     horizon = int(profiles.lengths.min()) - 1 if horizon is None else horizon
-    cfg = nominal(cfg, followers, horizon)
-    return build_env(cfg, profiles, POPULATION, len(profiles))
+    own = [f"scenario.horizon={horizon}", string(f"automated*{vehicles}")]
+    cfg = deployed(composed(*driver.overrides, *own))
+    return build_env(cfg, profiles, POPULATION, len(profiles), nominal=True)
 
 
-def play(profiles: Profiles, policy: Any, followers: int = 6, *overrides: str) -> dict[str, Tensor]:
+def play(profiles: Profiles, driver: Driver, vehicles: int = 6) -> dict[str, Tensor]:
     """Drive behind every record from its start to its end."""
-    return roll(env_of(profiles, followers, *overrides), policy)
-
-
-gains = cache(named_gains)
-
-
-def cacc(name: str = "tuned") -> CACCPolicy:
-    return CACCPolicy(T, A_MAX, **gains(name))
+    cfg = deployed(composed(*driver.overrides))
+    inputs = Inputs(profiles, profiles, POPULATION)
+    case = Case("whole", profiles, vehicles)
+    return drive(Strategy("tested", cfg, driver.policy), case, inputs)
 
 
 class Actor(TensorDictModuleBase):
@@ -95,16 +115,24 @@ class Actor(TensorDictModuleBase):
     """
 
     def __init__(self, kind: str) -> None:
-        self.beat = None
-        self.in_keys = [("platoon", "speed"), SEED, STEP]
-        self.out_keys = ["action"]
+        self.in_keys = [
+            ("vehicles", "speed"),
+            ("vehicles", "leader_speed"),
+            ("vehicles", "leader_acceleration"),
+            SEED,
+            STEP,
+        ]
+        self.out_keys = [ACTION]
         super().__init__()
-        self.kind, self.beat = kind, DeadBeatPolicy(T, A_MAX)
+        self.kind = kind
 
     def action(self, kind: str, td: TensorDictBase) -> Tensor:
-        speed = td["platoon", "speed"]
+        speed, *heard = (
+            td["vehicles", x] for x in ("speed", "leader_speed", "leader_acceleration")
+        )
         if kind in ("good", "hasty"):
-            own = self.beat(td.copy())["action"]
+            target = next_leader_speed([*heard, heard[0]], "causal", T)
+            own = dead_beat_acceleration(speed, target, T, A_MAX) / A_MAX
             return own + (0.1 / T / A_MAX if kind == "hasty" else 0.0)
         if kind == "bad":
             return torch.ones_like(speed)
@@ -113,13 +141,7 @@ class Actor(TensorDictModuleBase):
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         if self.kind != "mixed":
-            return td.set("action", self.action(self.kind, td))
+            return td.set(ACTION, self.action(self.kind, td))
         third = td.shape[0] // 3
         parts = [self.action(kind, td)[i * third :][:third] for i, kind in enumerate(ACTORS)]
-        return td.set("action", torch.cat(parts))
-
-
-def hcfs(learned: Any = "good", rule: str = "tuned", **settings: Any) -> HCFSPolicy:
-    """The hybrid of CACC and an actor."""
-    actor = Actor(learned) if isinstance(learned, str) else learned
-    return HCFSPolicy(cacc(rule), actor, T, A_MAX, **settings)
+        return td.set(ACTION, torch.cat(parts))

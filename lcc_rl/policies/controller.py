@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 
 from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.pieces.base import NEXT, root_key
@@ -37,6 +37,7 @@ class ControllerPolicy(TensorDictModuleBase):
         super().__init__()
         self.controller, self.max_acceleration = controller, max_acceleration
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         command = self.controller.compute(*(tensordict.get(key) for key in self.in_keys))

@@ -8,14 +8,15 @@ import signal
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, compose, wavy_profiles
+from helpers import POPULATION, REWARD, TERMS, compose, make_agent, string, wavy_profiles
 
-from lcc_rl.agents.analytic import GradientTrainer
+from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import derived_seed
 from lcc_rl.config import identity, load
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
+from lcc_rl.policies import shared_policy
 
 SMALL = (
     "agent=analytic",
@@ -32,7 +33,7 @@ WHOLE = ("training.segment=${scenario.horizon}", "agent.bootstrap=false", "agent
 def make(folder, *overrides: str, variant: str = "alcc") -> GradientTrainer:
     cfg = compose(variant, *SMALL, *overrides)
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    agent = build_agent(cfg, POPULATION)
+    agent = make_agent(cfg)
     return GradientTrainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
@@ -40,10 +41,10 @@ def weights(trainer: GradientTrainer) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
 
 
-@pytest.mark.parametrize("followers", [1, 5])
+@pytest.mark.parametrize("vehicles", ["automated human", "(automated human*5)*2"])
 @pytest.mark.parametrize("variant", ["alcc", "reference"])
-def test_same_seed_same_rows_and_weights(tmp_path, variant, followers) -> None:
-    settings = (f"scenario.followers={followers}", "training.episodes=16")
+def test_same_seed_same_rows_and_weights(tmp_path, variant, vehicles) -> None:
+    settings = (string(vehicles), "training.episodes=16")
     one, two = (make(tmp_path / name, *settings, variant=variant) for name in "ab")
     pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
     assert torch.equal(weights(one), weights(two))
@@ -82,11 +83,11 @@ def test_the_record_is_that_of_the_literal_reward(tmp_path) -> None:
     fresh = make(tmp_path / "again", *one_update)
     fresh.env.set_seed(derived_seed(0, 0, "episodes"))
     with torch.no_grad():
-        played = fresh.env.rollout(20, fresh.agent.policy, break_when_any_done=False)
-    terms = played["next", "reward_terms"].sum(1).mean(0)
+        played = fresh.env.rollout(20, shared_policy(fresh.agent.policy), break_when_any_done=False)
+    terms = played["next", *TERMS].sum(1).mean(0)
     for name in ("safety", "efficiency", "cav_energy", "hdv_energy"):
         assert row[f"reward_{name}"] == pytest.approx(float(terms[name]), rel=1e-5), name
-    assert row["episode_reward"] == pytest.approx(float(played["next", "reward"].sum(1).mean()))
+    assert row["episode_reward"] == pytest.approx(float(played["next", *REWARD].sum(1).mean()))
 
 
 def test_a_removed_term_is_not_optimised(tmp_path) -> None:
@@ -112,7 +113,7 @@ def test_a_removed_term_is_not_optimised(tmp_path) -> None:
         (["agent.gamma=1"], r"bootstrap needs agent\.gamma below 1"),
         (["agent.learning_rate=-1"], "learning_rate"),
         (["agent.clip_norm=0"], "clip_norm"),
-        (["agent.final_share=2"], "final_share"),
+        (["agent.final_lr_fraction=2"], "final_lr_fraction"),
         (["agent.surrogates.safety.threshold=0"], r"surrogates\.safety\.threshold"),
         (["agent.surrogates.safety.width=thin"], r"surrogates\.safety\.width must be"),
         (["training.segment=7"], "segment"),
@@ -165,7 +166,7 @@ def test_learns_to_keep_going(tmp_path, overrides) -> None:
         "training.environments=16",
         "agent.learning_rate=0.01",
         "agent.value_lr=0.001",
-        "scenario.pieces.cav.initial_gap_range=[0.8,1.2]",
+        "training.gap_range=[0.8,1.2]",
     ).run()
     # The objective, not the literal reward, is what a handful of steps is sure to improve.
     assert rows["loss_actor"].tail(3).mean() < 0.6 * rows["loss_actor"].head(3).mean()

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from lcc_rl.agents import DDPG
+from lcc_rl.agents.ddpg import DDPGSettings
 
 
 def transitions(count: int, seed: int) -> TensorDict:
@@ -28,16 +29,8 @@ def transitions(count: int, seed: int) -> TensorDict:
 
 
 def agent(**settings: object) -> DDPG:
-    return DDPG(
-        observation_size=7,
-        action_size=1,
-        seed=3,
-        batch_size=64,
-        buffer_size=64,
-        critic_lr=2e-3,
-        tau=0.05,
-        **settings,  # type: ignore[arg-type]
-    )
+    own = {"batch_size": 64, "buffer_size": 64, "critic_lr": 2e-3, "tau": 0.05, **settings}
+    return DDPG(7, 1, seed=3, settings=DDPGSettings(**own))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("hidden", [[200, 100, 50], [16]])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, compose, wavy_profiles
-from lcc_rl.agents.training import Trainer
+from helpers import ACTION, POPULATION, compose, make_agent, wavy_profiles
 from tensordict import TensorDict
 
+from lcc_rl.agents.replay import Trainer
 from lcc_rl.config import identity
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
+from lcc_rl.policies import shared_policy
 
 SMALL = (
     "training.episodes=16",
@@ -28,7 +29,7 @@ EACH = pytest.mark.parametrize("agent", ["td3", "sac"])
 def make(folder, agent: str, *overrides: str, variant: str = "alcc") -> Trainer:
     cfg = compose(variant, f"agent={agent}", *SMALL, *overrides)
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    return Trainer(build_agent(cfg, POPULATION), env, cfg.training, cfg.seed, folder, identity(cfg))
+    return Trainer(make_agent(cfg), env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
 def weights(trainer: Trainer) -> torch.Tensor:
@@ -86,7 +87,7 @@ def batch(size: int = 64) -> TensorDict:
 
 @EACH
 def test_an_update_leaves_the_global_generator_alone(agent) -> None:
-    made = build_agent(compose("alcc", f"agent={agent}", *SMALL), POPULATION)
+    made = make_agent(compose("alcc", f"agent={agent}", *SMALL))
     before = torch.random.get_rng_state()
     made.update(batch())
     assert torch.equal(torch.random.get_rng_state(), before)
@@ -95,7 +96,7 @@ def test_an_update_leaves_the_global_generator_alone(agent) -> None:
 @EACH
 def test_the_value_learns_a_constant_reward(agent) -> None:
     overrides = ("agent.gamma=0", "agent.critic_lr=0.01")
-    made = build_agent(compose("alcc", f"agent={agent}", *SMALL, *overrides), POPULATION)
+    made = make_agent(compose("alcc", f"agent={agent}", *SMALL, *overrides))
     data = batch()
     data["next", "reward"].fill_(2.0)
     losses = [float(made.update(data)["loss_value"]) for _ in range(60)]
@@ -103,7 +104,7 @@ def test_the_value_learns_a_constant_reward(agent) -> None:
 
 
 def test_td3_moves_its_policy_every_second_update() -> None:
-    made = build_agent(compose("alcc", "agent=td3", *SMALL), POPULATION)
+    made = make_agent(compose("alcc", "agent=td3", *SMALL))
     policy = next(made.policy.parameters())
     moved = []
     for _ in range(4):
@@ -115,14 +116,14 @@ def test_td3_moves_its_policy_every_second_update() -> None:
 
 def test_sac_explores_around_the_policy_that_is_kept() -> None:
     cfg = compose("alcc", "agent=sac", *SMALL)
-    made = build_agent(cfg, POPULATION)
+    made = make_agent(cfg)
     env = build_env(cfg, wavy_profiles(), POPULATION, 512)
-    td = made.policy(env.reset())
-    kept = td["action"].clone()
-    spread = (made.noise(td)["action"] - kept).std()
+    td = shared_policy(made.policy)(env.reset())
+    kept = td[ACTION].clone()
+    spread = (made.noise(td)[ACTION] - kept).std()
     assert spread > 0.02
     made.noise.sigma.fill_(0.0)
-    assert torch.allclose(made.noise(td)["action"], kept, atol=1e-5)
+    assert torch.allclose(made.noise(td)[ACTION], kept, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -141,4 +142,4 @@ def test_sac_explores_around_the_policy_that_is_kept() -> None:
 )
 def test_impossible_settings(agent, override, words) -> None:
     with pytest.raises(ConfigError, match=words):
-        build_agent(compose("alcc", f"agent={agent}", override), POPULATION)
+        make_agent(compose("alcc", f"agent={agent}", override))

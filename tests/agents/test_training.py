@@ -7,13 +7,13 @@ import signal
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, compose, wavy_profiles
-from lcc_rl.agents.training import Trainer
+from helpers import ACTION, POPULATION, compose, make_agent, small_env, string, wavy_profiles
 
-from lcc_rl.agents.ddpg import Exploration
 from lcc_rl.agents.loop import episode_statistics
+from lcc_rl.agents.off_policy import Exploration
+from lcc_rl.agents.replay import Trainer, transitions
 from lcc_rl.config import identity
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_parquet, write_torch
 
@@ -31,7 +31,7 @@ SMALL = (
 def make(folder, *overrides: str) -> Trainer:
     cfg = compose("alcc", *SMALL, *overrides)
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    agent = build_agent(cfg, POPULATION)
+    agent = make_agent(cfg)
     return Trainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
@@ -124,6 +124,35 @@ def test_damaged_checkpoints(tmp_path, damage) -> None:
 def test_contradictory_lengths(tmp_path, override, words) -> None:
     with pytest.raises(ConfigError, match=words):
         make(tmp_path, override)
+
+
+def test_an_unknown_collector_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="collector must be one of string, torchrl, got 'ray'"):
+        make(tmp_path, "training.collector=ray")
+
+
+@pytest.mark.parametrize("vehicles", ["automated human", "(automated human)*2"])
+def test_torchrls_collector_gives_the_same_rows(tmp_path, vehicles) -> None:
+    rows = [
+        make(tmp_path / name, f"training.collector={name}", string(vehicles)).run()
+        for name in ("string", "torchrl")
+    ]
+    pd.testing.assert_frame_equal(*rows, check_exact=True)
+
+
+def test_every_vehicles_transition_is_learned_from() -> None:
+    env = small_env("alcc", 3, [string("(automated human)*2"), "scenario.horizon=10"])
+    data = env.rollout(10, break_when_any_done=False)
+    rows = transitions(data)
+    assert rows.shape == (3 * 10 * 2,)
+    assert rows["observation"].shape == (60, 7)
+    for key in ("reward", "done", "terminated"):
+        assert rows["next", key].shape == (60, 1), key
+    # Vehicles fastest, then steps; both of an episode end at once.
+    assert torch.equal(rows["action"].view(3, 10, 2, 1), data[ACTION])
+    done = data["next", "done"].unsqueeze(-2).expand(3, 10, 2, 1)
+    assert torch.equal(rows["next", "done"].view(3, 10, 2, 1), done)
+    assert done[:, -1].all()
 
 
 def test_divergence_stops_with_the_quantity_named(tmp_path) -> None:

@@ -6,15 +6,29 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import POPULATION, VARIANTS, compose, small_env, wavy_profiles
+from helpers import (
+    ACTION,
+    OBSERVATION,
+    POPULATION,
+    REWARD,
+    TERMS,
+    VARIANTS,
+    compose,
+    followers,
+    network,
+    small_env,
+    steady,
+    wavy_profiles,
+)
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource
+from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.clock import Clock
-from lcc_rl.envs.factory import build_agent, build_env, load_inputs
+from lcc_rl.envs.step import Step, closure, entries, pieces_of
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.power import motor_power
@@ -24,7 +38,7 @@ T = 0.1
 
 
 def play(env, actions):
-    """Step through actions ``[time, *batch, 1]`` without resets; returns the list of moments."""
+    """Step through actions ``[time, *batch, A, 1]`` without resets; returns the list of moments."""
     td = env.reset()
     return [td, *play_from(env, td, actions)]
 
@@ -44,58 +58,57 @@ def test_no_batch_of_episodes_is_refused(size, words) -> None:
         small_env("alcc", size)
 
 
-@pytest.mark.parametrize("followers", [1, 4])
-def test_number_of_followers_is_a_dimension(followers) -> None:
-    env = small_env("alcc", 3, [f"scenario.followers={followers}"])
+@pytest.mark.parametrize("count", [1, 4])
+def test_number_of_vehicles_is_a_dimension(count) -> None:
+    env = small_env("alcc", 3, [followers(count)])
     check_env_specs(env)
     data = env.rollout(5)
-    assert data["hdv", "speed"].shape == (3, 5, followers, 1)
-    assert data["observation"].shape[-1] == 7
+    assert data["vehicles", "speed"].shape == (3, 5, count + 1, 1)
+    assert data[OBSERVATION].shape == (3, 5, 1, 7)
 
 
 def test_rollout_follows_the_equations() -> None:
-    env = small_env("alcc", 5, ["scenario.pieces.hdv.noise=0"])
+    env = small_env("alcc", 5, ["scenario.controllers.human.noise=0"])
     data = env.rollout(20, break_when_any_done=False)
-    leader, cav, hdv = data["leader"], data["cav"], data["hdv"]
+    leader, speed, gap = data["leader"], *(data["vehicles", x] for x in ("speed", "gap"))
     after = data["next"]
-    # The CAV moves by its action: v' = v + 3·action·T unless it stops.
-    moved = (cav["speed"] + 3.0 * data["action"] * T).clamp(min=0.0)
-    torch.testing.assert_close(after["cav", "speed"], moved)
+    cav, reached = speed[..., 0, :], after["vehicles", "speed"][..., 0, :]
+    # The automated vehicle moves by its action: v' = v + 3·action·T unless it stops.
+    moved = (cav + 3.0 * data[ACTION][..., 0, :] * T).clamp(min=0.0)
+    torch.testing.assert_close(reached, moved)
     # Gaps are the integral of relative speed by the trapezoidal rule.
-    closing = leader["speed"] - cav["speed"] + after["leader", "speed"] - after["cav", "speed"]
-    torch.testing.assert_close(after["cav", "gap"], cav["gap"] + 0.05 * closing)
+    closing = leader["speed"] - cav + after["leader", "speed"] - reached
+    torch.testing.assert_close(after["vehicles", "gap"][..., 0, :], gap[..., 0, :] + 0.05 * closing)
     # Power: A2 of the speed at the start and the acceleration executed.
-    power = motor_power(cav["speed"], (after["cav", "speed"] - cav["speed"]) / T)
-    torch.testing.assert_close(after["cav", "power"], power, rtol=1e-3, atol=2.0)
+    power = motor_power(speed, (after["vehicles", "speed"] - speed) / T)
+    torch.testing.assert_close(after["vehicles", "power"], power, rtol=1e-3, atol=2.0)
     # The reward is the sum of its terms; energy is −P/20000·T.
-    terms = after["reward_terms"]
-    torch.testing.assert_close(after["reward"], sum(terms.values()))
-    torch.testing.assert_close(terms["cav_energy"], -after["cav", "power"] / 20000 * T)
-    predicted = after["hdv", "predicted_power"].sum(-2)
+    terms = after[TERMS]
+    torch.testing.assert_close(after[REWARD], sum(terms.values()))
+    own = after["vehicles", "power"][..., :1, :]
+    torch.testing.assert_close(terms["cav_energy"], -own / 20000 * T)
+    predicted = after["human", "predicted_power"].sum(-2, keepdim=True)
     torch.testing.assert_close(terms["hdv_energy"], -predicted / 20000 * T)
-    assert hdv["driver"].unique().numel() > 1
+    assert data["human", "driver"].unique().numel() > 1
 
 
 def test_initial_state() -> None:
-    nominal = TensorDict({("cav", "gap_factor"): torch.ones(6, 1)}, [6])
-    td = small_env("alcc", 6).reset(nominal)
-    speed = td["leader", "speed"]
-    assert torch.equal(td["cav", "speed"], speed)
-    assert torch.equal(td["hdv", "speed"].squeeze(-2), speed)
-    torch.testing.assert_close(td["cav", "gap"], 2.0 + 1.5 * speed)
-    hdv = td["hdv"]
-    gap = equilibrium_gap(
-        hdv["speed"], hdv["desired_speed"], hdv["desired_time_gap"], POPULATION.constants
+    td = small_env("alcc", 6, nominal=True).reset()
+    lead, speed, gap = td["leader", "speed"], *(td["vehicles", x] for x in ("speed", "gap"))
+    assert torch.equal(speed, lead.unsqueeze(-2).expand(6, 2, 1))
+    torch.testing.assert_close(gap[:, 0], 2.0 + 1.5 * lead)
+    human = td["human"]
+    expected = equilibrium_gap(
+        speed[:, 1:], human["desired_speed"], human["desired_time_gap"], POPULATION.constants
     )
-    torch.testing.assert_close(hdv["gap"], gap)
+    torch.testing.assert_close(gap[:, 1:], expected)
 
 
 def test_training_starts_at_many_gaps() -> None:
     td = small_env("alcc", 200).reset()
-    factor = td["cav", "gap"] / (2.0 + 1.5 * td["cav", "speed"])
-    torch.testing.assert_close(factor, td["cav", "gap_factor"])
+    factor = td["vehicles", "gap"][:, 0] / (2.0 + 1.5 * td["vehicles", "speed"][:, 0])
     assert 0.1 <= factor.min() < 0.2
-    assert 1.4 < factor.max() <= 1.5
+    assert 1.4 < factor.max() <= 1.5 + 1e-5
 
 
 def test_leader_plays_the_profile_that_is_asked_for() -> None:
@@ -104,7 +117,7 @@ def test_leader_plays_the_profile_that_is_asked_for() -> None:
         {
             ("leader", "profile"): torch.tensor([[2], [0]]),
             ("leader", "start"): torch.tensor([[7], [300]]),
-            ("hdv", "driver"): torch.tensor([[[5]], [[9]]]),
+            ("human", "driver"): torch.tensor([[[5]], [[9]]]),
         },
         [2],
     )
@@ -113,7 +126,7 @@ def test_leader_plays_the_profile_that_is_asked_for() -> None:
     expected = torch.stack([profiles.record(2)[8:28], profiles.record(0)[301:321]])
     assert torch.equal(data["next", "leader", "speed"].squeeze(-1), expected)
     drawn = POPULATION.time_gap[torch.tensor([5, 9])]
-    assert torch.equal(data["hdv", "desired_time_gap"][:, 0].flatten(), drawn)
+    assert torch.equal(data["human", "desired_time_gap"][:, 0].flatten(), drawn)
 
 
 def test_one_profile_for_every_episode() -> None:
@@ -129,7 +142,7 @@ def test_one_profile_for_every_episode() -> None:
     ("key", "value", "words"),
     [
         (("leader", "profile"), torch.tensor([[99]]), "profile ids"),
-        (("hdv", "driver"), torch.tensor([[[100000]]]), "driver ids"),
+        (("human", "driver"), torch.tensor([[[100000]]]), "driver ids"),
     ],
 )
 def test_unknown_ids_are_refused(key, value, words) -> None:
@@ -145,50 +158,51 @@ def test_same_seed_same_episodes_and_other_seed_others() -> None:
 
 def test_episode_seed_replays_an_episode_wherever_it_stands() -> None:
     env = small_env("alcc", 4)
-    actions = torch.zeros(20, 4, 1)
+    actions = torch.zeros(20, 4, 1, 1)
     td = env.reset()
     seeds = td["episode", "seed"]
-    first = torch.stack([m["hdv", "speed"] for m in play_from(env, td, actions)])
+    first = torch.stack([m["vehicles", "speed"] for m in play_from(env, td, actions)])
     turned = env.reset(TensorDict({("episode", "seed"): seeds.flip(0)}, [4]))
-    second = torch.stack([m["hdv", "speed"] for m in play_from(env, turned, actions)])
+    second = torch.stack([m["vehicles", "speed"] for m in play_from(env, turned, actions)])
     assert torch.equal(first, second.flip(1))
 
 
 def play_from(env, td, actions):
     moments = []
     for action in actions:
-        td = step_mdp(env.step(td.set("action", action)))
+        td = step_mdp(env.step(td.set(ACTION, action)))
         moments.append(td)
     return moments
 
 
 def test_noise_is_within_bounds_and_the_same_for_every_controller() -> None:
-    quiet = small_env("alcc", 64, ["scenario.pieces.hdv.noise=0"], seed=3)
+    quiet = small_env("alcc", 64, ["scenario.controllers.human.noise=0"], seed=3)
     noisy = small_env("alcc", 64, seed=3)
-    zero = torch.zeros(1, 64, 1)
-    a, b = play(quiet, zero)[-1], play(noisy, zero)[-1]
+    zero = torch.zeros(1, 64, 1, 1)
+    a, b = (play(env, zero)[-1]["vehicles", "acceleration"][:, 1] for env in (quiet, noisy))
     # Dividing tiny accelerations is noise of another kind.
-    firm = a["hdv", "acceleration"].abs() > 0.05
-    ratio = (b["hdv", "acceleration"] / a["hdv", "acceleration"])[firm]
+    firm = a.abs() > 0.05
+    ratio = (b / a)[firm]
     assert ((ratio > 1.0 - 1e-4) & (ratio < 1.05 + 1e-4)).all()
     assert ratio.std() > 0.005
 
 
 def test_collision_terminates_and_is_penalised() -> None:
     env = small_env("alcc", 2, ["scenario.horizon=100"])
-    data = env.rollout(100, lambda td: td.set("action", torch.ones(2, 1)), break_when_any_done=True)
+    data = env.rollout(100, steady(1.0, env), break_when_any_done=True)
     last = data[:, -1]["next"]
     crashed = last["terminated"].squeeze(-1)
     assert crashed.any()
     assert torch.equal(last["done"], last["terminated"])
     assert not last["truncated"].any()
-    assert (last["cav", "gap"][crashed] <= 0).all()
-    assert (last["reward_terms", "collision"][crashed] == -100.0).all()
-    assert (data["next", "reward_terms", "collision"][:, :-1] == 0.0).all()
+    assert (last["vehicles", "gap"][crashed][:, 0] <= 0).all()
+    penalty = data["next", *TERMS, "collision"]
+    assert (penalty[:, -1][crashed] == -100.0).all()
+    assert (penalty[:, :-1] == 0.0).all()
 
 
 def test_horizon_truncates() -> None:
-    data = small_env("idm", 2).rollout(20, lambda td: td.set("action", torch.zeros(2, 1)))
+    data = small_env("idm", 2).rollout(20)
     assert data.shape == (2, 20)
     last = data[:, -1]["next"]
     assert last["truncated"].all()
@@ -198,19 +212,22 @@ def test_horizon_truncates() -> None:
 
 def test_gradient_from_energies_to_actions_matches_finite_differences() -> None:
     # Over 300 steps, in double precision; actions small enough not to collide.
-    cfg = compose("alcc", "scenario.horizon=300", "scenario.pieces.hdv.noise=0")
+    cfg = compose("alcc", "scenario.horizon=300", "scenario.controllers.human.noise=0")
     env = build_env(cfg, wavy_profiles(), POPULATION, 2, seed=5)
     for piece in env.transform:
         piece.double()
     start = env.reset().apply(lambda x: x.double() if x.is_floating_point() else x)
     actions = 0.05 * torch.sin(torch.arange(300, dtype=torch.float64) / 7.0)
-    actions = actions.view(-1, 1, 1).repeat(1, 2, 1)
+    actions = actions.view(-1, 1, 1, 1).repeat(1, 2, 1, 1)
+    # The motion and the power are all that the energies depend on.
+    advance = Step(closure(pieces_of(env), {("vehicles", "power")}), 300)
 
     def energy(chosen):
-        td, total = start.clone(), 0.0
+        state, total = entries(start), 0.0
         for action in chosen:
-            td = env.step(td.set("action", action))["next"].exclude("reward", "reward_terms")
-            total = total + (td["cav", "power"] + td["hdv", "power"].sum(-2)).sum() * T / 1e3
+            reached = advance({**state, ACTION: action})
+            total = total + reached["vehicles", "power"].sum() * T / 1e3
+            state = {key: reached.get(key, value) for key, value in state.items()}
         return total
 
     chosen = actions.clone().requires_grad_()
@@ -221,26 +238,25 @@ def test_gradient_from_energies_to_actions_matches_finite_differences() -> None:
         shifted = [actions.clone() for _ in range(2)]
         shifted[0][step, 1] += 1e-4
         shifted[1][step, 1] -= 1e-4
-        difference = (energy(shifted[0]) - energy(shifted[1])) / 2e-4
-        torch.testing.assert_close(gradient[step, 1, 0], difference, rtol=1e-2, atol=1e-3)
+        with torch.no_grad():
+            difference = (energy(shifted[0]) - energy(shifted[1])) / 2e-4
+        torch.testing.assert_close(gradient[step, 1, 0, 0], difference, rtol=1e-2, atol=1e-3)
 
 
 def test_compiled_step_agrees_with_eager() -> None:
     env = small_env("alcc", 4)
-    pieces = [piece for piece in env.transform if type(piece).__name__ == "IDMFollower"]
-    compiled = torch.compile(pieces[0].compute, fullgraph=True, backend="aot_eager")
+    piece = next(piece for piece in env.transform if type(piece).__name__ == "IDM")
+    compiled = torch.compile(piece.compute, fullgraph=True, backend="aot_eager")
     data = env.rollout(5)
-    entries = [
-        (data["next"].get(key) if late else data.get(key)) for late, key in pieces[0]._sources
-    ]
-    for eager, fast in zip(pieces[0].compute(*entries), compiled(*entries), strict=True):
-        torch.testing.assert_close(eager, fast, rtol=1e-5, atol=1e-5)
+    # Steps and episodes side by side: the seed of each broadcasts over its vehicles.
+    found = [data.reshape(-1).get(key) for key in piece.in_keys]
+    torch.testing.assert_close(piece.compute(*found), compiled(*found), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own
 def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
-    policy = build_agent(compose("alcc"), POPULATION).policy
+    policy = network(compose("alcc"))
     runs = []
     for compiled in (False, True):
         env = small_env("alcc", 64, ["scenario.horizon=300"], seed=2)
@@ -248,39 +264,31 @@ def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
             env.compile(warmup=1)
         with torch.no_grad():
             runs.append(env.rollout(300, policy, break_when_any_done=False)["next"])
-    for key in (("cav", "gap"), ("hdv", "speed"), ("hdv", "predicted_acceleration"), "reward"):
+    keys = (("vehicles", "gap"), ("vehicles", "speed"), ("human", "predicted_acceleration"), REWARD)
+    for key in keys:
         difference = (runs[0][key] - runs[1][key]).abs()
         # Until the first collision; what follows depends on rounding.
-        running = ~runs[0]["terminated"].cumsum(1).bool()
-        running = running.unsqueeze(-1) if difference.ndim > running.ndim else running
+        running = ~runs[0]["terminated"].cumsum(1).bool().unsqueeze(-1)
         assert (difference * running).max() < 1e-3 * runs[0][key].abs().max(), key
 
 
-def test_idm_in_the_cars_place_follows_well() -> None:
-    cfg = compose("idm", "scenario.horizon=300")
-    env = build_env(cfg, wavy_profiles(), POPULATION, 16)
-    policy = build_agent(cfg, POPULATION).policy
+def test_idm_in_the_automated_vehicles_place_follows_well() -> None:
+    env = small_env("idm", 16, ["scenario.horizon=300"])
     with torch.no_grad():
-        data = env.rollout(300, policy, break_when_any_done=False)
-    assert (data["next", "cav", "gap"] > 0.5).all()
+        data = env.rollout(300, break_when_any_done=False)
+    assert (data["next", "vehicles", "gap"][..., 0, :] > 0.5).all()
     assert not data["next", "terminated"].any()
     # It really follows: after the start, its time gap stays near 1.2 s, not at the limits.
-    assert data["next", "cav", "time_gap"][:, 100:].median() < 2.5
+    assert data["next", "vehicles", "time_gap"][:, 100:, 0].median() < 2.5
 
 
 def test_sampled_idm_draws_drivers_per_episode() -> None:
-    cfg = compose("idm", "agent.sampled=true")
-    env = build_env(cfg, wavy_profiles(), POPULATION, 64)
-    td = env.reset(
-        TensorDict(
-            {
-                ("leader", "profile"): torch.zeros(64, 1, dtype=torch.int64),
-                ("leader", "start"): torch.zeros(64, 1, dtype=torch.int64),
-            },
-            [64],
-        )
-    )
-    assert build_agent(cfg, POPULATION).policy(td)["action"].unique().numel() > 10
+    own = [f"scenario.controllers.automated.{name}=null" for name in ("desired_speed", "time_gap")]
+    env = small_env("idm", 64, own)
+    same = torch.zeros(64, 1, dtype=torch.int64)
+    td = env.reset(TensorDict({("leader", "profile"): same, ("leader", "start"): same}, [64]))
+    command = env.step(td)["next", "vehicles", "command"][:, 0]
+    assert command.unique().numel() > 10
 
 
 def test_profile_shorter_than_the_horizon() -> None:
@@ -297,10 +305,10 @@ def test_clock_refuses_an_empty_horizon() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cuda_agrees_with_cpu() -> None:
     cfg = compose("alcc")
-    zero = torch.zeros(20, 8, 1)
+    zero = torch.zeros(20, 8, 1, 1)
     cpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8), zero)[-1]
     gpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8, device="cuda"), zero.cuda())[-1]
-    torch.testing.assert_close(cpu["hdv", "speed"], gpu["hdv", "speed"].cpu())
+    torch.testing.assert_close(cpu["vehicles", "speed"], gpu["vehicles", "speed"].cpu())
 
 
 def test_the_runs_of_a_sweep_share_the_data_while_its_files_stay_the_same(
@@ -315,7 +323,7 @@ def test_the_runs_of_a_sweep_share_the_data_while_its_files_stay_the_same(
     monkeypatch.setattr(EpisodesSource, "load", lambda own: (read.append(own.path), load(own))[1])
     alone = [load_inputs(cfg) for _ in range(2)]
     assert len(read) == 2
-    monkeypatch.setattr("lcc_rl.envs.factory.is_sweep", lambda: True)
+    monkeypatch.setattr("lcc_rl.envs.inputs.is_sweep", lambda: True)
     shared = [load_inputs(cfg) for _ in range(2)]
     assert len(read) == 3
     for inputs in shared:

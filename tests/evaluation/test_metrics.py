@@ -1,5 +1,6 @@
 """Measures of an episode against values worked out by hand."""
 
+import pytest
 import torch
 
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures
@@ -24,13 +25,15 @@ def test_energy_counts_only_the_running_steps() -> None:
 
 
 def test_safety() -> None:
+    # [time, episodes, vehicles, 1]: one vehicle in each of two episodes.
     series = {
         "ttc": torch.tensor([[3.0, 5.0], [1e3, 0.01]]),
         "time_gap": torch.tensor([[2.6, 1.0], [1.0, 9.0]]),
         "gap": torch.tensor([[8.0, 3.0], [7.0, -1.0]]),
         "jerk": torch.tensor([[3.0, 2.0], [4.0, 50.0]]),
     }
-    measures = safety_measures(series, ALIVE, 0.1)
+    series = {name: value.view(2, 2, 1, 1) for name, value in series.items()}
+    measures = safety_measures(series, ALIVE.view(2, 2, 1, 1), 0.1)
     expected = {
         "min_gap_m": [7.0, 3.0],
         "min_ttc_s": [3.0, 5.0],
@@ -40,5 +43,24 @@ def test_safety() -> None:
         "rms_jerk_mps3": [12.5**0.5, 2.0],  # √((9 + 16)/2)
         "duration_s": [0.2, 0.1],
     }
+    assert set(measures) == set(expected)
     for name, values in expected.items():
-        torch.testing.assert_close(measures[name], torch.tensor(values))
+        torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
+
+
+def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> None:
+    series = {
+        "ttc": torch.tensor([[3.0, 5.0], [1e3, 2.0]]),
+        "time_gap": torch.tensor([[2.6, 1.0], [1.0, 1.0]]),
+        "gap": torch.tensor([[8.0, 3.0], [7.0, 4.0]]),
+        "jerk": torch.tensor([[3.0, 0.0], [4.0, 0.0]]),
+    }
+    series = {name: value.view(2, 1, 2, 1) for name, value in series.items()}
+    measures = safety_measures(series, torch.ones(2, 1, 1, 1, dtype=torch.bool), 0.1)
+    found = {name: float(value) for name, value in measures.items()}
+    assert found["min_gap_m"] == 3.0
+    assert found["min_ttc_s"] == 2.0
+    assert found["max_time_gap_s"] == pytest.approx(2.6)
+    # Unsafe in half of the time each; too long in half of one's time.
+    assert found["share_ttc_unsafe"] == pytest.approx(0.5)
+    assert found["share_time_gap_long"] == pytest.approx(0.25)

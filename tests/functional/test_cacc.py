@@ -11,16 +11,20 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.cacc import (
     Errors,
     Gains,
-    PlatoonReward,
     cacc_acceleration,
     dead_beat_acceleration,
-    hybrid_decision,
-    jerk_interval,
+    find_chains,
     next_leader_speed,
     platoon_errors,
+)
+from lcc_rl.functional.hcfs import (
+    PlatoonReward,
+    hybrid_decision,
+    jerk_interval,
     safe_acceleration,
 )
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
+from lcc_rl.functional.string import entries_ahead
 
 T, A_MAX = 0.2, 3.0
 NAMED = {
@@ -28,6 +32,12 @@ NAMED = {
     "paper_like": Gains(0.072, 0.168, 0.939, 0.023),
     "tuned": Gains(0.04, 0.12, 1.4, 1.3),
 }
+
+
+def errors_behind(v0, speed, gap, headway, delay) -> Errors:
+    """The errors of a platoon all of whose vehicles, the leader included, send and hear."""
+    lead = v0.unsqueeze(-2).expand_as(speed)
+    return platoon_errors(entries_ahead(v0, speed), lead, speed, gap, headway, delay)
 
 
 def column(*values: float) -> torch.Tensor:
@@ -43,7 +53,7 @@ def test_errors_from_positions() -> None:
     x0, x1, x2 = 100.0, 88.0, 81.0
     gap = column(x0 - x1 - length, x1 - x2 - length)
     v0, v = torch.tensor([10.0], dtype=torch.float64), column(9.0, 12.0)
-    errors = platoon_errors(v0, v, gap, headway, delay=0.0)
+    errors = errors_behind(v0, v, gap, headway, delay=0.0)
     torch.testing.assert_close(errors.gap, column(2.0, -3.0))
     torch.testing.assert_close(errors.speed, column(1.0, -3.0))
     torch.testing.assert_close(errors.leader_gap, column(2.0, x0 - x2 - 2 * 10.0))
@@ -52,10 +62,20 @@ def test_errors_from_positions() -> None:
 
 def test_delay_acts_on_what_is_received() -> None:
     gap, v0, v = column(5.0, 5.0), torch.tensor([10.0], dtype=torch.float64), column(8.0, 8.0)
-    late, now = (platoon_errors(v0, v, gap, 5.0, delay) for delay in (0.005, 0.0))
+    late, now = (errors_behind(v0, v, gap, 5.0, delay) for delay in (0.005, 0.0))
     torch.testing.assert_close(late.gap - now.gap, column(-0.05, -0.04))
     torch.testing.assert_close(late.leader_gap - now.leader_gap, column(-0.05, -0.05))
     assert torch.equal(late.speed, now.speed)
+
+
+def test_chains_of_a_mixed_string() -> None:
+    connected = torch.tensor([[True, True, False, True, True, True], [False, True, True] * 2])
+    chain = find_chains(connected, leader_sends=True)
+    assert chain.first.tolist() == [[0, 0, 2, 3, 3, 3], [0, 1, 1, 3, 4, 4]]
+    hears = chain.hears.squeeze(-1)
+    assert hears[0].tolist() == [True, True, False, False, True, True]
+    assert hears[1].tolist() == [False, False, True, False, False, True]
+    assert not find_chains(connected, leader_sends=False).hears[0, 0]
 
 
 # -- CACC ------------------------------------------------------------------------------------------
@@ -76,7 +96,7 @@ def closed_loop(gains: Gains, followers: int = 3) -> torch.Tensor:
 
     def step(state: torch.Tensor) -> torch.Tensor:
         gap, speed = state[:followers, None], state[followers:, None]
-        errors = platoon_errors(v0, speed, gap, 5.0, 0.005)
+        errors = errors_behind(v0, speed, gap, 5.0, 0.005)
         wanted = cacc_acceleration(errors, gains, T, 1e9)
         reached, _ = advance_speed(speed, wanted, T)
         ahead, ahead_reached = errors.speed + speed, torch.cat([v0[None], reached[:-1]])
@@ -175,7 +195,7 @@ def test_dead_beat_reaches_the_target_in_one_step() -> None:
 
 def test_lookaheads() -> None:
     v, a, true = torch.tensor([1.0]), torch.tensor([-6.0]), torch.tensor([0.7])
-    got = [float(next_leader_speed(v, a, true, mode, T)) for mode in ("causal", "hold", "oracle")]
+    got = [float(next_leader_speed([v, a, true], mode, T)) for mode in ("causal", "hold", "oracle")]
     assert got == pytest.approx([0.0, 1.0, 0.7])  # 1 − 1.2 < 0: nobody drives backwards
 
 

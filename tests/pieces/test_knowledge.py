@@ -6,9 +6,8 @@ import math
 
 import pytest
 import torch
-from helpers import POPULATION, compose, small_env, wavy_profiles
+from helpers import ACTION, OBSERVATION, compose, network, small_env, steady, wavy_profiles
 
-from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import LeaderPreview, Observation, ObservationMemory
 
@@ -17,25 +16,26 @@ FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1
 
 def played(*overrides: str):
     env = small_env("alcc", 2, [*FIRST, *overrides])
-    return env.rollout(20, lambda td: td.set("action", torch.zeros(2, 1)))
+    return env.rollout(20, steady(0.0, env))
 
 
 def test_preview_is_what_the_leader_will_do() -> None:
     data = played("+knowledge=preview", "scenario.pieces.preview.horizons=[0,0.5]")
-    seen, leader = data["preview", "speed"][0], data["leader", "speed"][0, :, 0]
+    seen, leader = data["preview", "speed"][0, :, 0], data["leader", "speed"][0, :, 0]
     assert torch.equal(seen[:, 0], leader)
     assert torch.equal(seen[:-5, 1], leader[5:])
     # It is part of the observation: the difference from the present, scaled.
     difference = seen - leader.unsqueeze(-1)
-    assert torch.allclose(data["observation"][0, :, -2:], 0.5 * difference)
+    assert torch.allclose(data[OBSERVATION][0, :, 0, -2:], 0.5 * difference)
 
 
 def test_differences_are_taken_in_equal_parts() -> None:
-    two = "scenario.pieces.memory.sources=[leader.speed,cav.gap]"
+    two = "scenario.pieces.memory.sources=[ahead.speed,self.gap]"
     data = played("+knowledge=memory", "scenario.pieces.memory.seconds=[1.0,2.0]", two)
-    present = torch.cat([data["leader", "speed"], data["cav", "gap"]], -1)
+    own = data["vehicles", "gap"][..., :1, :]
+    present = torch.cat([data["leader", "speed"].unsqueeze(-2), own], -1)
     difference = data["memory", "entries"] - present.repeat_interleave(2, -1)
-    assert torch.allclose(data["observation"][..., -4:], 0.5 * difference, atol=1e-5)
+    assert torch.allclose(data[OBSERVATION][..., -4:], 0.5 * difference, atol=1e-5)
     assert difference.abs().max() > 0.1
 
 
@@ -43,14 +43,14 @@ def test_a_delayed_preview_is_an_older_one() -> None:
     late = ["scenario.pieces.preview.horizons=[0.5]", "scenario.pieces.preview.delay=0.2"]
     data = played("+knowledge=preview", *late)
     leader = data["leader", "speed"][0, :, 0]
-    assert torch.equal(data["preview", "speed"][0, :-3, 0], leader[3:])
+    assert torch.equal(data["preview", "speed"][0, :-3, 0, 0], leader[3:])
 
 
 def test_beyond_the_record_its_last_speed_stands() -> None:
     profiles = wavy_profiles(samples=30)
     piece = LeaderPreview(profiles, 0.1, [60.0])
     zero = torch.zeros(1, dtype=torch.int64)
-    assert piece.compute(zero, zero, zero, zero)[0] == profiles.record(0)[-1]
+    assert piece.compute(zero, zero, zero, zero)[0, 0] == profiles.record(0)[-1]
 
 
 def test_a_window_goes_on_in_the_record_it_was_cut_from() -> None:
@@ -60,7 +60,7 @@ def test_a_window_goes_on_in_the_record_it_was_cut_from() -> None:
     at = torch.tensor([80])
     for window in (0, 1):  # of the first record: samples 0…100 and 101…201
         ahead = piece.compute(torch.tensor([window]), 0 * at, at, at)
-        assert ahead[0] == whole.record(0)[101 * window + 130]
+        assert ahead[0, 0] == whole.record(0)[101 * window + 130]
     assert cut.lengths.tolist() == [101] * len(cut)
     assert torch.equal(cut.record(1), whole.record(0)[101:202])
 
@@ -78,14 +78,14 @@ def test_noise_is_as_large_as_stated_and_repeats_with_the_seed() -> None:
 def test_stacked_memory_is_what_was_measured() -> None:
     settings = ["scenario.pieces.memory.kind=stacked", "scenario.pieces.memory.seconds=[0.5]"]
     data = played("+knowledge=memory", *settings)
-    past, leader = data["memory", "entries"][0, :, 0], data["leader", "speed"][0, :, 0]
+    past, leader = data["memory", "entries"][0, :, 0, 0], data["leader", "speed"][0, :, 0]
     assert torch.equal(past[5:], leader[:-5])
     assert (past[:5] == leader[0]).all()
 
 
 def test_filtered_memory_is_the_exponential_average() -> None:
     data = played("+knowledge=memory", "scenario.pieces.memory.seconds=[2.0]")
-    average, leader = data["memory", "entries"][0, :, 0], data["leader", "speed"][0, :, 0]
+    average, leader = data["memory", "entries"][0, :, 0, 0], data["leader", "speed"][0, :, 0]
     share, expected = 1.0 - math.exp(-0.05), [leader[0].item()]
     for speed in leader[1:].tolist():
         expected.append(expected[-1] + share * (speed - expected[-1]))
@@ -94,17 +94,26 @@ def test_filtered_memory_is_the_exponential_average() -> None:
 
 def test_plain_values_on_request() -> None:
     data = played("+knowledge=preview", "observation.relative_to.preview=null")
-    assert torch.allclose(data["observation"][..., -5:], 0.5 * data["preview", "speed"])
+    assert torch.allclose(data[OBSERVATION][..., -5:], 0.5 * data["preview", "speed"])
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac", "analytic"])
 @pytest.mark.parametrize("knowledge", ["memory", "preview"])
 @pytest.mark.parametrize("variant", ["alcc", "reference"])
 def test_every_agent_can_use_it(agent, knowledge, variant) -> None:
-    cfg = compose(variant, f"agent={agent}", f"+knowledge={knowledge}")
-    env = build_env(cfg, wavy_profiles(), POPULATION, 3)
-    policy = build_agent(cfg, POPULATION).policy
-    assert env.rollout(5, policy)["action"].shape == (3, 5, 1)
+    overrides = [f"agent={agent}", f"+knowledge={knowledge}"]
+    env = small_env(variant, 3, overrides)
+    policy = network(compose(variant, *overrides))
+    assert env.rollout(5, policy)[ACTION].shape == (3, 5, 1, 1)
+
+
+def test_every_vehicle_of_a_string_remembers_what_it_saw() -> None:
+    settings = ["scenario.pieces.memory.kind=stacked", "scenario.pieces.memory.seconds=[0.5]"]
+    mixed = "scenario.string='automated human automated'"
+    data = played("+knowledge=memory", *settings, mixed)
+    past, speed = data["memory", "entries"][0, ..., 0], data["vehicles", "speed"][0, ..., 0]
+    assert torch.equal(past[5:, 1], speed[:-5, 1])
+    assert torch.equal(past[5:, 0], data["leader", "speed"][0, :-5, 0])
 
 
 @pytest.mark.parametrize(
@@ -118,12 +127,12 @@ def test_every_agent_can_use_it(agent, knowledge, variant) -> None:
         (lambda: ObservationMemory(0.1, kind="remembered"), "remembered"),
         (lambda: ObservationMemory(0.1, seconds=[0.0]), "shorter than a step"),
         (lambda: ObservationMemory(0.1, sources=[]), "sources"),
-        (lambda: Observation({"cav": {"speed": 1}}, relative_to={"hdv": "cav.speed"}), "to.hdv"),
+        (lambda: Observation({"self": {"gap": 1}}, relative_to={"ahead": "self.gap"}), "to.ahead"),
         (
             lambda: Observation(
                 {"memory": {"entries": 1}},
                 widths={"memory": 3},
-                relative_to={"memory": ["cav.gap", "cav.speed"]},
+                relative_to={"memory": ["self.gap", "self.speed"]},
             ),
             "2 entries do not divide its 3",
         ),

@@ -12,6 +12,7 @@ from lcc_rl.pieces import (
     EnergyReward,
     SafetyReward,
     TotalReward,
+    parse_string,
 )
 
 
@@ -42,15 +43,77 @@ def test_energy() -> None:
     # −20 kW/20 kW · 0.1 s; recuperation earns.
     got = EnergyReward(0.1).reward(t(20000.0, -5000.0))
     torch.testing.assert_close(got, t(-0.1, 0.025))
-    string = torch.tensor([[[20000.0], [10000.0]]])
-    got = EnergyReward(0.1, followers=True).reward(string)
-    torch.testing.assert_close(got, t(-0.15))
 
 
-def test_collision_and_weights() -> None:
-    crashed = torch.tensor([[True], [False]])
-    torch.testing.assert_close(CollisionPenalty(weight=100.0).compute(crashed), t(-100.0, 0.0))
+def test_weights() -> None:
     torch.testing.assert_close(EfficiencyReward(weight=0.5).compute(t(3.0)), t(-0.5))
+
+
+# -- many automated vehicles -------------------------------------------------------------------
+
+# Places: automated 0, human 1 and 2, automated 3, human 4 and 5.
+STRING = parse_string("(automated human*2)*2")
+RING = parse_string("(automated human*2)*2", "ring")
+POWER = torch.tensor([1.0, 10.0, 100.0, 2.0, 20.0, 200.0]).view(1, 6, 1) * 1000.0
+GAPS = torch.full((1, 6, 1), 5.0)
+
+
+@pytest.mark.parametrize(
+    ("of", "earned"),
+    [("self", (1.0, 2.0)), ("behind", (110.0, 220.0)), ("string", (333.0, 333.0))],
+)
+def test_whose_energy_counts(of, earned) -> None:
+    term = EnergyReward(0.1, of=of, scale=1000.0, string=STRING)
+    torch.testing.assert_close(term.compute(POWER), -0.1 * t(*earned).unsqueeze(0))
+
+
+def test_estimated_energy_of_the_human_drivers_behind() -> None:
+    # The same section, of an entry that only human drivers have.
+    term = EnergyReward(
+        0.1, of="behind", scale=1000.0, power="human.predicted_power", string=STRING
+    )
+    humans = POWER[:, [1, 2, 4, 5]]
+    assert term.in_keys == [("human", "predicted_power")]
+    torch.testing.assert_close(term.compute(humans), -0.1 * t(110.0, 220.0).unsqueeze(0))
+
+
+def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
+    string = parse_string("human (automated human)*2", "ring")
+    term = EnergyReward(0.1, of="behind", scale=1000.0, string=string)
+    power = 1000.0 * torch.tensor([1.0, 10.0, 100.0, 2.0, 20.0]).view(1, 5, 1)
+    torch.testing.assert_close(term.compute(power), -0.1 * t(100.0, 21.0).unsqueeze(0))
+    assert torch.equal(
+        EnergyReward(0.1, of="behind", string=RING).compute(POWER),
+        EnergyReward(0.1, of="behind", string=STRING).compute(POWER),
+    )
+
+
+@pytest.mark.parametrize(
+    ("hit", "behind", "pays"),
+    [
+        ((0,), True, (1.0, 0.0)),
+        ((3,), True, (0.0, 1.0)),  # of one automated vehicle into a human: the one that hit
+        ((3,), False, (0.0, 1.0)),
+        ((1,), True, (1.0, 0.0)),
+        ((2,), True, (1.0, 0.0)),
+        ((1,), False, (0.0, 0.0)),
+        ((5,), True, (0.0, 1.0)),
+        ((0, 4), True, (1.0, 1.0)),
+        ((), True, (0.0, 0.0)),
+    ],
+)
+def test_who_pays_for_a_collision(hit, behind, pays) -> None:
+    gaps = GAPS.clone()
+    gaps[:, list(hit)] = -0.1
+    term = CollisionPenalty(weight=100.0, behind=behind, string=STRING)
+    entries = {("vehicles", "gap"): gaps}
+    got = term.compute(*(entries[key] for key in term.in_keys))
+    torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))
+
+
+def test_what_is_unknown_is_refused() -> None:
+    with pytest.raises(ConfigError, match="of must be self, behind or string, got 'all'"):
+        EnergyReward(0.1, of="all")
 
 
 def test_sum() -> None:

@@ -6,13 +6,13 @@ from itertools import pairwise
 
 import pytest
 import torch
-from helpers import POPULATION, compose, wavy_profiles
+from helpers import ACTION, OBSERVATION, POPULATION, REWARD, compose, wavy_profiles
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from lcc_rl.data.profiles import from_records
-from lcc_rl.envs.factory import build_env
+from lcc_rl.envs import build_env
 from lcc_rl.evaluation.metrics import energy_measures
 from lcc_rl.functional.idm import (
     IDMConstants,
@@ -21,6 +21,7 @@ from lcc_rl.functional.idm import (
     simulate_follower,
 )
 from lcc_rl.functional.power import motor_power, traction_force
+from lcc_rl.functional.string import entries_ahead
 
 QUICK = settings(
     max_examples=5, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
@@ -30,12 +31,12 @@ STEPS, STEP = 20, 0.1
 
 def played(batch: int, actions: torch.Tensor, choices: TensorDict, profiles=None):
     """Play actions ``[steps]`` in a batch with given seeds, profiles, starts and drivers."""
-    env = build_env(compose("alcc"), profiles or wavy_profiles(), POPULATION, batch)
+    env = build_env(compose("alcc"), profiles or wavy_profiles(), POPULATION, batch, nominal=True)
     start = env.reset(choices)
     number = iter(range(len(actions)))
 
     def policy(td):
-        return td.set("action", actions[next(number)].expand(batch, 1).clone())
+        return td.set(ACTION, actions[next(number)].expand(batch, 1, 1).clone())
 
     return env.rollout(STEPS, policy, auto_reset=False, tensordict=start, break_when_any_done=False)
 
@@ -49,8 +50,7 @@ def some_choices(seeds: list[int]) -> TensorDict:
             ("episode", "seed"): numbers,
             ("leader", "profile"): numbers % 4,
             ("leader", "start"): numbers % 50,
-            ("cav", "gap_factor"): torch.ones(batch, 1),
-            ("hdv", "driver"): (numbers % len(POPULATION.time_gap)).view(-1, 1, 1),
+            ("human", "driver"): (numbers % len(POPULATION.time_gap)).view(-1, 1, 1),
         },
         batch_size=[batch],
     )
@@ -64,15 +64,15 @@ actions = st.lists(st.floats(-1, 1), min_size=STEPS, max_size=STEPS).map(torch.t
 @given(seeds, actions)
 def test_speeds_are_never_negative_and_gaps_change_by_relative_motion(numbers, given_actions):
     data = played(len(numbers), given_actions, some_choices(numbers))
-    for vehicle, ahead in (("cav", "leader"), ("hdv", "cav")):
-        speed, after = data[vehicle, "speed"], data["next", vehicle, "speed"]
-        lead, lead_after = data[ahead, "speed"], data["next", ahead, "speed"]
-        if vehicle == "hdv":  # [..., followers, 1]
-            lead, lead_after = lead.unsqueeze(-2), lead_after.unsqueeze(-2)
-        assert (after >= 0).all()
-        change = data["next", vehicle, "gap"] - data[vehicle, "gap"]
-        closing = (lead - speed) + (lead_after - after)
-        torch.testing.assert_close(change, 0.5 * STEP * closing, rtol=0, atol=1e-4)
+    now, after = data["vehicles"], data["next", "vehicles"]
+    lead, lead_after = (
+        entries_ahead(part["leader", "speed"], part["vehicles", "speed"])
+        for part in (data, data["next"])
+    )
+    assert (after["speed"] >= 0).all()
+    change = after["gap"] - now["gap"]
+    closing = (lead - now["speed"]) + (lead_after - after["speed"])
+    torch.testing.assert_close(change, 0.5 * STEP * closing, rtol=0, atol=1e-4)
 
 
 @QUICK
@@ -82,8 +82,8 @@ def test_permuted_members_give_permuted_results(numbers, given_actions, chance) 
     chance.shuffle(order)
     one = played(len(numbers), given_actions, some_choices(numbers))
     two = played(len(numbers), given_actions, some_choices([numbers[i] for i in order]))
-    for key in ("observation", "reward"):
-        assert torch.equal(one["next", key][order], two["next", key])
+    for key in (OBSERVATION, REWARD):
+        assert torch.equal(one["next", *key][order], two["next", *key])
 
 
 @QUICK
@@ -94,8 +94,8 @@ def test_a_larger_batch_does_not_change_a_member(numbers, given_actions) -> None
     # Vectorised kernels may round differently at other sizes: 1e-5 is a hundred times less than
     # what a step changes.
     torch.testing.assert_close(
-        two["next", "observation"][: len(numbers)],
-        one["next", "observation"],
+        two["next", *OBSERVATION][: len(numbers)],
+        one["next", *OBSERVATION],
         rtol=1e-5,
         atol=1e-5,
     )
@@ -112,7 +112,7 @@ def test_a_profile_shifted_in_time_plays_the_same(shift, given_actions) -> None:
     early["leader", "start"] = torch.tensor([[0]])
     one = played(1, given_actions, late, whole)
     two = played(1, given_actions, early, shifted)
-    assert torch.equal(one["next", "observation"], two["next", "observation"])
+    assert torch.equal(one["next", *OBSERVATION], two["next", *OBSERVATION])
 
 
 @QUICK

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lcc_rl import evaluate
+from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_torch, write_torch
@@ -29,7 +29,7 @@ def test_a_shipped_policy_says_where_it_comes_from_and_names_no_path(variant) ->
 
 def test_evaluate_the_shipped_policies(tmp_path) -> None:
     how = ["variant=alcc", "policy=pretrained", "compare=[pretrained/reference]"]
-    rows = evaluate.run(load("evaluate", [*TINY, *how]), tmp_path, quiet=True)
+    rows = evaluation.run(load("evaluate", [*TINY, *how]), tmp_path, quiet=True)
     assert {"alcc", "reference", "idm", "direct"} == set(rows["strategy"])
 
 

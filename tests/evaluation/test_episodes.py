@@ -1,29 +1,31 @@
-"""The Monte Carlo evaluation: paired, independent of the batch, and equal to a plain simulation."""
+"""Evaluation by episodes: paired, independent of the batch, and equal to a plain simulation."""
 
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, compose, wavy_profiles
+from helpers import POPULATION, compose, steady, string, wavy_profiles
 
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.monte_carlo import Strategy, choices, evaluate, pairs
+from lcc_rl.evaluation.episodes import evaluate, pairs
+from lcc_rl.evaluation.rollout import reset_options
+from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
 from lcc_rl.functional.power import motor_power
 
 PROFILES = wavy_profiles().windows(100)
+INPUTS = Inputs(PROFILES, PROFILES, POPULATION)
 
 
 def strategy(variant: str, *overrides: str) -> Strategy:
     cfg = compose(variant, "scenario.horizon=100", *overrides)
-    return Strategy(variant, cfg, build_agent(cfg, POPULATION).policy)
+    return Strategy(variant, cfg)
 
 
 def run(variant: str, *overrides: str, drivers=5, batch_size=64, seed=1, sample_episodes=0):
     return evaluate(
         strategy(variant, *overrides),
-        PROFILES,
-        POPULATION,
+        INPUTS,
         drivers,
         batch_size,
         seed,
@@ -55,7 +57,7 @@ def test_seed_changes_only_the_noise() -> None:
 
 
 def test_scenario_b_equals_the_plain_simulation() -> None:
-    rows, _ = run("direct", "scenario.pieces.hdv.noise=0")
+    rows, _ = run("direct", "scenario.controllers.human.noise=0")
     profile, driver = pairs(len(PROFILES), len(POPULATION.time_gap), 5)
     leader = torch.stack([PROFILES.record(i) for i in profile], dim=1)
     v0, gap = POPULATION.desired_speed[driver], POPULATION.time_gap[driver]
@@ -77,29 +79,45 @@ def test_strategies_meet_the_same_noise() -> None:
 
 
 def test_collisions_end_the_count() -> None:
-    class Rammer(torch.nn.Module):
-        def forward(self, td):
-            return td.set("action", torch.ones_like(td["cav", "speed"]))
-
     cfg = compose("alcc", "scenario.horizon=100")
-    rows, _ = evaluate(Strategy("rammer", cfg, Rammer()), PROFILES, POPULATION, 3, 64, 1)
+    rammer = steady(1.0, build_env(cfg, PROFILES, POPULATION, len(PROFILES) * 3))
+    rows, _ = evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1)
     assert rows["collided"].all()
     assert (rows["duration_s"] < 10.0).all()
     assert (rows["min_ttc_s"] < 0.1).all()
 
 
-def test_string_of_followers_adds_up() -> None:
+def test_string_of_vehicles_adds_up() -> None:
     one, _ = run("direct")
-    three, _ = run("direct", "scenario.followers=3")
+    three, _ = run("direct", string("human*3"))
     assert (three["hdv_distance_m"] > 2.0 * one["hdv_distance_m"]).all()
 
 
-def test_a_string_begins_with_its_driver_and_goes_on_with_the_next() -> None:
-    cfg = strategy("direct", "scenario.followers=3").cfg
+def test_what_many_automated_vehicles_do_is_added_up() -> None:
+    # Two IDM drivers in the place of automated vehicles, and one of them: distances add up, and
+    # what is safe is that of the worst.
+    one, _ = run("idm", string("automated human"))
+    two, _ = run("idm", string("(automated human)*2"))
+    assert (two["cav_distance_m"] > 1.5 * one["cav_distance_m"]).all()
+    assert (two["hdv_distance_m"] > 1.5 * one["hdv_distance_m"]).all()
+    total = two["cav_energy_kj"] + two["hdv_energy_kj"]
+    assert two["total_energy_kj"].to_numpy() == pytest.approx(total.to_numpy(), rel=1e-5)
+
+
+def test_drawn_places_are_measured_by_role() -> None:
+    # Two human drivers and one automated vehicle, wherever it is: about twice its distance.
+    drawn, _ = run("idm", "scenario.string={size: 3, penetration: 0.34}")
+    assert {"cav_energy_kj", "hdv_energy_kj", "total_energy_kj"} <= set(drawn)
+    ratio = drawn["hdv_distance_m"] / drawn["cav_distance_m"]
+    assert ratio.between(1.3, 2.7).all()
+
+
+def test_a_string_begins_with_its_driver_and_those_of_the_next_ids_follow() -> None:
+    cfg = strategy("direct", string("human*3")).cfg
     env = build_env(cfg, PROFILES, POPULATION, 2)
     count = len(POPULATION.time_gap)
-    given = choices(env, torch.tensor([0, 1]), torch.tensor([0, count - 1]), 1, count)
-    assert given["hdv", "driver"].squeeze(-1).tolist() == [[0, 1, 2], [count - 1, 0, 1]]
+    given = reset_options(env, torch.tensor([0, 1]), torch.tensor([0, count - 1]), 1, count)
+    assert given["human", "driver"].squeeze(-1).tolist() == [[0, 1, 2], [count - 1, 0, 1]]
 
 
 def test_a_record_chosen_for_training_is_no_choice_for_evaluation() -> None:

@@ -1,58 +1,70 @@
-"""Unrolled environments: the same entries as a rollout, and gradients that are right."""
+"""Differentiable rollouts: the same entries as a rollout, and gradients that are right."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
-from helpers import POPULATION, compose, small_env, wavy_profiles
+from helpers import (
+    ACTION,
+    OBSERVATION,
+    POPULATION,
+    REWARD,
+    TERMS,
+    compose,
+    followers,
+    make_agent,
+    small_env,
+    string,
+    wavy_profiles,
+)
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.envs.factory import build_agent, build_env
-from lcc_rl.envs.unroll import Unrolled
-from lcc_rl.policies import make_actor
+from lcc_rl.envs import DifferentiableRollout, build_env
+from lcc_rl.policies import make_actor, shared_policy
 
-WANTED = [("cav", "gap"), ("cav", "power"), ("hdv", "power"), ("cav", "relative_speed")]
-OBSERVED = [("reward",), ("reward_terms", "hdv_energy"), ("reward_terms", "safety")]
+WANTED = [("vehicles", name) for name in ("gap", "power", "relative_speed")]
+OBSERVED = [REWARD, (*TERMS, "hdv_energy"), (*TERMS, "safety")]
 
 
 @pytest.mark.parametrize(
-    "more", ["scenario.followers=1", "scenario.followers=3", "+filter=barrier"]
+    "more", [followers(1), followers(3), string("human (automated human)*2"), "+filter=cbf"]
 )
 @pytest.mark.parametrize("variant", ["alcc", "reference"])
 def test_entries_equal_those_of_a_rollout(variant, more) -> None:
-    overrides = [more]
-    observed = OBSERVED if variant == "alcc" else [("reward",), ("reward_terms", "safety")]
-    policy = build_agent(compose(variant, *overrides), POPULATION).policy
+    # From such gaps nobody collides, after which a rollout would begin anew.
+    overrides = [more, "training.gap_range=[0.8,1.5]"]
+    observed = OBSERVED if variant == "alcc" else [REWARD, (*TERMS, "safety")]
+    policy = make_agent(compose(variant, *overrides)).policy
     with torch.no_grad():
         env = small_env(variant, 5, overrides, seed=3)
-        expected = env.rollout(20, policy, break_when_any_done=False)
-        unrolled = Unrolled(small_env(variant, 5, overrides, seed=3), WANTED, observed)
+        expected = env.rollout(20, shared_policy(policy), break_when_any_done=False)
+        unrolled = DifferentiableRollout(small_env(variant, 5, overrides, seed=3), WANTED, observed)
         _, record = unrolled.play(unrolled.start(), policy.module, 20)
         got = unrolled.assemble(record)
-    for key in [*WANTED, *observed, ("done",), ("terminated",), ("observation",)]:
+    for key in [*WANTED, *observed, ("done",), ("terminated",), OBSERVATION]:
         assert torch.equal(got.get(("next", *key)), expected.get(("next", *key))), key
-    assert torch.equal(got["action"], expected["action"])
+    assert torch.equal(got[ACTION], expected[ACTION])
 
 
 def test_what_nothing_depends_on_is_left_out() -> None:
     env = small_env("alcc", 4)
-    names = {type(p).__name__ for p in Unrolled(env, WANTED).after}
+    names = {type(p).__name__ for p in DifferentiableRollout(env, WANTED).after}
     assert "DriverEstimator" not in names
-    assert not any("estimate" in key for key in Unrolled(env, WANTED).carried)
-    assert ("hdv", "estimate") in Unrolled(env, WANTED, OBSERVED).carried
+    assert not any("estimate" in key for key in DifferentiableRollout(env, WANTED).carried)
+    assert ("human", "estimate") in DifferentiableRollout(env, WANTED, OBSERVED).carried
 
 
 def total_power(env: TransformedEnv, network, seed: int = 0) -> torch.Tensor:
     env.set_seed(seed)
-    unrolled = Unrolled(env, [("cav", "power"), ("hdv", "power")])
+    unrolled = DifferentiableRollout(env, [("vehicles", "power")])
     _, record = unrolled.play(unrolled.start(), network, 20)
-    power = unrolled.assemble(record)["next"]
-    return (power["cav", "power"].sum() + power["hdv", "power"].sum()) / 20000.0
+    return unrolled.assemble(record)["next", "vehicles", "power"].sum() / 20000.0
 
 
 def in_float64(population: Any, profiles: Profiles) -> tuple[Any, Profiles]:
@@ -67,9 +79,10 @@ def in_float64(population: Any, profiles: Profiles) -> tuple[Any, Profiles]:
 
 def test_gradient_equals_finite_differences() -> None:
     # 20 steps of leader, car, three human drivers and the observation, in float64.
-    cfg = compose("alcc", "scenario.followers=3")
+    cfg = compose("alcc", followers(3))
     population, profiles = in_float64(POPULATION, wavy_profiles())
-    env = build_env(cfg, profiles, population, 4)
+    with patch("lcc_rl.envs.factory.check_pieces"):  # whose specs are those of float32
+        env = build_env(cfg, profiles, population, 4)
     network = make_actor(7, 1, (8,), 0).module.to(torch.float64)
     assert total_power(env, network).dtype == torch.float64
     total_power(env, network).backward()
@@ -89,30 +102,32 @@ def test_gradient_equals_finite_differences() -> None:
 
 def test_gradients_are_finite_through_contact_and_standstill() -> None:
     env = small_env("alcc", 64, ["scenario.horizon=100"])
-    wanted = [("cav", "gap"), ("cav", "relative_speed"), ("cav", "power"), ("hdv", "power")]
     for bias in (9.0, -9.0):  # into the leader; to a halt
         network = make_actor(7, 1, (8,), 0).module
         with torch.no_grad():
             network[0][-1].bias.fill_(bias * 0.1)
-        unrolled = Unrolled(env, wanted)
+        unrolled = DifferentiableRollout(env, WANTED)
         _, record = unrolled.play(unrolled.start(), network, 100)
         data = unrolled.assemble(record)
         if bias > 0:
             assert data["next", "terminated"].any()
-        sum(data["next"].get(key).mean() for key in wanted).backward()
+        sum(data["next"].get(key).mean() for key in WANTED).backward()
         assert all(torch.isfinite(weight.grad).all() for weight in network.parameters())
 
 
 def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
-    unrolled = Unrolled(small_env("alcc", 4), WANTED)
+    unrolled = DifferentiableRollout(small_env("alcc", 4), WANTED)
     network = make_actor(7, 1, (8,), 0).module
     _, expected = unrolled.play(unrolled.start(), network, 3)
 
-    def no_compiler(network, state, shift):
-        raise torch._dynamo.exc.TorchDynamoException("no C++ compiler found\nmore")
+    def no_compiler(function, **settings):
+        def fail(network, state, shift):
+            raise torch._dynamo.exc.TorchDynamoException("no C++ compiler found\nmore")
 
-    fallback = Unrolled(small_env("alcc", 4), WANTED)
-    fallback.advance = no_compiler
+        return fail
+
+    monkeypatch.setattr("lcc_rl.envs.step.compile", no_compiler)
+    fallback = DifferentiableRollout(small_env("alcc", 4), WANTED, compiled=True)
     with caplog.at_level(logging.INFO):
         _, record = fallback.play(fallback.start(), network, 3)
     assert "not compiling the simulator: no C++ compiler found" in caplog.text
@@ -123,21 +138,24 @@ def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # the compiler warns of much
 def test_compiled_equals_eager_over_an_episode() -> None:
     network = make_actor(7, 1, (16,), 0).module
     plain, fast = (
-        Unrolled(small_env("alcc", 8, ["scenario.horizon=100"]), WANTED, OBSERVED, compiled=c)
+        DifferentiableRollout(
+            small_env("alcc", 8, ["scenario.horizon=100"]), WANTED, OBSERVED, compiled=c
+        )
         for c in (False, True)
     )
     rolls = [u.assemble(u.play(u.start(), network, 100)[1])["next"] for u in (plain, fast)]
-    if fast.advance is fast.plain:
+    if fast.advance.function is fast.advance.plain:
         pytest.skip("no compiler on this machine")
-    for key in [("cav", "gap"), ("cav", "speed"), ("hdv", "speed")]:
+    for key in [("vehicles", "gap"), ("vehicles", "speed")]:
         assert torch.allclose(rolls[0].get(key), rolls[1].get(key), rtol=1e-5, atol=1e-5), key
     slopes = []
     for roll in rolls:
         network.zero_grad()
-        (roll["cav", "power"].mean() + roll["hdv", "power"].mean()).backward()
+        (2.0 * roll["vehicles", "power"].mean()).backward()
         slopes.append(torch.cat([w.grad.flatten() for w in network.parameters()]).clone())
     assert torch.allclose(slopes[0], slopes[1], rtol=1e-3, atol=1e-4 * float(slopes[0].norm()))

@@ -1,0 +1,171 @@
+"""Patterns of a string: what they mean, where they are wrong, and how penetration is rounded."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import VehicleString, parse_string
+
+A, H = "automated", "human"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "roles"),
+    [
+        ("automated", [A]),
+        ("automated human*5", [A, *[H] * 5]),
+        ("  human * 2(automated) ", [H, H, A]),
+        ("human*2 (automated human*2)*2", [H, H, A, H, H, A, H, H]),
+        ("((automated human)*2 cacc)*2", [A, H, A, H, "cacc"] * 2),
+        ("human (my_car2)*1", [H, "my_car2"]),
+        ("automated*10000", [A] * 10_000),
+    ],
+)
+def test_what_a_pattern_means(pattern, roles) -> None:
+    string = parse_string(pattern)
+    assert string.roles == tuple(roles)
+    assert not string.drawn
+    assert not string.ring
+    assert len(string) == len(roles)
+
+
+def test_places_and_names() -> None:
+    string = parse_string("human (automated human)*2 cacc", "ring")
+    assert string.places(A) == (1, 3)
+    assert string.places(H) == (0, 2, 4)
+    assert string.places("nobody") == ()
+    assert string.names == (H, A, "cacc")
+    assert string.count(H) == 3
+    assert string.ring
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words", "place"),
+    [
+        ("", "expected a role", 1),
+        ("automated )", "expected a role, '(' or the end", 11),
+        ("(automated", "this bracket is never closed", 1),
+        ("human (automated (human)", "this bracket is never closed", 7),
+        ("automated ()", "expected a role", 12),
+        ("*3 human", "expected a role before '*'", 1),
+        ("human*0", "expected a number that makes 1…10000 vehicles", 6),
+        ("human*99999", "expected a number that makes 1…10000 vehicles", 6),
+        ("automated human*-2", "expected a role, '(' or the end", 16),
+        ("automated, human", "expected a role, '(' or the end", 10),
+        ("automated*5000 human*5001", "more than 10000 vehicles", 16),
+        ("human*2*3", "expected a role before '*'", 8),
+        ("(" * 30 + "human" + ")" * 30, "too many brackets", 22),
+    ],
+)
+def test_an_error_points_at_the_place(pattern, words, place) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_string(pattern)
+    text = str(error.value)
+    assert f"{words} at character {place}: " in text
+    # The pattern itself, marked where it goes wrong.
+    assert text.endswith(f"{pattern[: place - 1]}»{pattern[place - 1 :]}")
+
+
+@pytest.mark.parametrize(
+    ("size", "penetration", "count"),
+    [
+        (100, 0.1, 10),
+        (10, 0.04, 1),  # at least one above 0
+        (10, 1e-9, 1),
+        (10, 0.0, 0),  # 0 is allowed: nobody is automated
+        (10, 0.26, 3),
+        (6, 0.34, 2),
+        (10, 1, 10),
+        (1, 0.5, 1),
+    ],
+)
+def test_penetration_is_rounded_to_whole_vehicles(size, penetration, count) -> None:
+    string = parse_string({"size": size, "penetration": penetration})
+    assert string.count(A) == count
+    assert string.count(H) == size - count
+    # Where only one role is left there is nothing to draw.
+    assert string.drawn == (0 < count < size)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        ({"size": 0, "penetration": 0.1}, "size must be a whole number"),
+        ({"size": 2.5, "penetration": 0.1}, "size must be a whole number"),
+        ({"size": True, "penetration": 0.1}, "size must be a whole number"),
+        ({"size": 20_000, "penetration": 0.1}, "1…10000"),
+        ({"size": 5, "penetration": 1.2}, "penetration must lie in"),
+        ({"size": 5, "penetration": -0.1}, "penetration must lie in"),
+        ({"size": 5, "penetration": "half"}, "penetration must lie in"),
+        ({"size": 5}, "must be a pattern such as"),
+        ({"size": 5, "penetration": 0.1, "seed": 1}, "must be a pattern such as"),
+        (7, "must be a pattern such as"),
+        (None, "must be a pattern such as"),
+    ],
+)
+def test_what_is_no_string(pattern, words) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        parse_string(pattern)
+
+
+def test_only_two_roads() -> None:
+    with pytest.raises(ConfigError, match="road must be 'open' or 'ring', got 'circle'"):
+        parse_string("human", "circle")
+
+
+# A pattern as a tree: a role, or a sequence of trees; each with how often.
+names = st.sampled_from([A, H, "cacc", "x_1"])
+trees = st.recursive(
+    st.tuples(names, st.integers(1, 4)),
+    lambda inner: st.tuples(st.lists(inner, min_size=1, max_size=3), st.integers(1, 3)),
+    max_leaves=8,
+)
+
+
+def printed(tree, chance) -> str:
+    inside, times = tree
+    text = inside if isinstance(inside, str) else f"({sequence(inside, chance)})"
+    star = chance.choice(["*", " *", "* "])
+    return text if times == 1 and chance.random() < 0.5 else f"{text}{star}{times}"
+
+
+def sequence(parts, chance) -> str:
+    return " ".join(printed(part, chance) for part in parts)
+
+
+def expanded(tree) -> list[str]:
+    inside, times = tree
+    roles = [inside] if isinstance(inside, str) else [x for part in inside for x in expanded(part)]
+    return roles * times
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.lists(trees, min_size=1, max_size=3), st.randoms(use_true_random=False))
+def test_a_printed_pattern_expands_to_what_was_printed(parts, chance) -> None:
+    roles = [role for part in parts for role in expanded(part)]
+    assert list(parse_string(sequence(parts, chance)).roles) == roles
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.text(alphabet="ah()* 12", max_size=12))
+def test_any_text_is_a_string_or_refused_in_one_way(text) -> None:
+    try:
+        string = parse_string(text)
+    except ConfigError as error:
+        assert "at character" in str(error)
+    else:
+        assert isinstance(string, VehicleString)
+        assert set(string.roles) <= set(re.findall(r"[A-Za-z_]\w*", text))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 300), st.floats(0.0, 1.0))
+def test_a_mixture_is_as_near_to_its_penetration_as_whole_vehicles_allow(size, share) -> None:
+    count = parse_string({"size": size, "penetration": share}).count(A)
+    assert abs(count - size * share) <= 0.5 or count == 1
+    assert (count == 0) == (share == 0.0)

@@ -1,0 +1,115 @@
+"""The CBF safety filter: whatever the policy wants, the vehicle stays between its limits."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import ACTION, small_env
+from torchrl.envs import check_env_specs
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.pieces import CBFFilter
+
+WHOLE = "scenario.horizon=300"
+
+
+def driven(action: float | None, *overrides: str, places: tuple[int, ...] = (0,)):
+    """Drive 32 episodes with one action throughout, or with random ones."""
+    env = small_env("alcc", 32, [WHOLE, *overrides], nominal=True)
+    chance = torch.Generator().manual_seed(0)
+    shape = (32, len(places), 1)
+
+    def policy(td):
+        drawn = 2.0 * torch.rand(shape, generator=chance) - 1.0
+        return td.set(ACTION, drawn if action is None else torch.full(shape, action))
+
+    keys = [("vehicles", name) for name in ("ttc", "time_gap", "gap")]
+    record, _ = play(env, policy, None, keys)
+    return {name: entry[..., list(places), :] for (_, name), entry in record.items()}
+
+
+@pytest.mark.parametrize("action", [1.0, 0.0, -1.0, None])
+def test_no_policy_passes_the_limits(action) -> None:
+    free, held = driven(action), driven(action, "+filter=cbf")
+    assert held["ttc"].min() >= 4.0
+    assert held["gap"].min() > 0.1
+    # The leader may pull away faster than the limit is approached, but not for long.
+    assert (held["time_gap"] > 2.5).double().mean() < 0.01
+    broken = (free["ttc"] < 4.0) | (free["time_gap"] > 2.5)
+    assert broken.double().mean() > 0.1
+
+
+@pytest.mark.parametrize("variant", ["alcc", "reference", "idm"])
+def test_specs(variant) -> None:
+    check_env_specs(small_env(variant, 2, ["+filter=cbf"]))
+
+
+def test_every_automated_vehicle_of_a_string_is_filtered() -> None:
+    mixed = "scenario.string='human automated human automated*2 human'"
+    data = driven(1.0, "+filter=cbf", mixed, places=(1, 3, 4))
+    # Behind a human driver, whose acceleration the filter knows from the step before, an approach
+    # may be a little quicker than it expected.
+    assert data["ttc"].min() >= 3.9
+    assert data["gap"].min() > 0.1
+
+
+def column(*values: float) -> torch.Tensor:
+    return torch.tensor(values).view(-1, 1, 1)
+
+
+def test_between_the_limits_the_controller_decides() -> None:
+    piece = CBFFilter(0.1)
+    wanted = column(-0.15, 0.0, 0.9)
+    speed, gap = column(10.0, 10.0, 10.0), column(15.0, 15.0, 15.0)
+    assert torch.equal(piece.filtered(wanted, speed, gap, speed, 0 * speed), wanted)
+
+
+def test_safety_wins() -> None:
+    # A gap far too long, closing far too fast: the limits contradict each other.
+    piece = CBFFilter(0.1, time_gap=0.5, full_speed=0.0)
+    speed, gap, ahead = (column(x) for x in (10.0, 20.0, 2.0))
+    assert piece.filtered(column(3.0), speed, gap, ahead, column(0.0)) == -3.0
+
+
+def test_a_limit_leaves_the_state_a_gradient() -> None:
+    piece = CBFFilter(0.1, rate=1.0)
+    gap = column(5.5).requires_grad_()
+    speed, ahead = column(6.0), column(5.0)
+    piece.filtered(column(3.0), speed, gap, ahead, column(0.0)).sum().backward()
+    assert gap.grad is not None
+    # More room, more acceleration: by rate / (τ + T/2).
+    assert gap.grad.item() == pytest.approx(1.0 / 4.05, rel=1e-5)
+
+
+def test_the_longest_gap_grows_with_the_square_of_the_speed_up_to_full_speed() -> None:
+    piece = CBFFilter(0.1, time_gap=2.4, full_speed=12.0, least_gap=2.0)
+    speed = torch.tensor([[0.0], [2.0], [6.0], [11.0], [20.0]], requires_grad=True)
+    longest, slope = piece._longest_gap(speed, 2.4)
+    assert torch.allclose(longest.flatten(), torch.tensor([2.0, 2.0, 7.2, 24.2, 48.0]))
+    (derivative,) = torch.autograd.grad(longest.sum(), speed)
+    assert torch.allclose(slope[2:], derivative[2:])  # elsewhere the least gap has none
+    always, _ = CBFFilter(0.1, time_gap=2.4, full_speed=0.0)._longest_gap(speed, 2.4)
+    assert torch.allclose(always.flatten(), 2.4 * speed.flatten().clamp(min=1.0))
+
+
+def test_far_away_the_vehicle_is_drawn_near() -> None:
+    piece = CBFFilter(0.1, full_speed=12.0)
+    speed, gap = column(6.0), column(14.0)
+    pushed = piece.filtered(column(-3.0), speed, gap, speed, column(0.0))
+    allowed = 2.45 * 6.0**2 / 12.0
+    expected = 0.2 * (14.0 - allowed) / (2 * 2.45 * 6.0 / 12.0)
+    assert pushed.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_full_speed_is_no_negative_number() -> None:
+    with pytest.raises(ConfigError, match=r"filters\.automated\.full_speed"):
+        CBFFilter(0.1, full_speed=-1.0)
+
+
+@pytest.mark.parametrize(
+    "setting", ["time_to_collision", "time_gap", "rate", "time_gap_rate", "max_acceleration"]
+)
+def test_limits_must_be_positive(setting) -> None:
+    with pytest.raises(ConfigError, match=rf"filters\.automated\.{setting} must be positive"):
+        CBFFilter(0.1, **{setting: 0.0})

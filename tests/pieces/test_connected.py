@@ -1,0 +1,405 @@
+"""Connected vehicles by behaviour: dead-beat, jerk, causality, safety, any number of them."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+from helpers import ACTION, POPULATION, REWARD, composed, network, string, wavy_profiles
+from platoons import (
+    A_MAX,
+    ACTORS,
+    Actor,
+    Driver,
+    T,
+    cacc,
+    deadbeat,
+    env_of,
+    hcfs,
+    leader,
+    play,
+    ramps,
+    repeated,
+    whole,
+    windows,
+)
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+from torchrl.envs.utils import step_mdp
+
+from lcc_rl.envs import build_env
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.rollout import reset_options
+from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.functional.cacc import Gains
+from lcc_rl.pieces import CACC, HCFS, Communication, DeadBeat, parse_string
+from lcc_rl.policies import ControllerPolicy
+
+# -- dead-beat -------------------------------------------------------------------------------------
+
+
+def test_oracle_dead_beat_has_no_error_where_limits_are_inactive() -> None:
+    # In double precision: the claim is about the law, not about rounding.
+    env = env_of(ramps(), deadbeat("oracle"))
+    for piece in env.transform:
+        piece.double()
+    given = TensorDict({("leader", "profile"): torch.arange(3).unsqueeze(-1)}, [3])
+    given.set(("leader", "start"), torch.zeros(3, 1, dtype=torch.int64))
+    td = env.reset(given).apply(lambda x: x.double() if x.is_floating_point() else x)
+    total = 0.0
+    for _ in range(100):
+        td = env.step(td)
+        total += td["next", "vehicles", "leader_speed_error"].abs().sum()
+        td = step_mdp(td)
+    assert total < 1e-6
+
+
+def test_dead_beat_on_held_speed_pays_the_total_variation() -> None:
+    profiles = windows()
+    series = play(profiles, deadbeat("hold"), 8)
+    error = series["leader_speed_error"].abs().sum((0, 2))
+    variation = torch.stack([profiles.record(i).diff().abs().sum() for i in range(len(profiles))])
+    torch.testing.assert_close(error, 8 * variation, atol=0.1, rtol=0)
+    assert variation.max() > 10.0
+
+
+def test_dead_beat_orders_as_its_knowledge_does() -> None:
+    profiles = windows(20)
+    rewards = [
+        float(play(profiles, deadbeat(mode))["reward"].sum())
+        for mode in ("hold", "causal", "oracle")
+    ]
+    assert rewards[0] < rewards[1] < rewards[2] < 0.0
+
+
+# -- CACC ------------------------------------------------------------------------------------------
+
+
+def test_gains_behave_as_described() -> None:
+    error = {}
+    for name in ("path", "paper_like", "tuned"):
+        series = play(ramps().select([0]), cacc(name), 8)
+        error[name] = float(series["leader_speed_error"].abs().sum())
+        jerk = float(series["jerk"].abs().sum())
+        if name == "paper_like":
+            # Near the CACC row of Table IV (149.6 and 735 on the paper-like ramp).
+            assert error[name] > 100
+            assert jerk > 400
+    assert error["tuned"] < 0.25 * min(error["path"], error["paper_like"])
+
+
+def test_cacc_closes_its_gaps() -> None:
+    # From disturbed gaps behind a steady leader back to equilibrium: h plus what the delay hides.
+    steady = leader(torch.full((401,), 10.0))
+    cfg = composed("variant=cacc", "scenario.horizon=400")
+    cfg.scenario.pieces.leader.perturbation = 0.0
+    env = build_env(cfg, steady, POPULATION, 4)
+    td = env.reset()
+    assert (td["vehicles", "gap"] - 5.0).abs().max() > 0.5
+    with torch.no_grad():
+        end = env.rollout(400, tensordict=td, auto_reset=False)[:, -1]["next", "vehicles"]
+    torch.testing.assert_close(end["gap"], torch.full((4, 6, 1), 5.0), atol=0.06, rtol=0)
+    assert end["leader_speed_error"].abs().max() < 1e-3
+
+
+def test_unstable_gains_are_refused_by_the_controller() -> None:
+    with pytest.raises(ConfigError, match=r"kv = k2 \+ k4 = 2\.6 must be below 2"):
+        CACC(T, A_MAX, k2=1.3)
+
+
+# -- jerk ------------------------------------------------------------------------------------------
+
+
+def violations(series, bound: float) -> torch.Tensor:
+    """Frames beyond the bound, less standstill and logged interventions of the safe cap."""
+    capped = series["cap_interventions"].diff(
+        dim=0, prepend=torch.zeros_like(series["cap_interventions"][:1])
+    )
+    stopped = series["speed"][1:] == 0.0
+    return (series["jerk"].abs() > bound + 1e-2) & (capped == 0) & ~stopped
+
+
+@pytest.mark.parametrize("bound", [5.0, 10.0, 30.0])
+@pytest.mark.parametrize("actor", ACTORS)
+def test_jerk_keeps_its_bound_over_every_window(actor, bound) -> None:
+    series = play(windows(), hcfs(actor, jerk_bound=bound))
+    assert not violations(series, bound).any()
+
+
+def test_the_literal_rule_violates_the_bound() -> None:
+    # Else the test above could not fail.
+    series = play(windows(), hcfs("random", jerk_bound=10.0, clamp=False))
+    assert violations(series, 10.0).float().mean() > 0.01
+
+
+# -- causality -------------------------------------------------------------------------------------
+
+FRAME = 40
+
+
+def driver(name: str) -> Driver:
+    kind, _, mode = name.partition(" ")
+    if kind == "deadbeat":
+        return deadbeat(mode)
+    if kind == "hcfs":
+        return hcfs("random", lookahead=mode)
+    if kind == "cacc":
+        return cacc()
+    return Driver(("variant=ddpg",), network(composed("variant=ddpg")))
+
+
+MODES = ("causal", "hold", "oracle")
+
+
+@pytest.mark.parametrize(
+    "name", ["cacc", "ddpg", *(f"{kind} {mode}" for kind in ("deadbeat", "hcfs") for mode in MODES)]
+)
+def test_nothing_but_the_oracle_knows_the_future(name) -> None:
+    tested = driver(name)
+    past = 8.0 + torch.sin(T * torch.arange(61.0))
+    other = past.clone()
+    other[FRAME + 1 :] = (past[FRAME] + 0.6 * torch.arange(1.0, 21.0)).clamp(max=20.0)
+    # Both records in one batch, the same noise for both.
+    env = env_of(leader(past, other), tested)
+    given = TensorDict({("episode", "seed"): torch.tensor([[3], [3]])}, [2])
+    given.set(("leader", "profile"), torch.tensor([[0], [1]]))
+    given.set(("leader", "start"), torch.zeros(2, 1, dtype=torch.int64))
+    with torch.no_grad():
+        data = env.rollout(60, tested.policy, tensordict=env.reset(given), auto_reset=False)
+    commands = data["next", "vehicles", "command"].flatten(2)
+    same = (commands[0] == commands[1]).all(1)
+    assert same[:FRAME].all()
+    assert bool(same[FRAME]) == ("oracle" not in name)
+    assert not same[FRAME + 1 :].all()
+
+
+# -- safety ----------------------------------------------------------------------------------------
+
+
+def hard_brake():
+    """From 20 m/s at 3 m/s² to standstill, after 4 s."""
+    speed = (20.0 - 3.0 * (T * torch.arange(101.0) - 4.0).clamp(min=0.0)).clamp(min=0.0)
+    return leader(speed)
+
+
+@pytest.mark.parametrize("rule", ["tuned", "paper_like"])
+@pytest.mark.parametrize("bound", [5.0, 30.0])
+def test_no_collision_over_windows_and_hard_braking(rule, bound) -> None:
+    for profiles in (windows(), hard_brake()):
+        series = play(repeated(profiles, 3), hcfs("mixed", rule, jerk_bound=bound))
+        assert series["gap"].min() > 0.0
+    # The bad and the random actor did put the cap to the test.
+    assert series["cap_interventions"][-1].sum() > 0
+
+
+@pytest.mark.slow
+def test_no_collision_over_the_whole_udds_at_half_and_full_speed() -> None:
+    profiles = whole(("udds", 0.5), ("udds", 1.0))
+    series = play(repeated(profiles, 3), hcfs("mixed"), 6)
+    assert series["gap"].min() > 0.0
+
+
+@pytest.mark.slow
+def test_no_collision_behind_measured_leaders(shared_data) -> None:
+    files = [shared_data / f"leader_openacc_platoon{n}_10hz.csv" for n in (3, 10)]
+    if not all(file.is_file() for file in files):
+        pytest.skip(f"no OpenACC leaders in {shared_data}")
+    series = play(repeated(whole(*((str(file), 1.0) for file in files)), 3), hcfs("mixed"), 6)
+    assert series["gap"].min() > 0.0
+
+
+def test_without_the_cap_it_drives_through_its_predecessor() -> None:
+    # The reward has no spacing term: an actor 10 cm/s too fast wins every frame against CACC.
+    steady = leader(8.0 + 1.5 * torch.sin(T * torch.arange(651.0) / 3.0))
+    literal = play(steady, hcfs("hasty", "path", safe_cap=False), 3)
+    assert literal["gap"].min() <= 0.0
+    safe = play(steady, hcfs("hasty", "path"), 3)
+    assert safe["gap"].min() > 0.4
+
+
+# -- the hybrid ------------------------------------------------------------------------------------
+
+
+def test_switching_state_is_carried_by_the_tensordict() -> None:
+    tested, profiles = hcfs("random"), ramps()
+    series = play(profiles, tested)
+    env = env_of(profiles, tested)
+    # The seeds that the evaluation gives to its episodes, whose noise the actor draws from.
+    count = len(POPULATION.time_gap)
+    ids = torch.arange(3)
+    given = reset_options(env, ids, ids % count, 0, count)
+    with torch.no_grad():
+        data = env.rollout(100, tested.policy, tensordict=env.reset(given), auto_reset=False)
+    for name in ("winner", "switches", "clamps", "cap_interventions"):
+        found = data["next", "hybrid", name].squeeze(-1).transpose(0, 1)
+        assert torch.equal(found, series[name]), name
+    # Counted from the record of winners: a change is a switch.
+    changes = (series["winner"].diff(dim=0) != 0).sum(0)
+    assert torch.equal(series["switches"][-1], changes)
+    assert changes.sum() > 10
+    # A new episode begins anew, whatever is left in the TensorDict from the one before.
+    end = step_mdp(data[:, -1])
+    end["done"][1] = False
+    begun = env.maybe_reset(end)
+    assert (begun["hybrid", "switches"][[0, 2]] == 0).all()
+    assert (begun["hybrid", "winner"][[0, 2]] == -1).all()
+    assert torch.equal(begun["hybrid", "switches"][1], data["next", "hybrid", "switches"][1, -1])
+
+
+def test_keeps_no_state_of_its_own() -> None:
+    tested = hcfs("random")
+    one, two = (play(ramps(), tested) for _ in range(2))
+    for name, value in one.items():
+        assert torch.equal(value, two[name]), name
+
+
+def test_any_two_controllers_make_a_hybrid() -> None:
+    gains = composed("variant=cacc", "gains=paper_like").gains
+    other = ControllerPolicy(CACC(T, A_MAX, **gains, string=parse_string("automated*6")), A_MAX)
+    series = play(ramps(), hcfs(other))
+    parents = [play(ramps(), cacc(name))["reward"].sum() for name in ("tuned", "paper_like")]
+    assert series["reward"].sum() >= max(parents) - 0.1 * abs(max(parents))
+
+
+def test_the_hybrid_of_good_parents_is_about_as_good_as_the_better() -> None:
+    profiles = windows()
+    hybrid = play(profiles, hcfs("good"))["reward"].sum()
+    good = Driver(("variant=ddpg",), Actor("good"))
+    parents = [play(profiles, p)["reward"].sum() for p in (cacc(), good)]
+    assert hybrid >= 1.1 * max(parents)  # rewards are negative: 10 %
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("deployed.jerk_bound=0", "jerk_bound must be positive"),
+        ("deployed.lookahead=future", "causal, hold, oracle"),
+        ("deployed.braking=9", "braking must lie in"),
+        ("deployed.margin=-1", "margin"),
+        ("+deployed.mass=3", "mass"),
+        ("gains.k2=1.9", "unstable"),
+    ],
+)
+def test_impossible_controllers(override, words) -> None:
+    cfg = deployed(composed("variant=hcfs", override))
+    with pytest.raises(ConfigError, match=words):
+        build_env(cfg, ramps(), POPULATION, 1)
+
+
+def test_a_controller_that_remembers_is_no_policy() -> None:
+    rule = CACC(T, string=parse_string("automated*2"))
+    with pytest.raises(ConfigError, match="HCFS remembers entries of its own"):
+        ControllerPolicy(HCFS(rule, T, string=parse_string("automated*2")))
+
+
+# -- any number of vehicles ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("vehicles", [1, 8, 100])
+@pytest.mark.parametrize("batch", [1, 512])
+def test_any_number_of_vehicles_and_any_batch(vehicles, batch) -> None:
+    profiles = repeated(ramps().select([1]), batch)
+    tested = Driver(("variant=hcfs",), network(composed("variant=hcfs")))
+    env = env_of(profiles, tested, vehicles, horizon=5)
+    td = env.rollout(5, tested.policy, break_when_any_done=False)
+    assert td[ACTION].shape == (batch, 5, vehicles, 1)
+    assert td["next", *REWARD].shape == (batch, 5, vehicles, 1)
+    assert torch.isfinite(td["next", *REWARD]).all()
+
+
+@pytest.mark.parametrize("vehicles", [1, 5])
+def test_specs(vehicles) -> None:
+    check_env_specs(env_of(ramps(), hcfs(), vehicles), break_when_any_done="both")
+
+
+def test_many_vehicles_cost_little_each() -> None:
+    spent = {}
+    for vehicles, batch in ((8, 1), (100, 512)):
+        tested = hcfs("good", "path")
+        env = env_of(repeated(ramps().select([1]), batch), tested, vehicles)
+        td, each = env.reset(), []
+        with torch.no_grad():
+            for _ in range(8):
+                begun = time.perf_counter()
+                td = step_mdp(env.step(tested.policy(td)))
+                each.append(time.perf_counter() - begun)
+        spent[vehicles] = min(each) / (vehicles * batch)
+    assert spent[100] <= spent[8] / 20
+
+
+# -- human drivers in between ----------------------------------------------------------------------
+
+MIXED = parse_string("automated*2 human automated*2")
+
+
+def heard(delay: float, leader_sends: bool = True):
+    """What is heard in one mixed string; speeds, gaps and accelerations as written here."""
+    piece = Communication(MIXED, leader_sends=leader_sends, headway=5.0, delay=delay)
+    speed = torch.tensor([10.0, 11.0, 8.0, 9.0, 12.0]).view(1, 5, 1)
+    gap = torch.tensor([6.0, 4.0, 20.0, 7.0, 5.5]).view(1, 5, 1)
+    acceleration = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]).view(1, 5, 1)
+    entries = piece.compute(
+        speed, gap, acceleration, torch.tensor([[13.0]]), torch.tensor([[-0.6]])
+    )
+    return {
+        key[1]: value.flatten().tolist() for key, value in zip(piece.out_keys, entries, strict=True)
+    }
+
+
+def test_behind_a_human_driver_that_one_leads_the_chain() -> None:
+    known = heard(0.0)
+    assert known["leader_speed"] == pytest.approx([13.0, 13.0, 11.0, 8.0, 8.0])
+    assert known["leader_acceleration"] == pytest.approx([-0.6, -0.6, 0.2, 0.3, 0.3])
+    assert known["leader_speed_error"] == pytest.approx([3.0, 2.0, 3.0, -1.0, -4.0])
+    assert known["speed_error"] == pytest.approx([3.0, -1.0, 3.0, -1.0, -3.0])
+    # Gaps less 5 m: 1, −1, 15, 2, 0.5; summed within each chain.
+    assert known["gap_error"] == pytest.approx([1.0, -1.0, 15.0, 2.0, 0.5])
+    assert known["leader_gap_error"] == pytest.approx([1.0, 0.0, 15.0, 2.0, 2.5])
+    assert known["received_gap"] == pytest.approx([6.0, 4.0, 20.0, 7.0, 5.5])
+
+
+def test_only_what_came_by_radio_is_delayed() -> None:
+    # 0.1 s: messages of the vehicle ahead (13, 10, ·, ·, 9 m/s) and of the chain's leader.
+    late, now = heard(0.1), heard(0.0)
+    change = [a - b for a, b in zip(late["gap_error"], now["gap_error"], strict=True)]
+    assert change == pytest.approx([-1.3, -1.0, 0.0, 0.0, -0.9], abs=1e-5)
+    change = [a - b for a, b in zip(late["leader_gap_error"], now["leader_gap_error"], strict=True)]
+    assert change == pytest.approx([-1.3, -1.3, 0.0, 0.0, -0.8], abs=1e-5)
+    assert late["speed_error"] == now["speed_error"]
+    # A leader of the string that does not send is seen by the first one's sensors.
+    silent = heard(0.1, leader_sends=False)
+    assert silent["gap_error"] == pytest.approx([1.0, -2.0, 15.0, 2.0, -0.4], abs=1e-5)
+    assert silent["leader_speed"] == now["leader_speed"]
+
+
+def test_cacc_in_a_mixed_string_obeys_the_law_by_hand() -> None:
+    cfg = composed("variant=cacc", string("automated*2 human automated*2"))
+    env = build_env(cfg, wavy_profiles(), POPULATION, 3)
+    data = env.rollout(20, break_when_any_done=False)
+    gains, now = Gains(0.04, 0.12, 1.4, 1.3), data["vehicles"]
+    speed, gap = now["speed"][..., 0], now["gap"][..., 0]
+    # The fourth vehicle is the first behind a human driver: both errors are those to the human.
+    change = (gains.k1 + gains.k3) * (gap[..., 3] - 5.0)
+    change = change + (gains.k2 + gains.k4) * (speed[..., 2] - speed[..., 3])
+    wanted = (change / T).clamp(-3.0, 3.0)
+    found = data["next", "vehicles", "command"][..., 3, 0]
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+    # The last one hears it, and of the human only what it knows of the fourth.
+    received = gap[..., 4] - 5.0 - 0.005 * speed[..., 3]
+    total = gap[..., 3] + gap[..., 4] - 10.0 - 0.005 * speed[..., 2]
+    change = gains.k1 * received + gains.k2 * (speed[..., 3] - speed[..., 4])
+    change = change + gains.k3 * total + gains.k4 * (speed[..., 2] - speed[..., 4])
+    wanted = (change / T).clamp(-3.0, 3.0)
+    found = data["next", "vehicles", "command"][..., 4, 0]
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_on_a_ring_a_chain_needs_a_leader() -> None:
+    with pytest.raises(ConfigError, match="a chain would have no leader"):
+        Communication(parse_string("automated*3", "ring"))
+
+
+def test_no_oracle_behind_a_human_driver() -> None:
+    with pytest.raises(ConfigError, match="oracle knows the recorded leader only"):
+        DeadBeat(T, lookahead="oracle", string=MIXED)
