@@ -61,7 +61,9 @@ class Views:
         self.first_is_ahead = 0 in self.places and not self.drawn
         self.keys: list[Key] = []
         self.plan = [self._add(name) for name in self.names]
-        self.index = self._place((role, "index")) if self.drawn else -1
+        # Where every entry is taken as it is, nobody needs to know where the role drives.
+        picks = any(kind in (SELF, AHEAD, BEHIND, PRESENT) for kind, _, _ in self.plan)
+        self.index = self._place((role, "index")) if self.drawn and picks else -1
 
     def _place(self, key: Key) -> int:
         """Return the place of an entry among those read."""
