@@ -1,5 +1,6 @@
-# Two commands: `make run` does the main job, `make test` checks everything. Each sets up .venv
-# first; Python 3.11 or newer and make are all that a fresh machine needs.
+# `make run` does the main job, `make test` checks everything but long experiments, which
+# `make test-all` adds. Each sets up .venv first; Python 3.11 or newer and make are all that a
+# fresh machine needs.
 
 PYTHON ?= python3
 VENV := .venv
@@ -10,16 +11,19 @@ ARGS ?=
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test coverage lint clean
+.PHONY: run test test-all coverage lint clean
 
 run: $(STAMP)
 	$(BIN)/python -m lcc_rl.pipeline experiment=quickstart $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" $(ARGS)
+
+test-all: lint
+	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
 
 coverage: $(STAMP)
-	$(BIN)/python -m pytest -n 2 -m "not slow" --cov $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --cov $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

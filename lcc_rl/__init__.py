@@ -6,8 +6,8 @@ from importlib import import_module
 from typing import Any
 
 from lcc_rl.runs import interrupts
+from lcc_rl.version import __version__
 
-__version__ = "0.1.0"
 __all__ = ["__version__", "make_env", "results"]
 
 if interrupts.is_command():

@@ -20,6 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from lcc_rl.config_checks import check_ignored, renamed_option
 from lcc_rl.config_errors import check_keys, explain, refused_key
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
@@ -27,6 +28,11 @@ from lcc_rl.schemas import register_schemas
 
 TARGET = "_target_"
 CONF = "lcc_rl.conf"
+# Settings that do not change any row of a result.
+NOT_IDENTITY = (
+    *("resume", "compare", "jobs", "sweep", "objective", "logger", "trust"),
+    "training.keep_every",
+)
 
 
 def chosen_folder(resumed: str | None, fresh: str) -> str:
@@ -67,6 +73,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(str(explained(error, entry, overrides))) from error
     check_keys(cfg)
+    check_ignored(cfg, overrides)
     return cfg
 
 
@@ -84,6 +91,9 @@ def is_sweep() -> bool:
 
 def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Exception:
     """Return a clearer error for what Hydra refused, naming the nearest option that exists."""
+    renamed = renamed_option(overrides)
+    if renamed is not None:
+        return renamed
     key = refused_key(error)
     hydra = key is not None and key.startswith("hydra.")
     # What exists may depend on the other overrides: leave out only those that fail.
@@ -212,6 +222,20 @@ def config_hash(config: Any) -> str:
     """Return a short hash of what a configuration says, independent of the order of its keys."""
     text = json.dumps(plain(config), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def identity(cfg: DictConfig) -> str:
+    """Return the hash of everything in a configuration that determines the results."""
+    content = plain(cfg)
+    for key in NOT_IDENTITY:
+        *path, last = key.split(".")
+        node = content
+        for part in path:
+            node = node.get(part) or {}
+        node.pop(last, None)
+    if content.get("policy") is None:  # some entry points have no such setting
+        content.pop("policy", None)
+    return config_hash(content)
 
 
 def require(condition: bool, message: str) -> None:

@@ -50,6 +50,9 @@ def explain(error: Exception, valid: Any) -> Exception:
         node = OmegaConf.select(valid, parent) if parent else valid
     except Exception:  # an interpolation of Hydra's own that exists only inside a run
         return error
+    if parent == "agent" and node is None:
+        variant = OmegaConf.select(valid, "variant")
+        return ConfigError(f"{key}: variant {variant} learns nothing, it has no agent")
     if not OmegaConf.is_dict(node):
         return unknown_at(parent, valid) or error
     if not parent and name in node:  # other variants have it

@@ -1,4 +1,4 @@
-"""Error room: the one family of errors a user is meant to read, each naming the culprit."""
+"""Exceptions for wrong input, with messages for the user."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from difflib import get_close_matches
 
 
 class LccError(Exception):
-    """Base of every error caused by input: a file, a row, a key or an option."""
+    """Base class of errors caused by input: a file, a row, a key or an option."""
 
 
 class DataError(LccError, ValueError):

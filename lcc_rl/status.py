@@ -1,4 +1,4 @@
-"""Entry point: how the runs below a folder stand, ``python -m lcc_rl.status FOLDER``."""
+"""Entry point: show the state of the runs in a folder, ``python -m lcc_rl.status FOLDER``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lcc_rl.runs.sweeps import read_plan
 
 
 def show(root: Path, console: Console) -> None:
-    """Print how the runs below a folder stand: a table on a terminal, else a line a run."""
+    """Print the state of the runs: a table on a terminal, otherwise one line per run."""
     states, planned = survey(root), read_plan(root).runs
     if console.is_terminal:
         console.print(draw(root, states, planned))
@@ -30,12 +30,12 @@ def show(root: Path, console: Console) -> None:
 
 
 def watch(root: Path, console: Console, every: float = 2.0) -> None:
-    """Keep the table current until no run is running and none waits."""
+    """Update the table until no run is running or waiting."""
 
     def planned() -> int:
         return read_plan(root).runs
 
-    survey(root)  # an error of the folder's is better said before the table begins
+    survey(root)  # raises for a missing folder before the table is drawn
     with live(root, planned, console, every):
         while True:
             numbers = counts(survey(root), planned())
@@ -48,7 +48,7 @@ def look(folder: str, console: Console, watching: bool) -> None:
     """Show a folder once, or keep showing it.
 
     Raises:
-        ConfigError: if its name is empty, as that of an unset variable is.
+        ConfigError: if the name is empty, for example from an unset variable.
         ResultsError: if there is no such folder.
     """
     if not folder:
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Show the folder given on the command line."""
     parser = argparse.ArgumentParser("lcc_rl.status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
-    parser.add_argument("--watch", action="store_true", help="keep the table current")
+    parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
     options = parser.parse_args(arguments)
     with interruptible():
         main_guard(look)(options.folder, Console(highlight=False), options.watch)

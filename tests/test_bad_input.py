@@ -8,10 +8,11 @@ import os
 import pandas as pd
 import pytest
 import torch
+from commands import QUICK, tiny
 from omegaconf import OmegaConf
-from test_entry_points import tiny
 
-from lcc_rl import calibrate, evaluate, results, train
+from lcc_rl import evaluate, results, train
+from lcc_rl.commands import calibration
 from lcc_rl.config import load, plain
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, ResultsError
@@ -114,8 +115,8 @@ def test_asking_for_more_than_there_is_is_said(caplog, tmp_path) -> None:
 
 
 def test_calibration_says_what_it_was_made_with(tmp_path) -> None:
-    words = ["data.platoons=3", "data.recordings=1", "calibration.local_genetic.generations=2"]
-    calibrate.run(load("calibrate", words), tmp_path)
+    words = ["data.platoons=3", "data.recordings=1", QUICK]
+    calibration.run(load("calibrate", words), tmp_path)
     assert results.load(tmp_path, "drivers")["data.platoons"].eq(3).all()
 
 

@@ -7,50 +7,30 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import torch
-from omegaconf import DictConfig, OmegaConf
+from commands import (
+    QUICK,
+    TINY,
+    assert_same_tables,
+    jobs_in_threads,
+    run_command,
+    run_process,
+    start,
+    tiny,
+    wait_for,
+)
+from omegaconf import OmegaConf
 
 from lcc_rl import evaluate, pipeline, results, train
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity, load_config, load_policy
+from lcc_rl.results.runs import load_config, load_policy
 from lcc_rl.runs.states import inspect_run
-
-ROOT = Path(__file__).resolve().parents[1]
-TINY = (
-    "experiment=smoke",
-    "data.platoons=4",
-    "data.recordings=2",
-    "scenario.horizon=40",
-    "agent.batch_size=64",
-    "agent.hidden=[16,16]",
-)
-NO_AGENT = tuple(item for item in TINY if not item.startswith("agent."))
-
-
-def tiny(entry: str, *overrides: str, agent: bool = True) -> DictConfig:
-    return load(entry, [*(TINY if agent else NO_AGENT), *overrides])
-
-
-def command(*words: str, cwd: Path, check: bool = True) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", *words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        timeout=300,
-    )
-    assert not check or done.returncode == 0, done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +59,7 @@ def test_train_leaves_everything_that_is_promised(trained) -> None:
 
 def test_same_command_same_rows(trained, tmp_path) -> None:
     train.run(tiny("train", "variant=alcc"), tmp_path, quiet=True)
-    for table in ("training", "episodes", "steps"):
-        one, two = (read_parquet(folder / f"{table}.parquet") for folder in (trained, tmp_path))
-        pd.testing.assert_frame_equal(one, two, check_exact=True)
+    assert_same_tables(trained, tmp_path)
 
 
 def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> None:
@@ -113,7 +91,7 @@ def test_a_folder_with_a_training_is_not_overwritten(trained) -> None:
 
 def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}")
-    rows = evaluate.run(cfg, tmp_path)
+    rows = evaluate.run(cfg, tmp_path)  # not quiet: draws figures
     assert set(rows["strategy"]) == {"direct", "idm", "alcc"}
     # The training's own evaluation met the same episodes.
     own = read_parquet(trained / "episodes.parquet")
@@ -124,9 +102,9 @@ def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
 
 
 def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_path) -> None:
-    policy = f"policy={trained}"
-    free = evaluate.run(tiny("evaluate", "variant=alcc", policy), tmp_path / "a")
-    held = evaluate.run(tiny("evaluate", "variant=alcc", policy, "+filter=barrier"), tmp_path / "b")
+    words = ("variant=alcc", f"policy={trained}")
+    free = evaluate.run(tiny("evaluate", *words), tmp_path / "a", quiet=True)
+    held = evaluate.run(tiny("evaluate", *words, "+filter=barrier"), tmp_path / "b", quiet=True)
     means = [rows.groupby("strategy")["min_ttc_s"].mean() for rows in (free, held)]
     assert means[0]["idm"] == means[1]["idm"]
     assert means[0]["alcc"] != means[1]["alcc"]
@@ -136,12 +114,12 @@ def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_pat
 def test_compared_policies_get_the_filter_under_study(trained, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "+filter=barrier")
     OmegaConf.update(cfg, "compare", ["pretrained/reference"])
-    rows = evaluate.run(cfg, tmp_path)
+    rows = evaluate.run(cfg, tmp_path, quiet=True)
     learned = rows[rows["strategy"].isin(["alcc", "reference"])]
     assert learned["strategy"].nunique() == 2
     assert (learned["share_ttc_unsafe"] == 0).all()
     alone = tiny("evaluate", "variant=reference", "policy=pretrained", "+filter=barrier")
-    again = evaluate.run(alone, tmp_path / "alone")
+    again = evaluate.run(alone, tmp_path / "alone", quiet=True)
     parts = [r[r["strategy"] == "reference"].reset_index(drop=True) for r in (rows, again)]
     pd.testing.assert_frame_equal(parts[0][again.columns], parts[1], check_exact=True)
 
@@ -174,10 +152,11 @@ def test_an_interrupted_evaluation_leaves_no_old_rows(trained, tmp_path, monkeyp
 
 def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
     # A quieter scenario must reach the baselines as well, without changing what they are.
-    quiet = "scenario.pieces.hdv.noise=0"
-    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", quiet)
-    rows = evaluate.run(cfg, tmp_path / "a")
-    alone = evaluate.run(tiny("evaluate", "variant=idm", quiet, agent=False), tmp_path / "b")
+    calm = "scenario.pieces.hdv.noise=0"
+    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", calm)
+    rows = evaluate.run(cfg, tmp_path / "a", quiet=True)
+    cfg = tiny("evaluate", "variant=idm", calm, agent=False)
+    alone = evaluate.run(cfg, tmp_path / "b", quiet=True)
     for name in ("idm", "direct"):
         one, two = (r[r["strategy"] == name].reset_index(drop=True) for r in (rows, alone))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
@@ -220,7 +199,7 @@ def test_what_would_fail_late_fails_before_anything_is_written(tmp_path, overrid
 
 
 def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
-    train.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct")
+    train.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct", quiet=True)
     cfg = tiny("evaluate", "variant=idm", "scenario.followers=3", agent=False)
     rows = evaluate.run(cfg, tmp_path / "three")
     assert set(rows["strategy"]) == {"direct", "idm"}
@@ -232,8 +211,9 @@ def test_a_policy_for_those_that_learn_nothing_is_refused(trained, tmp_path) -> 
         evaluate.run(tiny("evaluate", "variant=idm", f"policy={trained}", agent=False), tmp_path)
 
 
-def test_pipeline_from_data_to_figures_and_completion(tmp_path) -> None:
-    overrides = [*TINY, "variants=[reference,alcc]"]
+def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
+    jobs_in_threads(monkeypatch)
+    overrides = [*TINY, QUICK, "variants=[reference,alcc]"]
     rows = pipeline.run(load("pipeline", overrides), tmp_path, overrides)
     assert set(rows["strategy"]) == {"direct", "idm", "reference", "alcc"}
     for name in ("reference", "alcc"):
@@ -250,7 +230,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path) -> None:
 
 def test_multirun_sweep_and_results_load(tmp_path) -> None:
     words = [*TINY, "variant=alcc,reference", "seed=0,1", "hydra.sweep.dir=sweep"]
-    command("lcc_rl.train", "-m", *words, cwd=tmp_path)
+    run_command("lcc_rl.train", "-m", *words, cwd=tmp_path, check=True)
     frame = results.load(tmp_path / "sweep")
     assert frame.groupby(["variant", "seed"]).ngroups == 4
     assert frame["run"].nunique() == 4
@@ -260,76 +240,55 @@ def test_multirun_sweep_and_results_load(tmp_path) -> None:
     assert training.groupby("seed")["episode_reward"].first().nunique() == 2
 
 
-def test_sigkill_and_resume_equal_an_uninterrupted_run(trained, tmp_path) -> None:
-    longer = ("training.episodes=160", "variant=alcc", "hydra.run.dir=run")
-    whole = command("lcc_rl.train", *TINY, *longer[:2], "hydra.run.dir=whole", cwd=tmp_path)
-    assert whole.returncode == 0
-    process = subprocess.Popen(
-        [sys.executable, "-m", "lcc_rl.train", *TINY, *longer],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    checkpoint = tmp_path / "run" / "checkpoint.pt"
-    deadline = time.monotonic() + 120
-    while not checkpoint.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert checkpoint.exists()
+def test_sigkill_and_resume_equal_an_uninterrupted_run(tmp_path) -> None:
+    longer = ("training.episodes=160", "variant=alcc")
+    train.run(tiny("train", *longer), tmp_path / "whole", quiet=True)
+    with start("lcc_rl.train", *TINY, *longer, "hydra.run.dir=run", cwd=tmp_path) as process:
+        wait_for(tmp_path / "run" / "checkpoint.pt", process)
+        process.send_signal(signal.SIGKILL)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
-    command("lcc_rl.train", "resume=run", cwd=tmp_path)
-    for table in ("training", "episodes", "steps"):
-        one, two = (read_parquet(tmp_path / f / f"{table}.parquet") for f in ("whole", "run"))
-        pd.testing.assert_frame_equal(one, two, check_exact=True)
+    run_command("lcc_rl.train", "resume=run", cwd=tmp_path, check=True)
+    assert_same_tables(tmp_path / "whole", tmp_path / "run")
 
 
 def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
-    process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "lcc_rl.train",
-            *TINY,
-            "training.episodes=80000",
-            "hydra.run.dir=run",
-        ],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "run/checkpoint.pt").exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    words = (*TINY, "training.episodes=80000", "hydra.run.dir=run")
+    with start("lcc_rl.train", *words, cwd=tmp_path) as process:
+        wait_for(tmp_path / "run" / "checkpoint.pt", process)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert re.search(r"stopped after iteration \d+ of 10000; go on with: .*resume=.*run", errors)
+    said = r"stopped after iteration \d+ of 10000; (go on|resume) with: .*resume=.*run"
+    assert re.search(said, errors)
     assert "Traceback" not in errors
 
 
-def test_an_interrupted_pipeline_is_completed(tmp_path) -> None:
-    words = [*TINY, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "lcc_rl.pipeline", *words],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "job/alcc/checkpoint.pt").exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process of the job
-    _, errors = process.communicate(timeout=60)
+def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
+    words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
+    with start("lcc_rl.pipeline", *words, cwd=tmp_path) as process:
+        wait_for(tmp_path / "job/alcc/checkpoint.pt", process)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process of the job
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "resume=" in errors
     assert not (tmp_path / "job/alcc/episodes.parquet").exists()
-    command("lcc_rl.pipeline", "resume=job", cwd=tmp_path)
+    jobs_in_threads(monkeypatch)
+    run_command("lcc_rl.pipeline", "resume=job", cwd=tmp_path, check=True)
     assert len(read_parquet(tmp_path / "job/alcc/training.parquet")) == 50
     assert (tmp_path / "job/evaluation/figures/overview.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        (["lcc_rl.evaluate", "variant=alccc"], 2, "'alccc'"),
+        (["lcc_rl.status", "nowhere"], 2, "no such folder"),
+    ],
+)
+def test_commands_that_no_other_test_starts_as_a_process(tmp_path, words, code, expected) -> None:
+    done = run_process(*words, cwd=tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, 1), done.stderr
+    assert expected in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -345,7 +304,7 @@ def test_an_interrupted_pipeline_is_completed(tmp_path) -> None:
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> None:
-    done = command(*words, cwd=tmp_path, check=False)
+    done = run_command(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert expected in done.stderr
     assert "Traceback" not in done.stderr
@@ -365,7 +324,7 @@ def test_a_command_that_names_a_finished_run_by_mistake_leaves_it_finished(
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(trained, run)
-    done = command("lcc_rl.train", "variant=alcc", *words, cwd=tmp_path, check=False)
+    done = run_command("lcc_rl.train", "variant=alcc", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert expected in done.stderr
     assert inspect_run(run).state == "finished"

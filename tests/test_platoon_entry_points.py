@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import torch
+from commands import AGENT, HORIZON, run_command
 from helpers import POPULATION
+from lcc_rl.agents.training import Trainer, transitions
 
 from lcc_rl import evaluate, results, train
-from lcc_rl.agents.training import Trainer, transitions
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.envs.factory import build_agent, build_env, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity, load_policy
+from lcc_rl.results.runs import load_policy
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
 
-TINY = ("experiment=smoke", "scenario.horizon=40", "evaluation.profiles=3")
-AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")
+TINY = ("experiment=smoke", HORIZON, "evaluation.profiles=3")
 
 
 def tiny(entry: str, variant: str, *overrides: str):
@@ -112,9 +110,9 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
 
 
 def test_sweep_as_typed(tmp_path) -> None:
-    words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "hydra.sweep.dir=sweep"]
-    command = [sys.executable, "-m", "lcc_rl.train", *words]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "training.episodes=8"]
+    words.append("hydra.sweep.dir=sweep")
+    done = run_command("lcc_rl.train", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     frame = results.load(tmp_path / "sweep")
     assert frame.groupby(["variant", "seed"]).ngroups == 6
@@ -182,7 +180,7 @@ def test_resuming_equals_never_having_stopped(tmp_path) -> None:
 
 
 def test_study_from_cycles_to_page_and_on_from_where_it_stopped(tmp_path) -> None:
-    overrides = ("scenario.horizon=40", "evaluation.profiles=3", *AGENT)
+    overrides = (HORIZON, "evaluation.profiles=3", *AGENT)
     study = hcfs.Study(tmp_path, recipe="smoke", seeds=1, overrides=overrides, jobs=1)
     outcomes = hcfs.run(study)
     assert [outcome.status for outcome in outcomes] == ["finished"], outcomes

@@ -1,12 +1,12 @@
-"""How much could be saved at all: the best drive for somebody who knows the whole profile.
+"""Upper bound of the saving: the best drive with knowledge of the whole profile.
 
     python tools/clairvoyant.py data=ngsim data.path=...          # beside idm and the policy
     python tools/clairvoyant.py --policy outputs/train/<run> --iterations 100 evaluation.drivers=3
 
-Plans every held-out episode by the gradient through the simulator, beginning with a learned
-policy's drive, and evaluates the plan as any other strategy. Whatever is no option is an
-override of the evaluation (data, drivers, split, evaluation, scenario, +filter); by default 12
-drivers stand behind each of 20 profiles.
+Plans every held-out episode by the gradient through the simulator, starting from a learned
+policy's actions, and evaluates the plan like any other strategy. Words that are no options are
+overrides of the evaluation (data, drivers, split, evaluation, scenario, +filter); by default 12
+drivers follow on each of 20 profiles.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 
 import pandas as pd
+from lcc_rl.evaluation.monte_carlo import evaluate
 from rich.console import Console
 
 from lcc_rl.config import load, require
@@ -24,7 +25,6 @@ from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluate import baseline, trained
 from lcc_rl.evaluation.clairvoyant import clairvoyant
-from lcc_rl.evaluation.monte_carlo import evaluate
 from lcc_rl.io.files import write_parquet
 from lcc_rl.pipeline import root_key
 from lcc_rl.results.runs import load_policy
@@ -38,7 +38,7 @@ OWN = ("variant", "policy", "compare", "seed", "knowledge", "agent", "observatio
 
 
 def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
-    """Return the episodes of a human, the policy and the clairvoyant, and write them."""
+    """Evaluate human driver, policy and plan; write and return the rows of episodes.parquet."""
     own = ["variant=alcc", f"evaluation.drivers={DRIVERS}"]
     cfg = load("evaluate", [*own, *overrides])
     require(cfg.device == "cpu", "tools/clairvoyant.py runs on device=cpu")
@@ -76,7 +76,7 @@ def main(arguments: list[str]) -> int:
     """Plan and print the table."""
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
-    parser.add_argument("--policy", default="pretrained", help="where a plan begins")
+    parser.add_argument("--policy", default="pretrained", help="start of the plan")
     parser.add_argument("--iterations", type=int, default=400)
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))

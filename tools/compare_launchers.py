@@ -1,10 +1,10 @@
-"""Do the same sweep with every launcher, and compare its rows: python tools/compare_launchers.py.
+"""Run the same sweep with every launcher and compare the rows.
 
     python tools/compare_launchers.py --out outputs/launchers
     ray-environment/bin/python tools/compare_launchers.py serial ray --out outputs/launchers
 
-Launchers that are not installed are left out; the second command, in Ray's environment, finds the
-serial sweep of the first finished and compares with it. Exit code 1 where a row differs.
+Launchers that are not installed are left out. The second command, in Ray's environment, compares
+with the finished serial sweep of the first. The exit code is 1 if a row differs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from benchmarks.harness import installed
 
 from lcc_rl import results
 
-# What is typed, and the package behind it.
+# Override and package of each launcher.
 LAUNCHERS = {
     "serial": ("hydra/launcher=basic", "hydra"),
     "joblib": ("hydra/launcher=lcc_joblib", "hydra_plugins.hydra_joblib_launcher"),
@@ -38,12 +38,12 @@ SMALL = ("experiment=smoke", "agent.batch_size=64", "agent.hidden=[16,16]")
 
 @dataclass(frozen=True)
 class Spent:
-    """What a sweep took.
+    """Time of a sweep.
 
     Args:
-        wall_s: seconds on the clock.
-        cpu_s: seconds of processors that its processes used.
-        others_s: seconds of processors that everything else used meanwhile.
+        wall_s: wall-clock time [s].
+        cpu_s: processor time of the sweep [s].
+        others_s: processor time of all other processes meanwhile [s].
     """
 
     wall_s: float
@@ -60,17 +60,17 @@ class Spent:
 
 
 def busy() -> float:
-    """Seconds of processors that all processes of this machine have used since it started."""
+    """Return the processor time of all processes since the machine started [s]."""
     first = Path("/proc/stat").read_text().splitlines()[0].split()
     user, nice, system = map(int, first[1:4])
     return (user + nice + system) / os.sysconf("SC_CLK_TCK")
 
 
 def sweep(launcher: str, words: Sequence[str], folder: Path) -> Spent:
-    """Do the sweep with a launcher, into the folder of its name.
+    """Run the sweep with a launcher, into the folder of its name.
 
     Raises:
-        RuntimeError: if it fails, with what it said.
+        RuntimeError: if it fails, with its output.
     """
     typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words, LAUNCHERS[launcher][0]]
     typed += [f"hydra.sweep.dir={launcher}"]
@@ -98,7 +98,7 @@ def check_same(folder: Path, one: str, two: str) -> int:
 
 
 def run(launchers: Sequence[str], words: Sequence[str], folder: Path) -> bool:
-    """Do the sweep with every launcher and say what it took; False where rows differ."""
+    """Run the sweep with every launcher and print its time; False if rows differ."""
     same = True
     for launcher in launchers:
         if not installed(LAUNCHERS[launcher][1]):

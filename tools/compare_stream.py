@@ -1,4 +1,4 @@
-"""Compare the synthetic stream with real car-following pairs: a table, and a figure if wanted.
+"""Compare the synthetic stream with real car-following pairs in a table and a figure.
 
     python tools/compare_stream.py --real i80_pairs.parquet --out stream.png
 
@@ -43,7 +43,7 @@ def compare(real: str, seed: int, out: str | None, role: str) -> None:
 
 
 def main() -> int:
-    """Read the arguments and compare; 1 where the input is at fault."""
+    """Command line; returns the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

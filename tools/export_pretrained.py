@@ -1,8 +1,8 @@
-"""Make a shipped policy of a run's: its weights, what it was trained with, where it came from.
+"""Export a run's policy into the package: weights, configuration and provenance.
 
     python tools/export_pretrained.py outputs/train/<run> "3 of 8 seeds of …"
 
-Paths are left out of the configuration: they mean nothing on another machine.
+The configuration is exported without its paths.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER) -> Path:
     Args:
         run: a run folder or policy file.
         origin: data, recipe and seed, in a sentence.
-        folder: where the file goes, named by its variant.
+        folder: folder of the file, which is named by its variant.
 
     Returns:
         The file's path.
@@ -49,7 +49,7 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Export; 1 where the run is at fault."""
+    """Export a policy; 1 if the run holds none."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", help="run folder or policy.pt")
     parser.add_argument("origin", help="data, recipe and seed, in a sentence")

@@ -2,9 +2,9 @@
 
     python tools/fetch_ngsim.py --location i-80 --output data/ngsim_i80.csv
 
-The portal holds 11.8 million rows of four locations. The download is paged; an interrupted one is
-taken up again by the same command. The file appears under its name only when it is whole and its
-number of rows is the one the portal counts. The result is read by ``data=ngsim``.
+The portal holds 11.8 million rows of four locations. The download is paged; the same command
+resumes an interrupted one. The file gets its name only when it is complete, with as many rows as
+the portal counts. It is read by ``data=ngsim``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -28,19 +28,19 @@ BASE_URL = "https://data.transportation.gov"
 DATASET = "8ect-6jqj"
 LOCATIONS = ("i-80", "us-101", "lankershim", "peachtree")
 PAGE_ROWS = 50_000
-GIVE_UP = (400, 401, 403, 404)  # asking again would not help
+GIVE_UP = (400, 401, 403, 404)  # not worth a retry
 
 
 class FetchError(Exception):
-    """The download cannot go on; the message says why."""
+    """A download that failed."""
 
 
 @dataclass
 class State:
-    """How far a download is; kept beside the partial file.
+    """Progress of a download, kept beside the partial file.
 
     Args:
-        query: what is being downloaded; a partial file of another query is not continued.
+        query: what is being downloaded; a partial file of another query is discarded.
         total: rows that the portal counts.
         rows: rows in the partial file.
         size: bytes of the partial file up to the last whole page.
@@ -83,9 +83,8 @@ class Portal:
         try:
             return int(json.loads(text)[0]["rows"])
         except (ValueError, LookupError, TypeError) as error:
-            raise FetchError(
-                f"{self.base_url}: unexpected answer to a count: {text[:200]!r}"
-            ) from (error)
+            message = f"{self.base_url}: unexpected answer to a count: {text[:200]!r}"
+            raise FetchError(message) from error
 
     def page(self, offset: int, rows: int) -> bytes:
         """One page of the table as CSV with a header."""
@@ -113,7 +112,7 @@ class Portal:
                 time.sleep(self.pause_s * 2**attempt)
         raise FetchError(
             f"{url}: failed {self.retries + 1} times, last: {failure}. Run the same command again "
-            "to go on from here"
+            "to resume"
         )
 
     @staticmethod
@@ -125,33 +124,27 @@ class Portal:
         return content
 
 
-def fetch(
-    portal: Portal,
-    output: Path,
-    page_rows: int = PAGE_ROWS,
-    say: Callable[[str], None] = print,
-) -> int:
-    """Download a table, going on from a partial file of the same query.
+def fetch(portal: Portal, output: Path, page_rows: int = PAGE_ROWS) -> int:
+    """Download a table, resuming from a partial file of the same query.
 
     Args:
-        portal: where from, and which location.
-        output: the file, written whole or not at all.
+        portal: the portal and location.
+        output: the file, written completely or not at all.
         page_rows: rows per request.
-        say: takes lines of progress.
 
     Returns:
         The number of rows downloaded.
 
     Raises:
-        FetchError: if the portal does not answer, answers something else than the table, or the
-            number of rows is not the one it counts.
+        FetchError: if the portal does not deliver the table, with the rows that it counts.
     """
-    partial, state_file = _beside(output, "part"), _beside(output, "state")
+    partial = output.with_name(f".{output.name}.part")
+    state_file = output.with_name(f".{output.name}.state")
     output.parent.mkdir(parents=True, exist_ok=True)
     total = portal.count()
     if total == 0:
         raise FetchError(f"{portal.query}: the portal has no such rows")
-    state = _resumed(state_file, partial, State(portal.query, total), say)
+    state = _resumed(state_file, partial, State(portal.query, total))
     already, start = state.rows, time.monotonic()
     with open(partial, "r+b" if state.rows else "wb") as file:
         file.truncate(state.size)
@@ -166,18 +159,14 @@ def fetch(
             os.fsync(file.fileno())
             state.rows, state.size = state.rows + rows, state.size + len(text)
             _save(state, state_file)
-            say(_progress(state, state.rows - already, time.monotonic() - start))
+            print(_progress(state, state.rows - already, time.monotonic() - start))
     _check_whole(state, portal, state_file)
     os.replace(partial, output)
     state_file.unlink(missing_ok=True)
     return state.rows
 
 
-def _beside(output: Path, suffix: str) -> Path:
-    return output.with_name(f".{output.name}.{suffix}")
-
-
-def _resumed(state_file: Path, partial: Path, fresh: State, say: Callable[[str], None]) -> State:
+def _resumed(state_file: Path, partial: Path, fresh: State) -> State:
     """State of a partial download of the same query, or a fresh one."""
     try:
         state = State(**json.loads(state_file.read_text()))
@@ -185,9 +174,9 @@ def _resumed(state_file: Path, partial: Path, fresh: State, say: Callable[[str],
     except (OSError, ValueError, TypeError):
         return fresh
     if state.query != fresh.query or state.total != fresh.total or not whole:
-        say("the partial file is of another download or damaged: starting again")
+        print("the partial file is of another download or damaged: starting again")
         return fresh
-    say(f"going on from {state.rows:,} of {state.total:,} rows")
+    print(f"resuming from {state.rows:,} of {state.total:,} rows")
     return state
 
 
@@ -222,7 +211,7 @@ def _progress(state: State, fetched: int, seconds: float) -> str:
 def _check_whole(state: State, portal: Portal, state_file: Path) -> None:
     counted = portal.count()
     if state.rows > counted:
-        state_file.unlink(missing_ok=True)  # too many rows cannot become right by going on
+        state_file.unlink(missing_ok=True)  # too many rows: resuming cannot help
     if state.rows != counted:
         raise FetchError(
             f"{portal.query}: {state.rows:,} rows arrived but the portal counts {counted:,}. "
@@ -256,7 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("interrupted; run the same command again to go on", file=sys.stderr)
+        print("interrupted; run the same command again to resume", file=sys.stderr)
         return 130
     print(f"{options.output}: {rows:,} rows")
     return 0

@@ -2,12 +2,12 @@
 
     python tools/fit_stream.py --real i80_pairs.parquet
 
-Prints the fitted parameters, which are then written into lcc_rl/data/stop_and_go.py by hand. A
+Prints the fitted parameters, which are then written into lcc_rl/synthetic/stop_and_go.py by hand. A
 differential evolution within the bounds below is followed by a Nelder–Mead search on more streams
 (together about 15 minutes). The objective is the fourth-power mean of all deviations of
 lcc_rl.data.statistics.compare_statistics plus the distance between the autocorrelations of the
-leaders' acceleration. The committed parameters were found with platoons seen for 35–85 s; polishing
-them for the present 60–90 s brought nothing on fresh seeds.
+leaders' acceleration. The committed parameters were found with platoons recorded for 35–85 s;
+refining them for the present 60–90 s gave no improvement on other seeds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scipy.optimize import differential_evolution, minimize
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.synthetic.stop_and_go import StopAndGo
-from lcc_rl.synthetic.stream import Lane
+from lcc_rl.synthetic.stream import StreamSource
 
 BOUNDS = {
     "mean_speed_mps": (4.0, 7.0),
@@ -35,14 +35,14 @@ BOUNDS = {
     "response_s": (0.5, 2.0),
 }
 LAGS_S = (0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
-PLATOONS = 270  # three default streams at once: the search should not follow one seed's luck
-COARSE, FINE = (1000,), (1000, 1001, 1002)  # seeds that users hardly meet
+PLATOONS = 270  # three default streams at once, to reduce the variance between seeds
+COARSE, FINE = (1000,), (1000, 1001, 1002)  # unusual seeds, kept apart from those of users
 
 
 def episodes_of(leader: StopAndGo, drivers: DriverPopulation, seed: int) -> pd.DataFrame:
     """Pairs of a stream, straight from the simulation."""
-    lane = Lane(platoons=PLATOONS, leader=leader)
-    samples = lane.drive(drivers, "fit", np.random.default_rng(seed)).samples
+    stream = StreamSource(platoons=PLATOONS, leader=leader, drivers=drivers)
+    samples = stream.drive("fit", np.random.default_rng(seed)).samples
     ahead = samples[["vehicle", "frame", "speed_mps"]]
     ahead = ahead.rename(columns={"vehicle": "preceding", "speed_mps": "leader_speed_mps"})
     pairs = samples.merge(ahead, on=["preceding", "frame"])

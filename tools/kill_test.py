@@ -1,9 +1,9 @@
-"""Kill a small sweep again and again, at random moments, and check what is left each time.
+"""Kill a small sweep at random moments and check its files each time.
 
     python tools/kill_test.py --kills 200
 
-After every kill each file must be readable and no finished run may be lost; in the end the rows
-must equal those of a sweep that nobody disturbed. Prints what it saw; exit code 1 if that fails.
+After every kill each file must be readable and no finished run may be lost; the final rows must
+equal those of an undisturbed sweep. Prints the counts; the exit code is 1 if a check fails.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@
   python tools/reproduce.py alcc --recipe quickstart --parts main,filter   # in an hour, not days
   python tools/reproduce.py alcc --parts main,filter agent=analytic   # another agent, its settings
   python tools/reproduce.py alcc --recipe smoke --seeds 1   # everything once, in seconds
-  python tools/reproduce.py hcfs                            # the platoon: 8 DDPG parents, hybrids
+  python tools/reproduce.py hcfs                            # platoon: 8 DDPG parents, hybrids
   python tools/reproduce.py report outputs/alcc             # tables, figures and page, from parquet
 
-The same command goes on where it stopped: what is finished is skipped, a training that was
-interrupted is resumed, one that fails is listed and does not stop the others.
+The same command resumes where it stopped: finished runs are skipped, interrupted trainings are
+resumed, failed ones are listed and do not stop the others.
 """
 
 from __future__ import annotations
@@ -18,68 +18,65 @@ import argparse
 import logging
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
+from lcc_rl.studies.alcc.settings import ABLATIONS, chooses_agent
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
 from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, read_notes
 
 log = logging.getLogger("lcc_rl")
 
-# What turns a study's folder into its page.
 REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 
 def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
     """Run the ALCC study and write its page; 1 if a training failed."""
-    usual = None if alcc.chooses_agent(arguments.overrides) else "paper_alcc"
+    usual = None if chooses_agent(arguments.overrides) else "paper_alcc"
     study = alcc.Study(
-        folder=arguments.out,
-        recipe=arguments.recipe or usual,
-        seeds=arguments.seeds,
-        overrides=tuple(arguments.overrides),
-        jobs=arguments.jobs,
-        accept=tuple(arguments.accept),
-        ablations=tuple(arguments.ablations) if arguments.ablations else None,
+        **common(arguments, usual),
+        ablations=tuple(arguments.ablations) or None,
         profiles=arguments.profiles,
         followers=tuple(arguments.followers),
     )
-    outcomes = alcc.run(study, arguments.parts, command)
-    return concluded(outcomes, study.folder, alcc_report.write_results)
+    return concluded(alcc.run(study, arguments.parts, command), study.folder, "alcc")
 
 
 def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
     """Run the HCFS study and write its page; 1 if a training failed."""
-    study = hcfs.Study(
-        folder=arguments.out,
-        recipe=arguments.recipe or "paper_hcfs",
-        seeds=arguments.seeds,
-        overrides=tuple(arguments.overrides),
-        jobs=arguments.jobs,
-        accept=tuple(arguments.accept),
-    )
-    return concluded(hcfs.run(study, command), study.folder, hcfs_report.write_results)
+    study = hcfs.Study(**common(arguments, "paper_hcfs"))
+    return concluded(hcfs.run(study, command), study.folder, "hcfs")
 
 
-def concluded(
-    outcomes: Sequence[Outcome], folder: Path, write_results: Callable[[Path], Path]
-) -> int:
-    """Say what became of the trainings and write the page; 1 if one failed."""
+def common(arguments: argparse.Namespace, recipe: str | None) -> dict[str, Any]:
+    """Return the settings that every study has, with the recipe's default."""
+    return {
+        "folder": arguments.out,
+        "recipe": arguments.recipe or recipe,
+        "seeds": arguments.seeds,
+        "overrides": tuple(arguments.overrides),
+        "jobs": arguments.jobs,
+        "accept": tuple(arguments.accept),
+    }
+
+
+def concluded(outcomes: Sequence[Outcome], folder: Path, study: str) -> int:
+    """Log the trainings that failed and write the page; 1 if one failed."""
     wrong = [outcome for outcome in outcomes if outcome.status != FINISHED]
     for outcome in wrong:
         log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
-    page = write_results(folder)
+    page = REPORTS[study](folder)
     log.info("%d of %d trainings in %s", len(outcomes) - len(wrong), len(outcomes), page)
     return 1 if wrong else 0
 
 
 def rewrite(arguments: argparse.Namespace, command: str) -> int:
-    """Write tables, figures and page of a study's folder anew."""
+    """Rewrite tables, figures and page of a study's folder."""
     study = read_notes(arguments.folder).get("study", "alcc")
     log.info("wrote %s", REPORTS[study](arguments.folder))
     return 0
@@ -92,8 +89,8 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(required=True)
     one = study_parser(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
     one.set_defaults(run=reproduce_alcc)
-    listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
-    listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(alcc.ABLATIONS))
+    listing(one, "--parts", tuple(alcc.PARTS), "which parts to run: " + ",".join(alcc.PARTS))
+    listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(ABLATIONS))
     one.add_argument("--profiles", type=int, default=4, help="profiles of the part single")
     numbers = "numbers of human drivers behind the car, of the part followers: 1,2,5,10"
     one.add_argument("--followers", type=whole_numbers, default=[1, 2, 5, 10], help=numbers)
@@ -121,17 +118,17 @@ def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser
 def listing(
     target: argparse.ArgumentParser, name: str, default: tuple[str, ...], text: str
 ) -> None:
-    """Add an option that takes names with commas between them."""
+    """Add an option that takes names separated by commas."""
     target.add_argument(name, type=lambda words: words.split(","), default=default, help=text)
 
 
 def whole_numbers(text: str) -> list[int]:
-    """Split whole numbers with commas between them."""
+    """Split whole numbers separated by commas."""
     return [int(word) for word in text.split(",")]
 
 
 def main(words: list[str]) -> int:
-    """Run a command; whatever is no option is an override of every run."""
+    """Run a command; words that are no options are overrides of every run."""
     top = parser()
     arguments, overrides = top.parse_known_args(words)
     wrong = [item for item in overrides if item.startswith("-")]

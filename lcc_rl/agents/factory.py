@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModule
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
-from lcc_rl.agents.loop import TrainingLoop
+from lcc_rl.agents.loop import Agent, TrainingLoop
 from lcc_rl.agents.replay import Trainer
-from lcc_rl.config import TARGET, build
+from lcc_rl.config import TARGET, build, identity
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
@@ -22,25 +20,6 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Piece
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.runs import identity
-
-
-class Agent(Protocol):
-    """What learns: a policy and all that a training of it needs.
-
-    ``policy`` reads ``"observation"`` and writes ``"action"``.
-    """
-
-    policy: TensorDictModule
-
-    def anneal(self, share: float) -> float:
-        """Set the learning rates after this share of the training; return the policy's."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
 
 
 def learns(cfg: DictConfig) -> bool:
@@ -75,15 +54,6 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         device=device,
     )
     return agent
-
-
-def load_weights(agent: Agent, weights: Mapping[str, torch.Tensor]) -> None:
-    """Load a policy's weights into an agent.
-
-    Raises:
-        RuntimeError: if they do not fit its network.
-    """
-    agent.policy.load_state_dict(dict(weights))
 
 
 def make_trainer(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
@@ -17,7 +15,6 @@ from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.pieces.base import next_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
-from lcc_rl.schemas import TrainingConfig
 
 log = logging.getLogger("lcc_rl")
 
@@ -25,7 +22,7 @@ log = logging.getLogger("lcc_rl")
 WORTH_COMPILING = 100
 
 
-class GradientTrainer(TrainingLoop):
+class GradientTrainer(TrainingLoop[Analytic]):
     """Trains by the simulator's gradient; arguments as of :class:`TrainingLoop`.
 
     A segment of the settings is the stretch through which gradients flow; the whole episode where
@@ -35,23 +32,14 @@ class GradientTrainer(TrainingLoop):
     advice = "Lower agent.learning_rate, agent.value_lr or agent.clip_norm"
     watched = "loss_actor"
 
-    def __init__(
-        self,
-        agent: Analytic,
-        env: TransformedEnv,
-        settings: TrainingConfig,
-        seed: int,
-        folder: Path,
-        identity: str,
-    ) -> None:
-        super().__init__(agent, env, settings, seed, folder, identity)
-        self.terms = [piece for piece in pieces_of(env) if isinstance(piece, RewardTerm)]
-        self.objective = agent.objective(self.terms)
-        if not agent.settings.bootstrap and settings.segment < self.horizon:
+    def _prepare(self) -> None:
+        self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
+        self.objective = self.agent.objective(self.terms)
+        if not self.agent.settings.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
                 "say training.segment=%d for the gradient of whole episodes",
-                settings.segment,
+                self.settings.segment,
                 self.horizon,
             )
 

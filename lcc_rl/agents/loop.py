@@ -12,11 +12,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import pandas as pd
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
@@ -75,11 +76,32 @@ def anneal(
     return float(groups[0]["lr"])
 
 
-class TrainingLoop(ABC):
+class Agent(Protocol):
+    """What learns: a policy and all that a training of it needs.
+
+    ``policy`` reads ``"observation"`` and writes ``"action"``.
+    """
+
+    policy: TensorDictModule
+
+    def anneal(self, share: float) -> float:
+        """Set the learning rates after this share of the training; return the policy's."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+
+
+AgentT = TypeVar("AgentT", bound=Agent)
+
+
+class TrainingLoop(ABC, Generic[AgentT]):
     """Runs iterations to the end and keeps their record; a subclass says what an iteration is.
 
     Args:
-        agent: what learns: has ``policy``, ``state_dict`` and ``load_state_dict``.
+        agent: what learns.
         env: the training environment, ``[environments]`` episodes side by side.
         settings: length and bookkeeping.
         seed: seed of everything random.
@@ -95,7 +117,7 @@ class TrainingLoop(ABC):
 
     def __init__(
         self,
-        agent: Any,
+        agent: AgentT,
         env: TransformedEnv,
         settings: TrainingConfig,
         seed: int,
@@ -118,7 +140,7 @@ class TrainingLoop(ABC):
             f"training.segment ({settings.segment}) must divide scenario.horizon ({self.horizon})",
         )
         require(settings.checkpoint_every >= 1, "training.checkpoint_every must be at least 1")
-        self.keep_every = getattr(settings, "keep_every", None)  # older runs have no such choice
+        self.keep_every = settings.keep_every
         require(
             self.keep_every is None or self.keep_every >= 1,
             f"training.keep_every must be at least 1, or null, got {self.keep_every}",
@@ -133,6 +155,10 @@ class TrainingLoop(ABC):
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
         # Told the number of every iteration whose policy is to be kept.
         self.on_keep: Callable[[int], None] = lambda iteration: None
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Make what a subclass needs besides; called once the rest is known."""
 
     @abstractmethod
     def _source(self) -> Any:

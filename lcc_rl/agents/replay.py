@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +10,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
@@ -20,7 +18,6 @@ from lcc_rl.envs import StringCollector
 from lcc_rl.pieces.rewards import REWARD
 from lcc_rl.policies import shared_policy
 from lcc_rl.policies.actor import ACTION, OBSERVATION
-from lcc_rl.schemas import TrainingConfig
 
 # What is learned from, as the environment names it and as the losses do.
 LEARNED_FROM = {
@@ -37,21 +34,13 @@ WORTH_COMPILING = 40_000
 COLLECTORS = ("string", "torchrl")
 
 
-class Trainer(TrainingLoop):
+class Trainer(TrainingLoop[OffPolicy]):
     """Trains an off-policy agent and keeps its record; arguments as of :class:`TrainingLoop`."""
 
     advice = "Lower agent.critic_lr or agent.actor_lr"
 
-    def __init__(
-        self,
-        agent: OffPolicy,
-        env: TransformedEnv,
-        settings: TrainingConfig,
-        seed: int,
-        folder: Path,
-        identity: str,
-    ) -> None:
-        super().__init__(agent, env, settings, seed, folder, identity)
+    def _prepare(self) -> None:
+        settings, agent, env = self.settings, self.agent, self.env
         require(
             settings.collector in COLLECTORS,
             f"training.collector must be one of {', '.join(COLLECTORS)}, got "

@@ -1,1 +1,1 @@
-"""Asset room: small result tables that ship with the package, with their provenance."""
+"""Shipped drive cycles, driver tables and policies."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from time import perf_counter
 
 import pandas as pd
+import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.markup import escape
@@ -14,7 +15,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from lcc_rl.config import build, config_hash, plain
-from lcc_rl.drivers.idm_fit import COLUMNS, Calibration
+from lcc_rl.drivers.calibrator import Calibrator
+from lcc_rl.drivers.idm_fit import Calibration
+from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
@@ -52,13 +55,7 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
     dataset = build(cfg.data, "data").load()
     _say(console, dataset.report)
     start = perf_counter()
-    with _progress(console) as bar:
-        task = bar.add_task("calibration")
-
-        def show(generation: int, total: int, text: str) -> None:
-            bar.update(task, completed=generation, total=total, description=text)
-
-        result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=show)
+    result = _calibrate(calibrator, dataset.episodes, cfg.seed, device, console)
     seconds = perf_counter() - start
     save_config(cfg, folder)
     _say(console, result.report)
@@ -66,6 +63,23 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
     console.print(_summary(result.drivers))
     _say(console, [f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
+
+
+def _calibrate(
+    calibrator: Calibrator,
+    episodes: pd.DataFrame,
+    seed: int,
+    device: torch.device,
+    console: Console,
+) -> Calibration:
+    """Calibrate with a progress bar on a terminal."""
+    with _progress(console) as bar:
+        task = bar.add_task("calibration")
+
+        def show(generation: int, total: int, text: str) -> None:
+            bar.update(task, completed=generation, total=total, description=text)
+
+        return calibrator(episodes, seed=seed, device=device, progress=show)
 
 
 def _write(result: Calibration, cfg: DictConfig, folder: Path) -> None:

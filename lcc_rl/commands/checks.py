@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
 from lcc_rl.config import build, load, require
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import constant_profile
+from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.runs.loggers import Silent
 from lcc_rl.schemas import TrainConfig
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
@@ -52,17 +54,15 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     check_variant(cfg)
     trial = any_leader(cfg)
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
-    profiles = constant_profile(10.0, horizon, time_step, "trial")
+    profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if learns(cfg):
         agent = build_agent(cfg, population, cfg.device)
         make_trainer(trial, agent, profiles, population, folder)
     build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
 
 
-def build_logger(cfg: DictConfig):  # type: ignore[no-untyped-def]
-    """Build what is told every training row; nothing is where the run names none."""
-    from lcc_rl.runs.loggers import Silent
-
+def build_logger(cfg: DictConfig) -> Any:
+    """Build the logger of the training rows; a silent one where the run names none."""
     node = cfg.get("logger")
     return Silent() if node is None else build(node, "logger")
 

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_sizes
+from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation import cases, episodes
@@ -24,7 +25,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.figures import write_study_figures
-from lcc_rl.results.runs import PRETRAINED, identity, load_policy, save_config
+from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.string_figures import write_platoon_figures
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
@@ -60,9 +61,21 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+    strategies, inputs = _strategies(cfg, own)
+    # The rows of an earlier evaluation must never stand beside the configuration of this one.
+    (folder / EPISODES).unlink(missing_ok=True)
+    save_config(cfg, folder)
+    rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
+    if not quiet:
+        draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
+        draw(folder)
+    return rows
+
+
+def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
+    """Build all strategies of an evaluation, and read what they are evaluated on."""
     # Before the data: a missing file should not be noticed after minutes of reading.
-    trust = tuple(cfg.trust)
-    policy = None
+    trust, policy = tuple(cfg.trust), None
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     compared = {path: load_policy(path, cfg.variant, trust) for path in cfg.compare}
@@ -75,14 +88,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
         strategies += studied(cfg, policy, inputs.population)
     strategies = named_apart(strategies)
     check_distinct(strategies)
-    # The rows of an earlier evaluation must never stand beside the configuration of this one.
-    (folder / EPISODES).unlink(missing_ok=True)
-    save_config(cfg, folder)
-    rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
-    if not quiet:
-        draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
-        draw(folder)
-    return rows
+    return strategies, inputs
 
 
 def evaluate_and_write(

@@ -30,6 +30,8 @@ log = logging.getLogger("lcc_rl")
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra")
 PATIENCE = 20.0  # a training ends after the iteration at hand [s]
 OVERRIDES, TRAJECTORIES = "overrides.json", "trajectories.parquet"
+EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
+BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
 def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFrame:
@@ -59,16 +61,7 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     with atomic_path(folder / OVERRIDES) as temporary:
         temporary.write_text(json.dumps(overrides))
     drivers = calibrate_once(cfg, folder)
-    inputs = {
-        "data": {
-            "_target_": "lcc_rl.data.sources.EpisodesSource",
-            "path": str(folder / TRAJECTORIES),
-        },
-        "drivers": {
-            "_target_": "lcc_rl.drivers.population.bootstrap",
-            "path": str(drivers),
-        },
-    }
+    inputs = {"data": _episodes(folder), "drivers": {"_target_": BOOTSTRAP, "path": str(drivers)}}
     for part in (*parts.values(), final):
         OmegaConf.set_struct(part, False)
         part.update(inputs)
@@ -83,6 +76,11 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     return episodes
 
 
+def _episodes(folder: Path) -> dict[str, str]:
+    """Return the node of the trajectories that a job keeps in its folder."""
+    return {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
+
+
 def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
     """Read the trajectories once, keep them, and calibrate; skip what is already there."""
     table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
@@ -94,7 +92,7 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
     if not drivers.exists():
         own = OmegaConf.create(plain(cfg))
         assert isinstance(own, DictConfig)
-        own.data = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": str(table)}
+        own.data = _episodes(folder)
         calibration.run(own, drivers.parent)
     return drivers
 

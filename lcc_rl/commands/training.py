@@ -12,14 +12,14 @@ from omegaconf import DictConfig
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_settings, objectives
 from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write
-from lcc_rl.config import require
+from lcc_rl.config import identity, require
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.evaluation.strategies import Strategy, check_policy, deployed, with_weights
 from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import identity, load_config, load_policy, save_config, save_policy
+from lcc_rl.results.runs import load_config, load_policy, save_config, save_policy
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.cli import prepare_torch

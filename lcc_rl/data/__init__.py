@@ -1,1 +1,1 @@
-"""Data room: trajectories of any published layout become one SI table of car-following episodes."""
+"""Trajectories, car-following episodes and speed profiles from files."""

@@ -1,4 +1,4 @@
-"""Car-following room: stretches of one vehicle behind another, filtered by stated criteria.
+"""Extraction of car-following episodes from trajectories.
 
 A candidate is a maximal stretch of consecutive frames in which a vehicle names the same preceding
 vehicle and both have a row. Each criterion then removes whole candidates, in a fixed order, and
@@ -16,8 +16,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.episodes import PLAUSIBLE_SPEED
-from lcc_rl.data.ngsim import Trajectories
 from lcc_rl.data.places import find_leaders
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError, DataError
 
@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Criteria:
-    """What counts as an episode of car following.
+    """Criteria of a car-following episode.
 
     Args:
         min_duration_s: shortest episode [s].
@@ -36,8 +36,8 @@ class Criteria:
         min_gap_m: smallest gap at any time [m], bumper to bumper; None for no limit.
         max_gap_m: largest gap at any time [m], beyond which a driver does not follow; None for no
             limit.
-        passenger_cars_only: both vehicles are of class 2 throughout. Where the class of every
-            vehicle is unknown there is nothing to filter on: all stay and the report says so.
+        passenger_cars_only: both vehicles are of class 2 throughout. Where no vehicle has a class
+            this criterion is skipped, with a note in the report.
         lane_changes: both vehicles share one lane throughout. ``split`` cuts a candidate where
             they do not and judges the parts; ``reject`` removes a candidate with any lane change.
 
@@ -62,8 +62,13 @@ class Criteria:
                 f"criteria: 'min_duration_s' must be at least {FRAME:g} s, two samples, got "
                 f"{self.min_duration_s}"
             )
-        _ordered("min_duration_s", self.min_duration_s, "max_duration_s", self.max_duration_s)
-        _ordered("min_gap_m", self.min_gap_m, "max_gap_m", self.max_gap_m)
+        for quantity in ("duration_s", "gap_m"):
+            low, high = (getattr(self, f"{end}_{quantity}") for end in ("min", "max"))
+            if low is not None and high is not None and not low <= high:
+                raise ConfigError(
+                    f"criteria: 'min_{quantity}' ({low}) must not be above "
+                    f"'max_{quantity}' ({high})"
+                )
         if self.lane_changes not in LANE_CHANGES:
             raise ConfigError(
                 f"criteria: 'lane_changes' must be one of {', '.join(LANE_CHANGES)}, got "
@@ -71,16 +76,9 @@ class Criteria:
             )
 
 
-def _ordered(low_name: str, low: float | None, high_name: str, high: float | None) -> None:
-    if low is not None and high is not None and not low <= high:
-        raise ConfigError(
-            f"criteria: {low_name!r} ({low}) must not be above {high_name!r} ({high})"
-        )
-
-
 @dataclass
 class ExtractionReport:
-    """What the extraction kept and why it removed the rest.
+    """Counts of what the extraction kept and removed.
 
     Args:
         candidates: stretches of one vehicle behind another.
@@ -89,7 +87,7 @@ class ExtractionReport:
         rows: samples in the episodes.
         unseen: samples that name a preceding vehicle which has no row in that frame.
         other_lane: samples that name a preceding vehicle on another lane, left out by ``split``.
-        notes: anything else worth a line.
+        notes: further remarks, one a line.
     """
 
     candidates: int = 0
@@ -121,7 +119,7 @@ class ExtractionReport:
 
 @dataclass
 class _Pairs:
-    """Samples of followers that see their leader, and the candidates they form.
+    """Samples of followers whose leader has a row in the frame, grouped into candidates.
 
     Args:
         follower, leader: rows of the samples table, one entry per sample of a candidate.
@@ -135,14 +133,6 @@ class _Pairs:
     lengths: NDArray[np.intp]
     gap: NDArray[np.float32]
 
-    def least(self, values: NDArray) -> NDArray:
-        """Smallest value of each candidate."""
-        return np.minimum.reduceat(values, self.starts)
-
-    def largest(self, values: NDArray) -> NDArray:
-        """Largest value of each candidate."""
-        return np.maximum.reduceat(values, self.starts)
-
     def always(self, holds: Mask) -> Mask:
         """Candidates in which a condition holds throughout."""
         return np.logical_and.reduceat(holds, self.starts)
@@ -154,7 +144,7 @@ def extract(
     """Extract episodes of car following.
 
     Args:
-        trajectories: samples in the shape of :class:`lcc_rl.data.ngsim.Trajectories`.
+        trajectories: samples in the shape of :class:`lcc_rl.data.trajectories.Trajectories`.
         criteria: what counts as an episode.
 
     Returns:
@@ -171,11 +161,9 @@ def extract(
     pairs = _pairs(samples, criteria, report)
     keep = np.ones(len(pairs.starts), dtype=bool)
     for name, passes in _criteria(samples, pairs, criteria, report):
-        left = keep & passes
-        report.removed[name] = int(keep.sum() - left.sum())
-        keep = left
+        report.removed[name] = int((keep & ~passes).sum())
+        keep &= passes
         if not keep.any():
-            report.rows = 0
             raise DataError(f"no episode is left after the criterion {name!r}:\n{report}")
     episodes = _episodes(samples, pairs, keep)
     report.kept, report.rows = int(keep.sum()), len(episodes)
@@ -232,43 +220,33 @@ def _criteria(
     """Name of each criterion and which candidates pass it, in the order of application."""
     if criteria.lane_changes == "reject":
         lane = samples["lane"].to_numpy()
-        own = lane[pairs.follower]
-        one_lane = pairs.least(own) == pairs.largest(own)
-        yield "lane_changes: reject", one_lane & pairs.always(own == lane[pairs.leader])
+        first = np.repeat(lane[pairs.follower[pairs.starts]], pairs.lengths)
+        one_lane = (lane[pairs.follower] == first) & (lane[pairs.leader] == first)
+        yield "lane_changes: reject", pairs.always(one_lane)
     # Half a frame of slack: durations are sums of inexact tenths.
     duration = (pairs.lengths - 1) * FRAME
-    yield (
-        f"min_duration_s: {criteria.min_duration_s:g}",
-        duration > criteria.min_duration_s - FRAME / 2,
-    )
-    if criteria.max_duration_s is not None:
-        yield (
-            f"max_duration_s: {criteria.max_duration_s:g}",
-            duration < criteria.max_duration_s + FRAME / 2,
-        )
+    shortest, longest = criteria.min_duration_s, criteria.max_duration_s
+    yield f"min_duration_s: {shortest:g}", duration > shortest - FRAME / 2
+    if longest is not None:
+        yield f"max_duration_s: {longest:g}", duration < longest + FRAME / 2
     if criteria.passenger_cars_only:
-        yield from _class_criterion(samples["vehicle_class"].to_numpy(), pairs, report)
+        kind = samples["vehicle_class"].to_numpy()
+        if kind.any():
+            car = kind == PASSENGER_CAR
+            yield "passenger_cars_only", pairs.always(car[pairs.follower] & car[pairs.leader])
+        else:
+            report.notes.append(
+                "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
+                "there is nothing to filter on and every vehicle stays"
+            )
     speed = samples["speed_mps"].to_numpy()
     plausible = (speed >= 0) & (speed <= PLAUSIBLE_SPEED)
     name = f"speeds of 0 to {PLAUSIBLE_SPEED:g} m/s"
     yield name, pairs.always(plausible[pairs.follower] & plausible[pairs.leader])
     if criteria.min_gap_m is not None:
-        yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.least(pairs.gap) >= criteria.min_gap_m
+        yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.always(pairs.gap >= criteria.min_gap_m)
     if criteria.max_gap_m is not None:
-        yield f"max_gap_m: {criteria.max_gap_m:g}", pairs.largest(pairs.gap) <= criteria.max_gap_m
-
-
-def _class_criterion(
-    kind: NDArray[np.int8], pairs: _Pairs, report: ExtractionReport
-) -> Iterator[tuple[str, Mask]]:
-    if not kind.any():
-        report.notes.append(
-            "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so there "
-            "is nothing to filter on and every vehicle stays"
-        )
-        return
-    car = kind == PASSENGER_CAR
-    yield "passenger_cars_only", pairs.always(car[pairs.follower] & car[pairs.leader])
+        yield f"max_gap_m: {criteria.max_gap_m:g}", pairs.always(pairs.gap <= criteria.max_gap_m)
 
 
 def _episodes(samples: pd.DataFrame, pairs: _Pairs, keep: Mask) -> pd.DataFrame:

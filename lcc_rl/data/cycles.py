@@ -1,4 +1,4 @@
-"""Drive cycles and other speed records: from a file to profiles of a platoon's leader."""
+"""Speed profiles that a platoon's leader drives: stretches of speed records, evaluation cases."""
 
 from __future__ import annotations
 
@@ -7,102 +7,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
-import torch
-from scipy.interpolate import PchipInterpolator
-from torch import Tensor
-
-import lcc_rl.assets
-from lcc_rl.data.profiles import Profiles, Split, from_records, leader_profiles
+from lcc_rl.data.profiles import Profiles, Split, at_step, from_records, leader_profiles
+from lcc_rl.data.speed_records import read_speed_record, resample
 from lcc_rl.errors import ConfigError, DataError, unknown_name
-
-CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
-TIME, SPEED = "time_s", "speed_mps"
-
-
-def shipped_cycles() -> list[str]:
-    """Return the names of the drive cycles in the package."""
-    return sorted(path.stem for path in CYCLES.glob("*.csv"))
-
-
-def read_speed_record(path: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a speed record of any sampling rate.
-
-    Args:
-        path: name of a shipped cycle (``udds``, ``us06``, ``wltc_3b``, ``hwfet``), or a .csv or
-            .parquet file with the columns ``time_s`` [s] and ``speed_mps`` [m/s].
-
-    Returns:
-        Time [s], increasing, and speed [m/s], both ``[samples]``, float64.
-
-    Raises:
-        DataError: naming the file and the row or column at fault.
-    """
-    file = Path(path).expanduser()
-    if not file.suffix and path in shipped_cycles():
-        file = CYCLES / f"{path}.csv"
-    if not file.is_file():
-        raise DataError(
-            f"{path}: no such file, and no shipped cycle ({', '.join(shipped_cycles())})"
-        )
-    try:
-        frame = pd.read_parquet(file) if file.suffix == ".parquet" else pd.read_csv(file)
-    except (ValueError, OSError) as error:
-        raise DataError(f"{file}: not a readable table: {error}") from error
-    missing = {TIME, SPEED} - set(frame.columns)
-    if missing:
-        raise DataError(f"{file}: lacks the column {', '.join(sorted(missing))}")
-    try:
-        time, speed = (frame[name].to_numpy(float) for name in (TIME, SPEED))
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{file}: {TIME} and {SPEED} must be numbers: {error}") from error
-    if len(time) < 2:
-        raise DataError(f"{file}: holds {len(time)} samples, at least 2 are needed")
-    for bad, words in (
-        (~np.isfinite(time) | ~np.isfinite(speed), "is not a number"),
-        (speed < 0, "has a negative speed"),
-        (np.diff(time, prepend=-np.inf) <= 0, "does not follow the row before it in time"),
-    ):
-        if bad.any():
-            raise DataError(f"{file}: data row {int(bad.argmax()) + 1} {words}")
-    return time, speed
-
-
-def resample(
-    time: np.ndarray,
-    speed: np.ndarray,
-    time_step: float,
-    begin: float | None = None,
-    end: float | None = None,
-) -> Tensor:
-    """Interpolate a record to another step, monotonically between samples (PCHIP).
-
-    The interpolant never overshoots its samples, so no speed becomes negative and no peak grows.
-
-    Args:
-        time: increasing [s].
-        speed: [m/s].
-        time_step: step wanted [s].
-        begin, end: part of the record wanted [s]; None for all of it.
-
-    Returns:
-        Speeds, ``[steps]``, float32 [m/s].
-    """
-    begin, end = time[0] if begin is None else begin, time[-1] if end is None else end
-    steps = int(np.floor((end - begin) / time_step + 1e-6)) + 1
-    grid = np.minimum(begin + time_step * np.arange(steps), time[-1])
-    return torch.tensor(PchipInterpolator(time, speed)(grid).clip(min=0.0), dtype=torch.float32)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run of a platoon behind a given stretch of a record.
+    """Evaluation run of a platoon behind a given stretch of a record.
 
     Args:
-        name: how tables and figures call it.
-        profile: the stretch, one record.
-        followers: vehicles behind the leader.
+        name: name in tables and figures.
+        profile: speed of the leader, one record.
+        followers: number of vehicles behind the leader.
     """
 
     name: str
@@ -117,14 +34,14 @@ class Case:
 
 @dataclass(frozen=True)
 class Leaders:
-    """What a platoon's leader drives in training and in evaluation.
+    """Speed profiles of a platoon's leader, for training and for evaluation.
 
     Args:
         training: records to draw windows from.
         windows: held-out windows of one horizon.
-        cases: the cases looked at closely.
+        cases: named evaluation cases.
         full_length: a whole held-out record; None for none.
-        report: plain lines: what was read.
+        report: lines on what was read.
     """
 
     training: Profiles
@@ -183,7 +100,7 @@ def join(profiles: list[Profiles]) -> Profiles:
     )
 
 
-# What a stretch may say in the configuration, beside the settings of a case.
+# Settings of a stretch and of a case in the configuration.
 STRETCH = {"path", "scale", "from_s", "to_s"}
 CASE = {"path", "scale", "start_s", "followers"}
 
@@ -193,14 +110,13 @@ class RecordLeaders:
     """Leaders that drive speed records or drive cycles from files.
 
     Args:
-        training: stretches to train on, by name: ``path``, ``scale``, ``from_s``, ``to_s``.
-            A shared record need not be repeated: see ``path``.
+        training: training stretches by name: ``path``, ``scale``, ``from_s``, ``to_s``.
         held_out: stretches that windows for evaluation are cut from, likewise.
         cases: by name (``case_1`` for "case 1"): ``path``, ``scale``, ``start_s``, ``followers``.
         full_length: a stretch driven from end to end; None for none.
-        least_variation: windows whose leader changes its speed by less in total are left out:
-            nothing happens in them [m/s].
-        path: record of the stretches that name none.
+        least_variation: evaluation windows whose total speed change is below this are left out
+            [m/s].
+        path: default path of the stretches.
     """
 
     training: Mapping[str, Any]
@@ -219,40 +135,30 @@ class RecordLeaders:
             followers: vehicles of windows and of the full length.
 
         Raises:
-            DataError, ConfigError: naming the file or option at fault.
+            DataError: if a record cannot be used, naming the file.
+            ConfigError: if an option is unknown or impossible, naming it.
         """
-        parts = {
-            group: [
-                stretch(
-                    time_step=time_step,
-                    **self._checked(node, f"leader.{group}.{name}", STRETCH),
-                )
-                for name, node in stretches.items()
-            ]
-            for group, stretches in (("training", self.training), ("held_out", self.held_out))
-        }
-        for group, found in parts.items():
-            if not found:
-                raise ConfigError(f"leader.{group} names no record")
+        training = join(self._stretches("training", self.training, time_step))
+        held_out = join(self._stretches("held_out", self.held_out, time_step))
         whole = None
         if self.full_length is not None:
-            node = self._checked(self.full_length, "leader.full_length", STRETCH)
-            whole = Case("full length", stretch(time_step=time_step, **node), followers)
-        training, held_out = join(parts["training"]), join(parts["held_out"])
-        windows = lively(held_out.windows(horizon), self.least_variation)
+            settings = self._checked(self.full_length, "leader.full_length", STRETCH)
+            whole = Case("full length", stretch(time_step=time_step, **settings), followers)
+        windows = varying(held_out.windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"]
-        report += [
-            f"{group}: {p.names[0]}, {int(p.lengths[0]) * time_step:g} s"
-            for group, found in parts.items()
-            for p in found
+        for group, profiles in (("training", training), ("held_out", held_out)):
+            for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True):
+                report.append(f"{group}: {name}, {length * time_step:g} s")
+        cases = (self._case(name, node, time_step, horizon) for name, node in self.cases.items())
+        return Leaders(training, windows, tuple(cases), whole, tuple(report))
+
+    def _stretches(self, group: str, nodes: Mapping[str, Any], time_step: float) -> list[Profiles]:
+        if not nodes:
+            raise ConfigError(f"leader.{group} names no record")
+        return [
+            stretch(time_step=time_step, **self._checked(node, f"leader.{group}.{name}", STRETCH))
+            for name, node in nodes.items()
         ]
-        return Leaders(
-            training,
-            windows,
-            tuple(self._case(name, node, time_step, horizon) for name, node in self.cases.items()),
-            whole,
-            tuple(report),
-        )
 
     def _case(self, name: str, node: Mapping[str, Any], time_step: float, horizon: int) -> Case:
         given = self._checked(node, f"leader.cases.{name}", CASE)
@@ -264,11 +170,7 @@ class RecordLeaders:
         return Case(name.replace("_", " "), profile, followers)
 
     def _checked(self, node: Any, where: str, known: set[str]) -> dict[str, Any]:
-        """Return a stretch as a dictionary with a path.
-
-        Raises:
-            ConfigError: if it has none or holds an unknown key.
-        """
+        """Settings of a stretch or case with its path, or a ConfigError."""
         settings = {} if node is None else dict(node)
         for key in settings:
             if key not in known:
@@ -300,20 +202,11 @@ class TrajectoryLeaders:
         loaded = self.source.load()
         profiles = at_step(leader_profiles(loaded.episodes, self.source_step), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
-        windows = lively(held_out.windows(horizon), self.least_variation)
+        windows = varying(held_out.windows(horizon), self.least_variation)
         return Leaders(training, windows, report=tuple(loaded.report))
 
 
-def at_step(profiles: Profiles, time_step: float) -> Profiles:
-    """Interpolate every record to another step."""
-    records = []
-    for index in range(len(profiles)):
-        speed = profiles.record(index).numpy().astype(float)
-        records.append(resample(np.arange(len(speed)) * profiles.time_step, speed, time_step))
-    return from_records(records, profiles.names, profiles.recordings, time_step)
-
-
-def lively(profiles: Profiles, least_variation: float) -> Profiles:
+def varying(profiles: Profiles, least_variation: float) -> Profiles:
     """Return the records whose speed changes by at least so much in total [m/s].
 
     Raises:

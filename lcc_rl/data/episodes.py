@@ -1,9 +1,10 @@
-"""Episode room: the one table of car-following episodes that everything downstream reads."""
+"""Table of car-following episodes: schema, reading, writing and validation."""
 
 from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -80,8 +81,8 @@ def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
 
     Raises:
         DataError: naming the source, the row (from 0) and the column, if a column is missing or
-            holds NaN, text or an impossible value; if an episode is split, a single row, stands
-            for several pairs, or its time does not advance by one constant step.
+            holds NaN, text or an impossible value, or if an episode is not contiguous, has a
+            single row or several pairs, or its time does not advance by one constant step.
     """
     _check_columns(frame, source)
     if frame.empty:
@@ -91,27 +92,16 @@ def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
         frame[name] = _checked_numbers(frame[name], source)
     if frame["recording"].isna().any():
         raise _at(source, frame["recording"].isna(), "recording", "is blank; expected a name")
-    for name in SPEEDS:
-        _check_speed(frame[name], source)
-    for name in ("leader_length_m", "gap_m"):
-        _check_positive(frame[name] >= 0, name, source)
+    for name in (*SPEEDS, "leader_length_m", "gap_m"):
+        if (frame[name] < 0).any():
+            raise _at(source, frame[name] < 0, name, "is negative; expected at least 0")
+        fast = frame[name] > PLAUSIBLE_SPEED
+        if name in SPEEDS and fast.any():
+            limit = f"at most {PLAUSIBLE_SPEED:g} (is it km/h or ft/s?)"
+            shown = f"{frame.loc[fast, name].iloc[0]:g} m/s"
+            raise _at(source, fast, name, f"holds {shown}; expected {limit}")
     _check_episodes(frame, source)
     return frame.astype({**SCHEMA, "recording": str})
-
-
-def split_episodes(frame: pd.DataFrame) -> list[dict[str, NDArray]]:
-    """Split a validated table into one dictionary of arrays per episode, without copying rows.
-
-    Returns:
-        For each episode, in order: every column of the table as an array of shape ``[time]``.
-    """
-    starts = _starts(frame["episode"].to_numpy())
-    stops = [*starts[1:], len(frame)]
-    arrays = {str(name): frame[name].to_numpy() for name in frame.columns}
-    return [
-        {name: values[start:stop] for name, values in arrays.items()}
-        for start, stop in zip(starts, stops, strict=True)
-    ]
 
 
 def _check_columns(frame: pd.DataFrame, source: str) -> None:
@@ -139,35 +129,18 @@ def _checked_numbers(column: pd.Series, source: str) -> pd.Series:
         numbers = pd.to_numeric(column, errors="coerce").astype("float64")
     except (TypeError, ValueError) as error:
         raise DataError(f"{source}: column {name!r} does not hold numbers: {error}") from error
-    wrong = ~np.isfinite(numbers.to_numpy())
-    if wrong.any():
-        shown = column.iloc[int(np.argmax(wrong))]
-        raise _at(source, wrong, name, f"holds {shown!r}; expected a finite number")
+    checks: list[tuple[Any, str]] = [(np.isfinite(numbers), "a finite number")]
     if SCHEMA[name].startswith("int"):
         limit = np.iinfo(SCHEMA[name]).max if SCHEMA[name] == "int32" else 2**53
-        wrong = ((numbers != np.rint(numbers)) | (numbers.abs() > limit)).to_numpy()
-        if wrong.any():
-            shown = column.iloc[int(np.argmax(wrong))]
-            raise _at(source, wrong, name, f"holds {shown!r}; expected a whole number")
-    elif (wrong := (numbers.abs() > LARGEST).to_numpy()).any():
-        shown = column.iloc[int(np.argmax(wrong))]
-        raise _at(source, wrong, name, f"holds {shown!r}; expected at most {LARGEST:g}")
+        whole = (numbers == np.rint(numbers)) & (numbers.abs() <= limit)
+        checks.append((whole, "a whole number"))
+    else:
+        checks.append((numbers.abs() <= LARGEST, f"at most {LARGEST:g}"))
+    for valid, expected in checks:
+        if not valid.all():
+            shown = column.iloc[int(np.argmin(valid))]
+            raise _at(source, ~valid, name, f"holds {shown!r}; expected {expected}")
     return numbers
-
-
-def _check_speed(speed: pd.Series, source: str) -> None:
-    name = str(speed.name)
-    _check_positive(speed >= 0, name, source)
-    fast = (speed > PLAUSIBLE_SPEED).to_numpy()
-    if fast.any():
-        value = speed.iloc[int(np.argmax(fast))]
-        message = f"holds {value:g} m/s; expected at most {PLAUSIBLE_SPEED:g} (is it km/h or ft/s?)"
-        raise _at(source, fast, name, message)
-
-
-def _check_positive(holds: pd.Series, name: str, source: str) -> None:
-    if not holds.all():
-        raise _at(source, ~holds, name, "is negative; expected at least 0")
 
 
 def _check_episodes(frame: pd.DataFrame, source: str) -> None:
@@ -207,11 +180,6 @@ def _check_time(time: NDArray[np.float64], starts: NDArray[np.intp], source: str
     # Times that were kept in float32 are off by some tens of microseconds.
     wrong = np.append(False, inner & ((steps <= 0) | (np.abs(steps - step) > 0.01 * abs(step))))
     if wrong.any():
-        row = int(np.argmax(wrong))
-        raise _at(
-            source,
-            wrong,
-            "time_s",
-            f"is {steps[row - 1]:+g} s after the row before; expected a constant step "
-            f"({step:g} s here)",
-        )
+        shown = f"is {steps[int(np.argmax(wrong)) - 1]:+g} s after the row before"
+        expected = f"expected a constant step ({step:g} s here)"
+        raise _at(source, wrong, "time_s", f"{shown}; {expected}")

@@ -1,58 +1,24 @@
-"""NGSIM layout room: text of any published layout becomes checked columns, block by block."""
+"""Published column layouts of NGSIM files and their detection from the first line."""
 
 from __future__ import annotations
 
 import csv
-import gzip
 import re
-import zlib
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
-from pathlib import Path
-from typing import IO
-
-import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.csv as pa_csv
-from numpy.typing import NDArray
 
 from lcc_rl.errors import DataError
 
-OFFICIAL = (
-    "Vehicle_ID",
-    "Frame_ID",
-    "Total_Frames",
-    "Global_Time",
-    "Local_X",
-    "Local_Y",
-    "Global_X",
-    "Global_Y",
-    "v_Length",
-    "v_Width",
-    "v_Class",
-    "v_Vel",
-    "v_Acc",
-    "Lane_ID",
-    "Preceding",
-    "Following",
-    "Space_Headway",
-    "Time_Headway",
+HEADER = (
+    "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,"
+    "v_Width,v_Class,v_Vel,v_Acc,Lane_ID,Preceding,Following,Space_Headway,Time_Headway"
 )
-NEEDED = (
-    "Vehicle_ID",
-    "Frame_ID",
-    "Local_Y",
-    "v_Length",
-    "v_Class",
-    "v_Vel",
-    "v_Acc",
-    "Lane_ID",
-    "Preceding",
-)
-OPTIONAL = ("Global_Time", "Space_Headway", "Location")
-# Other spellings met in the documents of the four sites, already folded.
+REQUIRED = "Vehicle_ID,Frame_ID,Local_Y,v_Length,v_Class,v_Vel,v_Acc,Lane_ID,Preceding"
+OPTIONAL = "Global_Time,Space_Headway,Location"
+OFFICIAL = HEADER.split(",")
+NEEDED = REQUIRED.split(",")
+KNOWN = NEEDED + OPTIONAL.split(",")
+# Other spellings in the documents of the four sites, in lower case without separators.
 ALIASES = {
     "spacehdwy": "Space_Headway",
     "spacing": "Space_Headway",
@@ -64,15 +30,11 @@ ALIASES = {
     "vehicleacceleration": "v_Acc",
     "laneidentification": "Lane_ID",
 }
-BLANK = ["", "NA", "N/A", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
-BLOCK_BYTES = 1 << 22
-LONGEST_LINE = 1 << 24
-THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How one file is laid out.
+    """Layout of one file.
 
     Args:
         width: number of columns of a row.
@@ -87,252 +49,8 @@ class Layout:
     spaced: bool
 
 
-class Block:
-    """Some consecutive rows of a file, as text columns that are checked as they are read.
-
-    Args:
-        path: the file, for messages.
-        lines: the text of the rows.
-        first_line: number of the first line in the file, from 1.
-        layout: how the rows are laid out.
-    """
-
-    def __init__(self, path: str, lines: bytes, first_line: int, layout: Layout) -> None:
-        self.path, self.lines, self.first_line = path, lines, first_line
-        self.table = self._parse(layout)
-        self.rows_read = self.table.num_rows
-        self._kept: NDArray[np.int64] | None = None
-
-    def __len__(self) -> int:
-        return int(self.table.num_rows)
-
-    def has(self, name: str) -> bool:
-        """Whether the file has this column."""
-        return name in self.table.column_names
-
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep only the rows where ``mask`` holds; line numbers in messages stay right."""
-        kept = np.flatnonzero(mask)
-        self._kept = kept if self._kept is None else self._kept[kept]
-        self.table = self.table.filter(pa.array(mask))
-
-    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
-        """Names in the Location column (lower case, '' where blank) and each row's index of it."""
-        encoded = self.table["Location"].combine_chunks().dictionary_encode()
-        if isinstance(encoded, pa.ChunkedArray):
-            encoded = encoded.combine_chunks()
-        names = [str(name).strip().lower() for name in encoded.dictionary.to_pylist()]
-        codes = encoded.indices.fill_null(len(names)).to_numpy(zero_copy_only=False)
-        return [*names, ""], codes.astype(np.int64)
-
-    def numbers(self, name: str, unit: str, blank: float | None = None) -> NDArray[np.float64]:
-        """Read a column of finite numbers.
-
-        Args:
-            name: official column name.
-            unit: what the numbers are, for messages.
-            blank: what a blank cell stands for; None where cells must not be blank.
-
-        Raises:
-            DataError: at a cell that is no finite number, or blank where that is not allowed.
-        """
-        column = self.table[name]
-        try:
-            numbers = pc.cast(column, pa.float64())
-        except pa.ArrowInvalid:
-            numbers = self._spelled(column, name, unit)
-        values: NDArray[np.float64] = numbers.to_numpy()
-        bad = ~np.isfinite(values)
-        if not bad.any():
-            return values
-        # Blank cells and the word NaN both arrive here as NaN.
-        wrong = bad if blank is None else np.isinf(values)
-        if wrong.any():
-            self.fail(int(np.argmax(wrong)), name, f"{unit}, a finite number")
-        return np.nan_to_num(values, nan=blank or 0.0)
-
-    def integers(
-        self, name: str, low: int, high: int, blank: int | None = None
-    ) -> NDArray[np.int64]:
-        """Read a column of whole numbers within [low, high]; ``2322.0`` counts as whole.
-
-        Raises:
-            DataError: at a cell that is not such a number.
-        """
-        expected = f"a whole number of {low} to {high}"
-        values = self.numbers(name, expected, None if blank is None else float(blank))
-        wrong = (values != np.rint(values)) | (values < low) | (values > high)
-        if blank is not None:
-            wrong &= values != blank
-        if wrong.any():
-            self.fail(int(np.argmax(wrong)), name, expected)
-        return values.astype(np.int64)
-
-    def fail(self, row: int, name: str, expected: str) -> None:
-        """Raise the DataError for the cell at ``row`` of column ``name``."""
-        cell = self.table[name][row].as_py()
-        place = row if self._kept is None else int(self._kept[row])
-        shown = "is blank or NaN" if cell is None else f"holds {cell[:40]!r}"
-        raise DataError(
-            f"{self.path}: line {self._line_of_row(place)}, column {name!r} {shown}; "
-            f"expected {expected}"
-        )
-
-    def _spelled(self, column: pa.ChunkedArray, name: str, unit: str) -> pa.ChunkedArray:
-        """Numbers with surrounding spaces or thousands separators."""
-        text = pc.utf8_trim_whitespace(column)
-        # Only true thousands: a comma anywhere else would silently change the number.
-        grouped = pc.match_substring_regex(text, THOUSANDS)
-        text = pc.if_else(grouped, pc.replace_substring(text, ",", ""), text)
-        text = pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text)
-        try:
-            return pc.cast(text, pa.float64())
-        except pa.ArrowInvalid:
-            self.fail(_first_not_number(text.combine_chunks()), name, f"{unit}, a number")
-            raise
-
-    def _parse(self, layout: Layout) -> pa.Table:
-        if not _is_text(self.lines):
-            line = self._line_where(lambda found: not _is_text(found))
-            raise DataError(f"{self.path}: line {line} is not text; expected UTF-8")
-        names = [str(place) for place in range(layout.width)]
-        wanted = {str(place): name for name, place in layout.places.items()}
-        odd: list[pa_csv.InvalidRow] = []
-
-        def note(row: pa_csv.InvalidRow) -> str:
-            odd.append(row)
-            return "error"
-
-        try:
-            table = pa_csv.read_csv(
-                pa.BufferReader(self.lines),
-                pa_csv.ReadOptions(
-                    use_threads=False, column_names=names, block_size=len(self.lines) + 1
-                ),
-                pa_csv.ParseOptions(
-                    delimiter=" " if layout.spaced else ",", invalid_row_handler=note
-                ),
-                pa_csv.ConvertOptions(
-                    include_columns=list(wanted),
-                    column_types=dict.fromkeys(wanted, pa.string()),
-                    null_values=BLANK,
-                    strings_can_be_null=True,
-                ),
-            )
-        except pa.ArrowException as error:
-            raise DataError(self._parse_message(odd, layout, error)) from error
-        self._check_count(table.num_rows)
-        return table.rename_columns([wanted[name] for name in table.column_names])
-
-    def _parse_message(
-        self, odd: list[pa_csv.InvalidRow], layout: Layout, error: pa.ArrowException
-    ) -> str:
-        if odd:
-            text = odd[0].text.encode()
-            line = self._line_where(lambda found: found.rstrip(b"\r") == text)
-            return (
-                f"{self.path}: line {line} has {odd[0].actual_columns} columns; "
-                f"expected {layout.width} as in the first line"
-            )
-        reason = str(error).splitlines()[0]
-        return f"{self.path}: from line {self.first_line}: expected rows of text: {reason}"
-
-    def _check_count(self, parsed: int) -> None:
-        """A quote that is never closed swallows whole lines; that must not pass unseen."""
-        lines = self.lines.count(b"\n") + (not self.lines.endswith(b"\n"))
-        if parsed == lines:
-            return
-        full = sum(1 for line in self.lines.split(b"\n") if line.strip(b"\r"))
-        if parsed == full:
-            return
-        line = self._line_where(lambda found: found.count(b'"') % 2 == 1 or b"\r" in found[:-1])
-        raise DataError(
-            f"{self.path}: line {line or self.first_line} has a quote that is not closed or a "
-            "stray line end; expected one row per line"
-        )
-
-    def _line_where(self, holds: Callable[[bytes], bool]) -> int | None:
-        for place, line in enumerate(self.lines.split(b"\n")):
-            if holds(line):
-                return self.first_line + place
-        return None
-
-    def _line_of_row(self, row: int) -> int:
-        """Line number of a row; blank lines hold no row."""
-        seen = -1
-        for place, line in enumerate(self.lines.split(b"\n")):
-            seen += bool(line.strip(b"\r"))
-            if seen == row:
-                return self.first_line + place
-        return self.first_line
-
-
-def read_blocks(path: str | Path) -> Iterator[Block]:
-    """Read a plain or gzipped file in any published layout.
-
-    Yields:
-        Blocks of rows, in the order of the file.
-
-    Raises:
-        DataError: if the file is missing, damaged, empty, not text, or of no known layout.
-    """
-    name = str(path)
-    layout: Layout | None = None
-    first_line = 1
-    empty = True
-    for raw in _line_chunks(name):
-        lines = raw
-        if layout is None:
-            lines = lines.removeprefix(b"\xef\xbb\xbf")
-            bare = lines.lstrip(b" \t\r\n")
-            if not bare:
-                first_line += raw.count(b"\n")
-                continue
-            first_line += lines[: len(lines) - len(bare)].count(b"\n")
-            layout, lines = _detect(name, bare)
-            first_line += layout.header
-        if layout.spaced:
-            lines = _single_spaces(lines)
-        if lines.strip(b"\r\n"):
-            empty = False
-            yield Block(name, lines, first_line, layout)
-        first_line += lines.count(b"\n")
-    if empty:
-        what = "is empty" if layout is None else "has a header but no rows"
-        raise DataError(f"{name}: {what}; expected NGSIM trajectories")
-
-
-def _line_chunks(name: str) -> Iterator[bytes]:
-    """Whole lines of the decompressed file, some megabytes at a time."""
-    rest = b""
-    try:
-        with _opened(name) as file:
-            while data := file.read(BLOCK_BYTES):
-                cut = data.rfind(b"\n") + 1
-                if cut:
-                    yield rest + data[:cut]
-                    rest = data[cut:]
-                else:
-                    rest += data
-                if len(rest) > LONGEST_LINE:
-                    raise DataError(f"{name}: is not a text table; expected lines of 18 columns")
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
-    except OSError as error:
-        raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
-    if rest:
-        yield rest
-
-
-def _opened(name: str) -> IO[bytes]:
-    """Open a file, decompressing by content: suffixes get lost in downloads."""
-    with open(name, "rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    return gzip.open(name, "rb") if packed else open(name, "rb")  # type: ignore[return-value]
-
-
-def _detect(name: str, lines: bytes) -> tuple[Layout, bytes]:
-    """Tell the layout from the first line; returns the lines that hold rows."""
+def detect_layout(name: str, lines: bytes) -> tuple[Layout, bytes]:
+    """Detect the layout from the first line; returns it and the lines that hold rows."""
     first, _, rest = lines.partition(b"\n")
     try:
         text = first.decode("utf-8")
@@ -343,7 +61,10 @@ def _detect(name: str, lines: bytes) -> tuple[Layout, bytes]:
     if "\0" in text:
         raise DataError(f"{name}: is a binary file; expected an NGSIM text table, plain or .gz")
     spaced = "," not in text
-    cells = text.split() if spaced else [cell.strip() for cell in _split_commas(name, text)]
+    try:
+        cells = text.split() if spaced else [cell.strip() for cell in next(csv.reader([text]))]
+    except csv.Error as error:
+        raise DataError(f"{name}: the first line is not a CSV header: {error}") from error
     if not cells or not _is_number(cells[0]):
         return Layout(len(cells), _places(name, cells), header=True, spaced=spaced), rest
     if len(cells) != len(OFFICIAL):
@@ -351,20 +72,13 @@ def _detect(name: str, lines: bytes) -> tuple[Layout, bytes]:
             f"{name}: the first line has {len(cells)} columns and no header; expected the "
             f"{len(OFFICIAL)} columns of the native layout"
         )
-    places = {column: place for place, column in enumerate(OFFICIAL) if column in NEEDED + OPTIONAL}
+    places = {column: place for place, column in enumerate(OFFICIAL) if column in KNOWN}
     return Layout(len(OFFICIAL), places, header=False, spaced=spaced), lines
-
-
-def _split_commas(name: str, line: str) -> list[str]:
-    try:
-        return next(csv.reader([line]))
-    except csv.Error as error:
-        raise DataError(f"{name}: the first line is not a CSV header: {error}") from error
 
 
 def _places(name: str, header: list[str]) -> dict[str, int]:
     """Where the known columns are in a header, whatever its letter case and separators."""
-    known = {_folded(column): column for column in NEEDED + OPTIONAL} | ALIASES
+    known = {_folded(column): column for column in KNOWN} | ALIASES
     places: dict[str, int] = {}
     for place, cell in enumerate(header):
         column = known.get(_folded(cell))
@@ -375,16 +89,12 @@ def _places(name: str, header: list[str]) -> dict[str, int]:
         places[column] = place
     for column in NEEDED:
         if column not in places:
-            raise DataError(_missing_message(name, column, header))
+            folded = {_folded(cell): cell for cell in header}
+            near = get_close_matches(_folded(column), folded, n=1)
+            hint = f"; the nearest is {folded[near[0]]!r}" if near else ""
+            shown = ", ".join(header[:30])[:400]
+            raise DataError(f"{name}: the header has no column {column!r}{hint}. It has: {shown}")
     return places
-
-
-def _missing_message(name: str, column: str, header: list[str]) -> str:
-    folded = {_folded(cell): cell for cell in header}
-    near = get_close_matches(_folded(column), folded, n=1)
-    hint = f"; the nearest is {folded[near[0]]!r}" if near else ""
-    shown = ", ".join(header[:30])[:400]
-    return f"{name}: the header has no column {column!r}{hint}. It has: {shown}"
 
 
 def _folded(cell: str) -> str:
@@ -397,36 +107,3 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _is_text(lines: bytes) -> bool:
-    try:
-        return lines.isascii() or bool(lines.decode("utf-8"))
-    except UnicodeDecodeError:
-        return False
-
-
-def _single_spaces(lines: bytes) -> bytes:
-    """One space between columns and none around the row; the native files align by spaces."""
-    if b"\t" in lines:
-        lines = lines.replace(b"\t", b" ")
-    if b"  " in lines:
-        lines = re.sub(rb" {2,}", b" ", lines)
-    if b" \n" in lines or b" \r" in lines:
-        lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n")
-    if b"\n " in lines:
-        lines = lines.replace(b"\n ", b"\n")
-    return lines.strip(b" ")
-
-
-def _first_not_number(text: pa.Array) -> int:
-    """Index of the first cell that does not read as a number, by halving."""
-    low, high = 0, len(text)
-    while high - low > 1:
-        middle = (low + high) // 2
-        try:
-            pc.cast(text[low:middle], pa.float64())
-            low = middle
-        except pa.ArrowInvalid:
-            high = middle
-    return low

@@ -1,19 +1,18 @@
-"""Recording room: tells apart the recordings in which vehicle ids are used again.
+"""Identification of the recordings that NGSIM rows belong to, as vehicle ids are reused.
 
-Within a recording the clock runs 100 ms a frame, so Global_Time − 100·Frame_ID, the time of frame
-0, is the same in every row of it and differs between recordings by minutes. Published clocks are
-not perfect. Those of one file and location are taken in three steps:
+Within a recording the clock advances 100 ms a frame, so Global_Time − 100·Frame_ID, the time of
+frame 0, is constant and differs between recordings by minutes. Published clocks have errors; those
+of one file and location are processed in three steps:
 
-1. A clock that is blank, zero or no plausible epoch is unusable. The site Peachtree publishes its
-   epoch in seconds (and still 100 a frame): that is usable.
-2. Times of frame 0 that lie within ``JITTER`` of the next one belong together, so that jitter,
-   truncation and rounding do not split a recording.
-3. Times that belong together and yet spread over more than ``SPREAD`` are no steady clock (one
-   that stands still, say) and are unusable too.
+1. A clock that is blank, zero or not a plausible epoch is unusable. The site Peachtree publishes
+   its epoch in seconds (and 100 a frame), which is usable.
+2. Times of frame 0 within ``JITTER`` of the next one form a cluster, so that jitter, truncation and
+   rounding do not split a recording.
+3. Clusters that spread over more than ``SPREAD`` (a constant clock, for example) are unusable.
 
-Rows with a usable clock are told apart by location and time, over all files. Rows without one join
-the only recording of their file and location, where there is exactly one, and otherwise form a
-recording of their own per file and location.
+Rows with a usable clock are identified by location and time, over all files. Rows without one join
+the recording of their file and location where there is exactly one, and otherwise form a recording
+of their own per file and location.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ SECONDS_BELOW = 10**11  # an epoch below this is in seconds: in ms it would be i
 
 
 class Group(NamedTuple):
-    """Rows of one file and location whose clocks tell the same time of frame 0.
+    """Rows of one file and location with the same time of frame 0.
 
     Args:
         file: path of the file.
@@ -50,22 +49,24 @@ def name_recordings(rows: dict[Group, int]) -> tuple[dict[Group, str], list[str]
         rows: number of rows of each group.
 
     Returns:
-        A name such as ``i-80@2005-04-13T22:58:55Z`` (UTC, the commonest time of frame 0), or
-        ``<file stem>#1`` where the clock does not tell, for each group; and notes for the report.
+        The name of each group, such as ``i-80@2005-04-13T22:58:55Z`` (UTC, the most frequent time
+        of frame 0) or, without a usable clock, ``<file stem>#1``; and notes for the report.
     """
     steady = _steady(rows)
     named: dict[Group, str] = {}
     for location in sorted({group.location for group in steady}):
         here = [group for group in steady if group.location == location]
         for cluster in _clusters(here):
-            name = _time_name(location, _commonest(cluster, rows))
-            named.update(dict.fromkeys(cluster, name))
-    notes = _name_by_file(named, rows)
-    return named, notes
+            counts: Counter[int] = Counter()
+            for group in cluster:
+                counts[group.start] += rows[group]
+            start = min(counts, key=lambda start: (-counts[start], start))
+            named.update(dict.fromkeys(cluster, _time_name(location, start)))
+    return named, _name_by_file(named, rows)
 
 
 def _steady(rows: dict[Group, int]) -> list[Group]:
-    """Groups whose clock is usable; each file is judged alone, not to spoil the others."""
+    """Groups whose clock is usable, judged file by file."""
     places: dict[tuple[str, str], list[Group]] = defaultdict(list)
     for group in rows:
         if group.start > 0:
@@ -90,14 +91,6 @@ def _clusters(groups: Iterable[Group]) -> list[list[Group]]:
     return clusters
 
 
-def _commonest(cluster: list[Group], rows: dict[Group, int]) -> int:
-    """Start that most rows tell, the earliest of equals."""
-    counts: Counter[int] = Counter()
-    for group in cluster:
-        counts[group.start] += rows[group]
-    return min(counts, key=lambda start: (-counts[start], start))
-
-
 def _time_name(location: str, start: int) -> str:
     seconds = start if start < SECONDS_BELOW else start // 1000
     time = datetime.fromtimestamp(seconds, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -109,11 +102,11 @@ def _name_by_file(named: dict[Group, str], rows: dict[Group, int]) -> list[str]:
     recordings: dict[tuple[str, str], set[str]] = defaultdict(set)
     for group, name in named.items():
         recordings[group.file, group.location].add(name)
-    untold: Counter[tuple[str, str]] = Counter()
+    unclocked: Counter[tuple[str, str]] = Counter()
     own: dict[tuple[str, str], str] = {}
     for group in sorted(rows.keys() - named.keys()):
         place = (group.file, group.location)
-        untold[place] += rows[group]
+        unclocked[place] += rows[group]
         if place not in own:
             alone = len(recordings[place]) == 1
             own[place] = next(iter(recordings[place])) if alone else _file_name(place[0], own)
@@ -121,7 +114,7 @@ def _name_by_file(named: dict[Group, str], rows: dict[Group, int]) -> list[str]:
     return [
         f"Global_Time does not tell the recording of {count:,} rows of {file}"
         f"{f' at {location}' if location else ''}: taken as {own[file, location]}"
-        for (file, location), count in untold.items()
+        for (file, location), count in unclocked.items()
     ]
 
 

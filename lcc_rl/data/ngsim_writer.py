@@ -1,4 +1,4 @@
-"""NGSIM writer room: SI samples become a file in the official 18-column layout."""
+"""Writer of NGSIM files in the official 18-column layout."""
 
 from __future__ import annotations
 
@@ -18,19 +18,12 @@ from lcc_rl.data.units import FOOT
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import atomic_path
 
-REQUIRED = (
-    "recording",
-    "vehicle",
-    "frame",
-    "position_m",
-    "lane",
-    "length_m",
-    "vehicle_class",
-    "speed_mps",
-    "acceleration_mps2",
-    "preceding",
-)
-# A recording whose name tells no time starts at one of these hours; any distinct hours would do.
+# Columns of the samples beside the recording.
+NUMBERS = ["vehicle", "frame", "position_m", "lane", "length_m", "vehicle_class"]
+NUMBERS += ["speed_mps", "acceleration_mps2", "preceding"]
+KEY = ["recording", "vehicle", "frame"]
+AHEAD = ["recording", "preceding", "frame"]
+# Start of recordings whose name holds no time, one hour apart.
 FIRST_START_MS = int(datetime(2005, 4, 13, 23, tzinfo=UTC).timestamp() * 1000)
 HOUR_MS = 3_600_000
 LANE_WIDTH_FT = 12.0
@@ -47,9 +40,9 @@ def write_ngsim(samples: pd.DataFrame, path: str | Path) -> None:
     Local_X is a lane centre; Global_X and Global_Y are 0 and v_Width 6.4 ft, as fillers.
 
     Args:
-        samples: rows with the columns of :class:`lcc_rl.data.ngsim.Trajectories`, in any order;
-            ``segment`` and ``time_s`` are not needed, and ``space_headway_m`` is taken from the
-            positions where the column is absent.
+        samples: rows with the columns of :class:`lcc_rl.data.trajectories.Trajectories`, in any
+            order; ``segment`` and ``time_s`` are not needed, and ``space_headway_m`` is derived
+            from the positions where the column is absent.
         path: destination; compressed where it ends in ``.gz``.
 
     Raises:
@@ -72,18 +65,18 @@ def write_ngsim(samples: pd.DataFrame, path: str | Path) -> None:
 
 def _checked(samples: pd.DataFrame, path: str) -> pd.DataFrame:
     """Sorted copy of the samples, or a DataError."""
-    missing = [name for name in REQUIRED if name not in samples.columns]
+    missing = [name for name in ["recording", *NUMBERS] if name not in samples.columns]
     if missing:
         raise DataError(f"{path}: the samples to write lack the column(s) {', '.join(missing)}")
     if samples.empty:
         raise DataError(f"{path}: there are no samples to write")
-    for name in REQUIRED[1:]:
+    for name in NUMBERS:
         if not np.isfinite(samples[name].to_numpy(dtype=float)).all():
             raise DataError(f"{path}: column {name!r} of the samples to write is not all finite")
     # Plain text orders recordings the same whatever the categories' own order is.
     frame = samples.assign(recording=samples["recording"].astype(str))
-    frame = frame.sort_values(["recording", "vehicle", "frame"], ignore_index=True)
-    if frame.duplicated(["recording", "vehicle", "frame"]).any():
+    frame = frame.sort_values(KEY, ignore_index=True)
+    if frame.duplicated(KEY).any():
         raise DataError(f"{path}: a vehicle to write appears twice in one frame")
     return frame
 
@@ -91,22 +84,23 @@ def _checked(samples: pd.DataFrame, path: str) -> pd.DataFrame:
 def _start_times(frame: pd.DataFrame, path: str) -> dict[str, int]:
     """Epoch of frame 0 of every recording [ms]."""
     starts: dict[str, int] = {}
-    untold = 0
-    for name in frame["recording"].unique():
-        told = start_in_name(str(name))
-        starts[str(name)] = FIRST_START_MS + untold * HOUR_MS if told is None else told
-        untold += told is None
+    unnamed = 0
+    for name in map(str, frame["recording"].unique()):
+        start = start_in_name(name)
+        starts[name] = FIRST_START_MS + unnamed * HOUR_MS if start is None else start
+        unnamed += start is None
     ordered = sorted(starts.values())
     if any(later - earlier <= 5000 for earlier, later in pairwise(ordered)):
         raise DataError(
-            f"{path}: two recordings start at the same time, and the 18-column layout has nothing "
-            f"else to tell them apart; write one file each. Recordings: {', '.join(starts)}"
+            f"{path}: two recordings start at the same time, and the 18-column layout holds "
+            f"nothing else to distinguish them; write one file each. Recordings: "
+            f"{', '.join(starts)}"
         )
     return starts
 
 
 def start_in_name(name: str) -> int | None:
-    """Epoch [ms] told by a recording name such as ``i-80@2005-04-13T22:58:55Z``, if any."""
+    """Epoch [ms] in a recording name such as ``i-80@2005-04-13T22:58:55Z``, if any."""
     try:
         start = datetime.fromisoformat(name.rpartition("@")[2].replace("Z", "+00:00"))
     except ValueError:
@@ -152,9 +146,8 @@ def _space_headway(frame: pd.DataFrame) -> NDArray:
     if "space_headway_m" in frame.columns:
         given = frame["space_headway_m"].to_numpy(dtype=float)
     else:
-        place = pd.MultiIndex.from_frame(frame[["recording", "vehicle", "frame"]])
-        ahead = pd.MultiIndex.from_frame(frame[["recording", "preceding", "frame"]])
-        row = place.get_indexer(ahead)
+        place = pd.MultiIndex.from_frame(frame[KEY])
+        row = place.get_indexer(pd.MultiIndex.from_frame(frame[AHEAD]))
         position = frame["position_m"].to_numpy(dtype=float)
         given = np.where(row >= 0, position[row] - position, 0.0)
     return np.where(np.isfinite(given) & (frame["preceding"].to_numpy() > 0), given, 0.0)
@@ -162,10 +155,9 @@ def _space_headway(frame: pd.DataFrame) -> NDArray:
 
 def _following(frame: pd.DataFrame) -> NDArray:
     """Id of the vehicle behind in the same frame, 0 where there is none."""
-    names = ["recording", "preceding", "frame"]
-    behind = frame.loc[frame["preceding"] > 0, [*names, "vehicle"]].drop_duplicates(names)
-    place = pd.MultiIndex.from_frame(frame[["recording", "vehicle", "frame"]])
-    row = pd.MultiIndex.from_frame(behind[names]).get_indexer(place)
+    behind = frame.loc[frame["preceding"] > 0, [*AHEAD, "vehicle"]].drop_duplicates(AHEAD)
+    place = pd.MultiIndex.from_frame(frame[KEY])
+    row = pd.MultiIndex.from_frame(behind[AHEAD]).get_indexer(place)
     followers = np.append(behind["vehicle"].to_numpy(dtype=np.int64), 0)  # row −1 is the last: 0
     return followers[row]
 
@@ -175,5 +167,5 @@ def _feet(values: pd.Series) -> NDArray:
 
 
 def _printed(values: NDArray) -> NDArray:
-    """Values as they are printed, three decimals; adding 0 removes negative zeros."""
+    """Values with three decimals; adding 0 removes negative zeros."""
     return np.round(values, 3) + 0.0

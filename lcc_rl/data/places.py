@@ -1,4 +1,4 @@
-"""Place room: finds the row of a vehicle at a frame of a recording in millions of rows."""
+"""Row lookup by recording, vehicle and frame in sorted tables of millions of rows."""
 
 from __future__ import annotations
 

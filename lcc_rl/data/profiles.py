@@ -1,15 +1,19 @@
-"""Speed profiles of leaders: cut from episodes, split into training and evaluation, windowed."""
+"""Speed profiles of leaders: extraction, windows, split into training and evaluation."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.data.sources import NgsimSource
+from lcc_rl.data.speed_records import resample
+from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError, DataError
 
 
@@ -24,8 +28,8 @@ class Profiles:
         names: a readable identity of each record: recording, vehicle and start.
         recordings: the recording that each record comes from.
         time_step: time between samples [s].
-        reach: samples known of each record, shape ``[profiles]``: those to play and what follows
-            a window, for those who look ahead; None for ``lengths``.
+        reach: samples of each record including those after a window's end, shape ``[profiles]``,
+            for previews; None for ``lengths``.
     """
 
     speeds: Tensor
@@ -57,7 +61,7 @@ class Profiles:
     def windows(self, horizon: int, limit: int | None = None) -> Profiles:
         """Cut the records into consecutive windows of ``horizon`` steps that do not overlap.
 
-        What follows a window in its record stays within ``reach``.
+        The samples after a window in its record are kept, see ``reach``.
 
         Args:
             horizon: steps per window; a window has one sample more.
@@ -166,16 +170,45 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
     return from_records(records, names, recordings, time_step)
 
 
+def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Profiles:
+    """Read the speed profiles of the leaders in car-following episodes of NGSIM files.
+
+    Args:
+        path: one or several files of any published NGSIM layout, or a pattern; see
+            :class:`lcc_rl.data.sources.NgsimSource`, whose default criteria apply.
+        time_step: step of the profiles [s]; the records are interpolated to it.
+
+    Raises:
+        ConfigError: if the step is not positive and finite.
+        DataError: if a file cannot be read or holds no car-following episode.
+    """
+    if not 0.0 < time_step < float("inf"):
+        raise ConfigError(f"time_step must be positive and finite, got {time_step}")
+    episodes = NgsimSource(path).load().episodes
+    return at_step(leader_profiles(episodes, FRAME), time_step)
+
+
+def at_step(profiles: Profiles, time_step: float) -> Profiles:
+    """Interpolate every record to another step [s]."""
+    if time_step == profiles.time_step:
+        return profiles
+    records = []
+    for index in range(len(profiles)):
+        speed = profiles.record(index).numpy().astype(float)
+        records.append(resample(np.arange(len(speed)) * profiles.time_step, speed, time_step))
+    return from_records(records, profiles.names, profiles.recordings, time_step)
+
+
 @dataclass(frozen=True)
 class Split:
-    """How profiles are divided so that nothing seen in training is met in evaluation.
+    """Split into training and evaluation profiles that share no recording or vehicle.
 
     Args:
         by: ``"recording"`` holds out whole recordings (no shared traffic wave at all);
             ``"vehicle"`` holds out leaders within every recording.
         evaluation_share: share of the recordings or vehicles held out, 0…1.
-        tuning: for choosing settings: put what would be held out aside, unseen, and hold out a
-            part of the rest, by the same rule, in its place.
+        tuning: for choosing settings: leave the evaluation profiles out and split the training
+            profiles once more, by the same rule.
 
     Raises:
         ConfigError: if a setting is unknown or out of range.

@@ -1,9 +1,8 @@
-"""Smoothing room: positions are smoothed; speeds and accelerations follow from them.
+"""Smoothing of trajectories: positions are smoothed, then differentiated.
 
-Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Each class here is
-called with trajectories and returns smoothed ones: per stretch without a missing frame, the
-positions are smoothed, speed and acceleration are their derivatives, and space headways are
-derived again. Smoothing is off unless a configuration names one of these classes.
+Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Per stretch without a
+missing frame the positions are smoothed, speed and acceleration are their derivatives, and space
+headways are derived again. Smoothing is off unless a configuration names one of these classes.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from lcc_rl.data.ngsim import Trajectories
 from lcc_rl.data.places import find_leaders
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
 from lcc_rl.errors import ConfigError
 
@@ -24,13 +23,13 @@ Array = NDArray[np.float64]
 
 
 class Smoothing(ABC):
-    """Smooths the positions of trajectories; a subclass says how."""
+    """Smoothing of the positions of trajectories, called with them."""
 
     def __call__(self, trajectories: Trajectories) -> Trajectories:
-        """Return smoothed trajectories; the given ones stay as they are.
+        """Return smoothed trajectories; the given ones are not changed.
 
-        Smoothed speeds below zero, the ripple of a standing vehicle, become zero. Stretches too
-        short to smooth keep their published values. Both are counted in the report's notes.
+        Negative smoothed speeds, as at standstill, become zero. Stretches too short to smooth keep
+        their published values. Both are counted in the report's notes.
         """
         samples = trajectories.samples.copy(deep=False)
         starts, lengths = stretches(samples["segment"].to_numpy())
@@ -73,8 +72,8 @@ class Smoothing(ABC):
             starts, lengths: first row and number of rows of each stretch.
 
         Returns:
-            Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; what stands in
-            stretches shorter than ``shortest`` is not used.
+            Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; values in
+            stretches shorter than ``shortest`` are not used.
         """
 
 

@@ -1,4 +1,4 @@
-"""Source room: where car-following episodes come from; every source loads the same table."""
+"""Sources of car-following episodes: NGSIM files and episode tables."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ import pandas as pd
 
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import read_episodes
-from lcc_rl.data.ngsim import Trajectories, read_ngsim
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
 class LoadedEpisodes:
-    """Episodes and how they came about.
+    """Episode table and the report on its origin.
 
     Args:
         episodes: the episode table, see :data:`lcc_rl.data.episodes.SCHEMA`.
-        report: plain lines: what was read, dropped, filtered and kept.
+        report: lines on what was read, dropped, filtered and kept.
     """
 
     episodes: pd.DataFrame
@@ -39,7 +40,7 @@ class NgsimSource:
         criteria: what counts as an episode; None for the defaults.
     """
 
-    path: str | Sequence[str]
+    path: str | Path | Sequence[str]
     location: str | None = None
     smoothing: Callable[[Trajectories], Trajectories] | None = None
     criteria: Criteria | None = None
@@ -67,7 +68,7 @@ class NgsimSource:
 
 @dataclass(frozen=True)
 class EpisodesSource:
-    """Episodes that were extracted before, from a parquet file.
+    """Episodes from a parquet file.
 
     Args:
         path: see :func:`lcc_rl.data.episodes.read_episodes`.
@@ -90,7 +91,7 @@ class EpisodesSource:
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
-    """Files that a path, a pattern or a list of them stands for; a pattern's are sorted.
+    """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.

@@ -1,4 +1,4 @@
-"""Statistics room: what the leaders of a set of car-following episodes drive like.
+"""Statistics of speed, acceleration and energy of car-following episodes.
 
 The same definitions hold for real and synthetic episodes. Speed: every sample of every episode.
 Acceleration: forward difference of speed within an episode. Energy: the sum of P·T by A2 over
@@ -18,7 +18,7 @@ from lcc_rl.functional.power import motor_power
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 WINDOW_S = 30.0
 UNITS = {"speed": "m/s", "acceleration": "m/s²", "energy": "kJ"}
-# What is compared beside the quantiles; the mean of acceleration is zero but for end effects.
+# Compared beside the quantiles; the mean of acceleration is close to zero.
 LEVEL = {"speed": "mean", "acceleration": "std", "energy": "mean"}
 ROLES = ("leader", "follower")
 
@@ -85,10 +85,10 @@ def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataF
     """
     rows = []
     for quantity, unit in UNITS.items():
-        span = _cell(reference, quantity, "q95") - _cell(reference, quantity, "q05")
+        first, second = (table.loc[quantity].to_dict() for table in (reference, other))
         for statistic in (LEVEL[quantity], *map(_label, QUANTILES)):
-            one, two = (_cell(table, quantity, statistic) for table in (reference, other))
-            scale = one if statistic == LEVEL[quantity] else span
+            one, two = first[statistic], second[statistic]
+            scale = one if statistic == LEVEL[quantity] else first["q95"] - first["q05"]
             deviation = (two - one) / scale if scale else np.nan
             rows.append((quantity, statistic, unit, one, two, deviation))
     columns = ["quantity", "statistic", "unit", "reference", "other", "deviation"]
@@ -126,11 +126,6 @@ def _summary(values: NDArray[np.float64]) -> dict[str, float]:
         return {"count": 0, **dict.fromkeys(("mean", "std", *map(_label, QUANTILES)), np.nan)}
     quantiles = zip(map(_label, QUANTILES), np.quantile(values, QUANTILES), strict=True)
     return {"count": len(values), "mean": values.mean(), "std": values.std(), **dict(quantiles)}
-
-
-def _cell(table: pd.DataFrame, quantity: str, statistic: str) -> float:
-    """One number of a table of statistics."""
-    return float(table[statistic].to_dict()[quantity])
 
 
 def _label(quantile: float) -> str:

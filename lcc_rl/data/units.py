@@ -1,4 +1,4 @@
-"""Unit room: the constants between published units and SI."""
+"""Conversion constants from the units of published files to SI."""
 
 from __future__ import annotations
 

@@ -1,32 +1,33 @@
-"""Calibration room: the calibration that a configuration describes."""
+"""Calibration as described by a configuration."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import pandas as pd
 import torch
 
 from lcc_rl.drivers.genetic import GeneticSettings, Progress
-from lcc_rl.drivers.idm_fit import DEFAULT_GENETIC, MODES, Calibration, checked_bounds, fit
+from lcc_rl.drivers.idm_fit import DEFAULT_GENETIC, Calibration, fit
 from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.drivers.parameters import MODES, Bounds, checked_bounds
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.idm import IDMConstants
 
 
 @dataclass(frozen=True)
 class Calibrator:
-    """How to calibrate; see :func:`lcc_rl.drivers.idm_fit.fit` for the settings.
+    """Calibration of all drivers in one or both modes.
 
     Args:
         modes: ``local``, ``global`` or both, each once.
-        bounds: bounds by parameter.
-        constants: parameters that the local mode holds.
+        bounds: lower and upper bound by parameter, in its unit.
+        constants: parameters that the local mode does not fit.
         selection: which episodes are used.
         local_genetic: genetic algorithm of the local mode.
         global_genetic: genetic algorithm of the global mode.
-        choose_constants: choose the local mode's constants over all drivers first.
+        choose_constants: first choose the local mode's constants over all drivers.
         compiled: compile the simulation.
 
     Raises:
@@ -34,7 +35,7 @@ class Calibrator:
     """
 
     modes: Sequence[str] = ("local",)
-    bounds: Mapping[str, Sequence[float]] | None = None
+    bounds: Bounds | None = None
     constants: IDMConstants = field(default_factory=IDMConstants)
     selection: Selection = field(default_factory=Selection)
     local_genetic: GeneticSettings = DEFAULT_GENETIC["local"]
@@ -58,37 +59,29 @@ class Calibrator:
         device: torch.device | str = "cpu",
         progress: Progress | None = None,
     ) -> Calibration:
-        """Calibrate the drivers of an episode table in every mode.
+        """Calibrate the drivers of an episode table; see :func:`lcc_rl.drivers.idm_fit.fit`.
 
         Returns:
-            The drivers of all modes, told apart by the column ``mode``, and one report.
-
-        Raises:
-            ConfigError: if a setting is impossible.
-            DataError: if the table lacks a column or holds no usable episode.
+            The drivers of all modes, with the column ``mode``, and one report.
         """
         observed = observe(episodes, self.selection)
-        report = list(observed.report)
-        parts = []
-        for mode in self.modes:
-            part = fit(
+        genetic = {"local": self.local_genetic, "global": self.global_genetic}
+        parts = [
+            fit(
                 observed,
                 mode,
                 self.bounds,
                 self.constants,
-                self.local_genetic if mode == "local" else self.global_genetic,
-                seed=seed,
-                choose_constants=self.choose_constants and mode == "local",
-                compiled=self.compiled,
-                device=device,
-                progress=progress,
+                genetic[mode],
+                seed,
+                self.choose_constants and mode == "local",
+                self.compiled,
+                device,
+                progress,
             )
-            parts.append(part)
+            for mode in self.modes
+        ]
+        report = list(observed.report)
+        for mode, part in zip(self.modes, parts, strict=True):
             report += [f"{mode}: {line}" for line in part.report[len(observed.report) :]]
-        return Calibration(
-            drivers=pd.concat([part.drivers for part in parts], ignore_index=True),
-            report=report,
-            constants=parts[0].constants,
-            generations=sum(part.generations for part in parts),
-            evaluations=sum(part.evaluations for part in parts),
-        )
+        return Calibration(pd.concat([part.drivers for part in parts], ignore_index=True), report)

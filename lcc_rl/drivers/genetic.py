@@ -1,10 +1,10 @@
-"""Calibration room: a genetic algorithm that evolves many independent problems at once."""
+"""Genetic algorithm that solves many independent problems at once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,13 +14,12 @@ from lcc_rl.errors import ConfigError
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
-
 _LEAST = {"population": 4, "generations": 1, "founders": 1, "tournament": 1, "patience": 1}
 
 
 @dataclass(frozen=True)
 class GeneticSettings:
-    """How a population evolves.
+    """Settings of the genetic algorithm.
 
     Args:
         population: individuals per problem.
@@ -63,15 +62,13 @@ class GeneticSettings:
         for name in ("mutation_start", "mutation_end"):
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f"genetic setting {name!r} must be positive")
-        if self.blend < 0.0 or self.patience < 1 or self.tolerance < 0.0:
-            raise ConfigError(
-                "genetic settings 'blend', 'patience', 'tolerance' must not be below 0"
-            )
+        if self.blend < 0.0 or self.tolerance < 0.0:
+            raise ConfigError("genetic settings 'blend' and 'tolerance' must not be below 0")
 
 
 @dataclass(frozen=True)
 class Evolution:
-    """What a run of the algorithm found.
+    """Result of the genetic algorithm.
 
     Args:
         best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
@@ -97,23 +94,18 @@ def minimise(
 ) -> Evolution:
     """Minimise an objective inside a box, for all problems at once.
 
-    Selection by tournament, blend crossover (Eshelman & Schaffer 1993), a mutation by population
-    differences and an annealed Gaussian one, and survival of the elite among parents beside the
-    fittest children. All problems share the random numbers of a generation, while fitness decides
-    per problem: a problem's result does not depend on which others run beside it.
+    Tournament selection, blend crossover (Eshelman & Schaffer 1993), mutation by differences of
+    individuals and by annealed Gaussian noise, elitist survival. All problems share the random
+    numbers of a generation, so that a problem's result does not depend on the others.
 
     Args:
-        objective: maps ``[problems, population, dims]`` to ``[problems, population]``; where it
-            is not finite, the individual is unfit.
-        lower: lower bounds, ``[dims]``.
-        upper: upper bounds, ``[dims]``; the device and dtype of the search are those of ``lower``.
+        objective: maps ``[problems, population, dims]`` to ``[problems, population]``; an
+            individual whose value is not finite is unfit.
+        lower, upper: bounds, ``[dims]``; the search has the device and dtype of ``lower``.
         problems: number of problems.
         generator: source of all randomness (on the CPU, so that devices agree).
-        settings: how to evolve.
+        settings: settings of the algorithm.
         progress: called as ``progress(generation, total, text)`` after each generation.
-
-    Returns:
-        The fittest individuals.
 
     Raises:
         ConfigError: if the bounds are empty or crossed.
@@ -121,15 +113,25 @@ def minimise(
     settings = settings or GeneticSettings()
     if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
         raise ConfigError("bounds must be two vectors of one length with lower < upper")
-    dice = _Dice(generator, lower)
-    # Genes live in the unit box, so that one mutation strength suits every parameter.
-    genes = _latin_hypercube(dice, settings.founders * settings.population, lower.numel())
-    genes = genes.expand(problems, -1, -1).contiguous()
     evaluate = _in_units(objective, lower, upper)
+    found = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
+    return replace(found, best=lower + found.best * (upper - lower))
+
+
+def _evolve(
+    evaluate: Objective,
+    problems: int,
+    random: _Random,
+    settings: GeneticSettings,
+    progress: Progress | None,
+) -> Evolution:
+    """Evolve in the unit box, so that one mutation strength suits every parameter."""
+    genes = _latin_hypercube(random, settings.founders * settings.population)
+    genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
     best, stale, generation = fitness[:, 0], 0, 0
     for generation in range(1, settings.generations + 1):
-        children = _children(genes, fitness, dice, settings, generation)
+        children = _children(genes, fitness, random, settings, generation)
         genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
         improved = bool((fitness[:, 0] < best * (1.0 - settings.tolerance)).any())
         best, stale = fitness[:, 0], 0 if improved else stale + 1
@@ -137,16 +139,12 @@ def minimise(
             progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
         if stale >= settings.patience:
             break
-    return Evolution(
-        best=lower + genes[:, 0] * (upper - lower),
-        fitness=fitness[:, 0],
-        generations=generation,
-        evaluations=settings.population * (settings.founders + generation),
-    )
+    evaluations = settings.population * (settings.founders + generation)
+    return Evolution(genes[:, 0], fitness[:, 0], generation, evaluations)
 
 
-class _Dice:
-    """Random numbers on the CPU from one generator, delivered where the search runs."""
+class _Random:
+    """Random numbers from a generator on the CPU, moved to the device of ``like``."""
 
     def __init__(self, generator: torch.Generator, like: Tensor) -> None:
         self.generator, self.like = generator, like
@@ -158,17 +156,17 @@ class _Dice:
         return torch.randn(shape, generator=self.generator).to(self.like)
 
     def index(self, high: int, *shape: int) -> Tensor:
-        draw = torch.randint(high, shape, generator=self.generator)
-        return draw.to(self.like.device)
+        return torch.randint(high, shape, generator=self.generator).to(self.like.device)
 
     def permutation(self, count: int) -> Tensor:
         return torch.randperm(count, generator=self.generator).to(self.like.device)
 
 
-def _latin_hypercube(dice: _Dice, count: int, dims: int) -> Tensor:
-    """Spread ``count`` individuals so that every parameter's range is covered evenly."""
-    strata = torch.stack([dice.permutation(count) for _ in range(dims)], dim=1)
-    return (strata + dice.uniform(count, dims)) / count
+def _latin_hypercube(random: _Random, count: int) -> Tensor:
+    """``count`` individuals, one in each of ``count`` equal parts of every parameter's range."""
+    dims = random.like.numel()
+    strata = torch.stack([random.permutation(count) for _ in range(dims)], dim=1)
+    return (strata + random.uniform(count, dims)) / count
 
 
 def _in_units(objective: Objective, lower: Tensor, upper: Tensor) -> Objective:
@@ -182,35 +180,31 @@ def _in_units(objective: Objective, lower: Tensor, upper: Tensor) -> Objective:
 
 
 def _children(
-    genes: Tensor, fitness: Tensor, dice: _Dice, settings: GeneticSettings, generation: int
+    genes: Tensor, fitness: Tensor, random: _Random, settings: GeneticSettings, generation: int
 ) -> Tensor:
     """Breed one child per individual: selection, crossover, mutation."""
     _, count, dims = genes.shape
-    first = _tournament(genes, fitness, dice, settings.tournament)
-    second = _tournament(genes, fitness, dice, settings.tournament)
-    weight = dice.uniform(count, dims) * (1.0 + 2.0 * settings.blend) - settings.blend
+    first = _tournament(genes, fitness, random, settings.tournament)
+    second = _tournament(genes, fitness, random, settings.tournament)
+    weight = random.uniform(count, dims) * (1.0 + 2.0 * settings.blend) - settings.blend
     child = first + weight * (second - first)
     # The population's own spread scales this step: wide at first, fine once it contracts.
-    shift = genes[:, dice.permutation(count)] - genes[:, dice.permutation(count)]
-    chosen = dice.uniform(count, 1) < settings.difference_rate
-    child = child + torch.where(chosen, dice.uniform(count, 1), 0.0) * shift
-    chosen = dice.uniform(count, dims) < settings.mutation_rate
-    noise = dice.normal(count, dims) * _mutation_strength(settings, generation)
+    shift = genes[:, random.permutation(count)] - genes[:, random.permutation(count)]
+    chosen = random.uniform(count, 1) < settings.difference_rate
+    child = child + torch.where(chosen, random.uniform(count, 1), 0.0) * shift
+    chosen = random.uniform(count, dims) < settings.mutation_rate
+    share = (generation - 1) / max(settings.generations - 1, 1)
+    strength = settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
+    noise = random.normal(count, dims) * strength
     child = child + torch.where(chosen, noise, 0.0)
     # Clamped, not reflected: an optimum on a bound is then reached exactly and can be flagged.
     return child.clamp_(0.0, 1.0)
 
 
-def _mutation_strength(settings: GeneticSettings, generation: int) -> float:
-    """Standard deviation of the Gaussian mutation, falling geometrically."""
-    share = (generation - 1) / max(settings.generations - 1, 1)
-    return settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
-
-
-def _tournament(genes: Tensor, fitness: Tensor, dice: _Dice, size: int) -> Tensor:
-    """Draw one parent per place: the fittest of ``size`` random individuals."""
+def _tournament(genes: Tensor, fitness: Tensor, random: _Random, size: int) -> Tensor:
+    """Tournament selection: one parent per place, the fittest of ``size`` random individuals."""
     count = genes.shape[1]
-    entrants = dice.index(count, count, size)
+    entrants = random.index(count, count, size)
     winner = fitness[:, entrants].argmin(-1, keepdim=True)
     parents = entrants.expand(genes.shape[0], -1, -1).gather(-1, winner)
     return genes.gather(1, parents.expand(-1, -1, genes.shape[-1]))
@@ -222,8 +216,7 @@ def _survivors(
     """Let the elite of the parents compete with the children; sorted, fittest first."""
     count = genes.shape[1]
     elites = max(1, round(settings.elites * count))
-    # The parents come sorted, so their elite stands first.
-    everyone = torch.cat([genes[:, :elites], children], 1)
+    everyone = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
     return _fittest(everyone, torch.cat([fitness[:, :elites], born], 1), count)
 
 

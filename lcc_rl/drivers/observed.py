@@ -1,4 +1,4 @@
-"""Calibration room: observed car-following episodes as tensors, longest first."""
+"""Observed car-following episodes as tensors, longest first."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.data.episodes import ALIASES
 from lcc_rl.errors import ConfigError, DataError
 
 IDENTITY = ("recording", "follower_id", "leader_id")
 NUMERIC = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
-RENAMED = {"event": "episode", "period": "recording"}
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which episodes are fit for calibration; the rest are dropped and counted.
+    """Criteria of the episodes used for calibration.
 
     Args:
-        min_gap_m: drop an episode whose gap ever falls below this, also beyond the part used: it
-            is a sign of a broken reconstruction [m].
+        min_gap_m: drop an episode whose gap ever falls below this, also beyond the part used [m].
         max_duration_s: use the first so many seconds of each; None uses everything [s].
         min_duration_s: drop shorter episodes [s].
-        min_mean_speed_mps: drop episodes that mostly stand still; RMSPE divides by speed [m/s].
+        min_mean_speed_mps: drop episodes at standstill; RMSPE divides by speed [m/s].
 
     Raises:
         ConfigError: if a limit is negative or the durations are crossed.
@@ -55,7 +54,7 @@ class Observed:
         samples: samples per episode, falling, on the CPU.
         identity: one row per episode: episode, recording, follower_id, leader_id.
         time_step: sampling interval [s].
-        report: what was dropped and why, in plain lines.
+        report: lines on what was dropped.
     """
 
     leader_speed: Tensor
@@ -102,8 +101,8 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
 
     Args:
         episodes: one row per sample: episode, time_s, follower_speed_mps, leader_speed_mps,
-            gap_m and, where known, recording, follower_id, leader_id (event and period are
-            understood as episode and recording).
+            gap_m and, where known, recording, follower_id, leader_id (or event and period for
+            episode and recording).
         selection: which episodes to use.
 
     Returns:
@@ -121,16 +120,14 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
     table, report = _select(table, selection)
     table = table.sort_values("samples", ascending=False, kind="stable")
     length, count = int(table["samples"].iloc[0]), len(table)
-    leader, follower = np.zeros((length, count)), np.zeros((length, count))
-    speeds = frame[["leader_speed_mps", "follower_speed_mps"]].to_numpy(np.float64)
-    for column, (start, samples) in enumerate(
-        zip(table["start"].to_numpy(), table["samples"].to_numpy(), strict=True)
-    ):
-        leader[:samples, column] = speeds[start : start + samples, 0]
-        follower[:samples, column] = speeds[start : start + samples, 1]
+    padded = np.zeros((2, length, count))
+    speeds = frame[["leader_speed_mps", "follower_speed_mps"]].to_numpy(np.float64).T
+    for column, (start, samples) in enumerate(zip(table["start"], table["samples"], strict=True)):
+        padded[:, :samples, column] = speeds[:, start : start + samples]
+    leader, follower = torch.from_numpy(padded)
     return Observed(
-        leader_speed=torch.from_numpy(leader),
-        follower_speed=torch.from_numpy(follower),
+        leader_speed=leader,
+        follower_speed=follower,
         gap=torch.from_numpy(table["first_gap"].to_numpy(np.float64).copy()),
         samples=table["samples"].to_numpy(np.int64),
         identity=table[["episode", *IDENTITY]].reset_index(drop=True),
@@ -141,7 +138,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
 
 def _canonical(episodes: pd.DataFrame) -> pd.DataFrame:
     """Check columns and types; order by episode and time."""
-    aliases = {old: new for old, new in RENAMED.items() if new not in episodes.columns}
+    aliases = {old: new for old, new in ALIASES.items() if new not in episodes.columns}
     frame = episodes.rename(columns=aliases)
     missing = [name for name in ("episode", *NUMERIC) if name not in frame.columns]
     if missing:
@@ -176,7 +173,7 @@ def _truncate(frame: pd.DataFrame, duration: float | None) -> pd.DataFrame:
 
 
 def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
-    """One row per episode: where it starts and what the selection looks at."""
+    """One row per episode: its first row and the values that the selection checks."""
     values = frame[list(NUMERIC)]
     frame = frame.assign(
         finite=np.isfinite(values.to_numpy(np.float64)).all(axis=1)
@@ -204,7 +201,7 @@ def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
 
 
 def _select(table: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, list[str]]:
-    """Drop what cannot be calibrated; every episode is counted under the first reason."""
+    """Drop unusable episodes; each is counted under its first reason."""
     reasons = {
         "missing, infinite or negative values": ~table["finite"],
         "uneven sampling": table["uneven"],

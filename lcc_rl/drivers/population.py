@@ -1,9 +1,8 @@
-"""Calibration room: populations of human drivers, from which episodes draw (v0, T)."""
+"""Populations of human drivers, from which episodes draw (v0, T)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
@@ -13,12 +12,13 @@ import torch
 from scipy.stats import gaussian_kde
 from torch import Tensor
 
-from lcc_rl.drivers.idm_fit import (
-    BOUND_TOLERANCE,
+from lcc_rl.drivers.parameters import (
     COLUMNS,
     DEFAULT_BOUNDS,
     MODES,
     SHARED,
+    Bounds,
+    at_bound,
     checked_bounds,
 )
 from lcc_rl.errors import ConfigError, DataError, ResultsError, unknown_name
@@ -30,7 +30,7 @@ SHIPPED = "i80_drivers.parquet"
 
 @dataclass(frozen=True)
 class DriverPopulation:
-    """Drivers an episode can draw: each has its own v0 and T, all share the constants.
+    """IDM drivers that an episode can draw.
 
     Args:
         desired_speed: v0, ``[drivers]`` [m/s].
@@ -39,6 +39,9 @@ class DriverPopulation:
             ``[drivers]`` (a globally calibrated population).
         ids: the drivers' identities, one per driver.
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
+
+    Raises:
+        ConfigError: if there is no driver, or a parameter is not positive and finite.
     """
 
     desired_speed: Tensor
@@ -46,6 +49,13 @@ class DriverPopulation:
     constants: IDMConstants
     ids: tuple[str, ...]
     at_bound: Tensor
+
+    def __post_init__(self) -> None:
+        if not self.ids:
+            raise ConfigError("driver population: holds no drivers")
+        for name, values in self.parameters().items():
+            if not bool((torch.isfinite(values) & (values > 0.0)).all()):
+                raise ConfigError(f"driver population: {name!r} must be positive and finite")
 
     def __len__(self) -> int:
         """Number of drivers."""
@@ -57,26 +67,14 @@ class DriverPopulation:
 
     def select(self, index: Tensor) -> DriverPopulation:
         """Return the drivers at ``index`` ``[chosen]``, in that order, repetitions included."""
-        index = index.to(self.desired_speed.device)
-        own = {name: value[index] for name, value in self._own_constants().items()}
-        return replace(
-            self,
-            desired_speed=self.desired_speed[index],
-            time_gap=self.time_gap[index],
-            constants=self.constants.with_(**own),
-            ids=tuple(self.ids[place] for place in index.tolist()),
-            at_bound=self.at_bound[index],
-        )
-
-    def to(self, device: torch.device | str) -> DriverPopulation:
-        """Return the same drivers on another device."""
-        own = {name: value.to(device) for name, value in self._own_constants().items()}
-        return replace(
-            self,
-            desired_speed=self.desired_speed.to(device),
-            time_gap=self.time_gap.to(device),
-            constants=self.constants.with_(**own),
-            at_bound=self.at_bound.to(device),
+        constants = vars(self.constants).items()
+        own = {name: value[index] for name, value in constants if isinstance(value, Tensor)}
+        return DriverPopulation(
+            self.desired_speed[index],
+            self.time_gap[index],
+            self.constants.with_(**own),
+            tuple(self.ids[place] for place in index.tolist()),
+            self.at_bound[index],
         )
 
     def summary(self) -> dict[str, float]:
@@ -94,10 +92,15 @@ class DriverPopulation:
             "share_at_bound": float(self.at_bound.double().mean()),
         }
 
-    def _own_constants(self) -> dict[str, Tensor]:
-        """The constants that differ between drivers."""
-        values = vars(self.constants)
-        return {name: value for name, value in values.items() if isinstance(value, Tensor)}
+    def parameters(self) -> dict[str, Tensor]:
+        """Return the five IDM parameters by name, each ``[drivers]``, float64."""
+        own = {"desired_speed": self.desired_speed, "time_gap": self.time_gap}
+        own |= {name: getattr(self.constants, name) for name in SHARED}
+        device = self.desired_speed.device
+        return {
+            name: torch.as_tensor(values, dtype=torch.float64, device=device).expand(len(self))
+            for name, values in own.items()
+        }
 
 
 def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.DataFrame:
@@ -131,7 +134,7 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
 
 
 def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
-    """Keep one calibration of a table that may hold two."""
+    """Keep the drivers of one calibration mode."""
     if "mode" not in frame.columns:
         return frame
     held = frame["mode"].unique().tolist()
@@ -142,7 +145,7 @@ def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
 
 
 def _check(frame: pd.DataFrame, name: str) -> None:
-    """Raise the first thing that is wrong with a driver table."""
+    """Raise a DataError for the first fault of a driver table."""
     if frame.empty:
         raise DataError(f"{name}: the table holds no drivers")
     missing = [column for column in COLUMNS.values() if column not in frame.columns]
@@ -151,16 +154,18 @@ def _check(frame: pd.DataFrame, name: str) -> None:
     for column in COLUMNS.values():
         if not pd.api.types.is_numeric_dtype(frame[column]):
             raise DataError(f"{name}: column {column!r} is not numeric")
-        values = frame[column].to_numpy(np.float64)
+        values = frame[column].to_numpy(np.float32)
         bad = ~(np.isfinite(values) & (values > 0.0))
         if bad.any():
             row = int(bad.argmax())
-            where = f"{name}: row {row}, column {column!r}"
-            raise DataError(f"{where}: must be a positive number, got {values[row]}")
+            raise DataError(
+                f"{name}: row {row}, column {column!r}: must be a positive number, "
+                f"got {frame[column].iloc[row]}"
+            )
 
 
 def bootstrap(path: str | Path | None = None, mode: str | None = None) -> DriverPopulation:
-    """The empirical joint distribution: the calibrated drivers themselves.
+    """Population of the calibrated drivers themselves, the empirical joint distribution.
 
     Args:
         path: table of calibrated drivers; None takes the shipped I-80 drivers.
@@ -174,7 +179,7 @@ def bootstrap(path: str | Path | None = None, mode: str | None = None) -> Driver
 
 
 def from_table(table: pd.DataFrame) -> DriverPopulation:
-    """Make a population of a checked driver table, one driver per row.
+    """Build a population from a driver table, one driver per row.
 
     Raises:
         DataError: if the table is not sound.
@@ -210,10 +215,8 @@ def _flags(table: pd.DataFrame) -> Tensor:
     """Which desired speeds lie on a bound, as calibrated, or by the default bounds."""
     if "desired_speed_at_bound" in table.columns:
         return torch.tensor(table["desired_speed_at_bound"].to_numpy(bool))
-    low, high = DEFAULT_BOUNDS["desired_speed"]
     values = table[COLUMNS["desired_speed"]].to_numpy(np.float64)
-    margin = BOUND_TOLERANCE * (high - low)
-    return torch.tensor((values <= low + margin) | (values >= high - margin))
+    return torch.tensor(at_bound(values, DEFAULT_BOUNDS["desired_speed"]))
 
 
 def kde(
@@ -221,10 +224,10 @@ def kde(
     drivers: int = 1000,
     seed: int = 0,
     bandwidth: float | None = None,
-    bounds: Mapping[str, Sequence[float]] | None = None,
+    bounds: Bounds | None = None,
     mode: str | None = None,
 ) -> DriverPopulation:
-    """Drivers resampled from a Gaussian kernel density of the joint distribution.
+    """Population drawn from a Gaussian kernel density estimate of the joint distribution.
 
     Args:
         path: table of calibrated drivers; None takes the shipped I-80 drivers.
@@ -264,7 +267,7 @@ def fixed(
     deceleration: float = 1.5,
     min_gap: float = 2.0,
 ) -> DriverPopulation:
-    """A population of one given driver.
+    """Population of one given driver.
 
     Args:
         desired_speed: v0 [m/s].
@@ -274,10 +277,8 @@ def fixed(
         min_gap: s0 [m].
 
     Raises:
-        ConfigError: if a parameter is not positive.
+        ConfigError: if a parameter is not positive and finite.
     """
-    if not (desired_speed > 0.0 and time_gap > 0.0):
-        raise ConfigError("fixed driver: desired_speed and time_gap must be positive")
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
         time_gap=torch.tensor([float(time_gap)]),

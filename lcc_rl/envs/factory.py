@@ -18,7 +18,7 @@ from lcc_rl.envs.inputs import load_inputs, string_of
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
 from lcc_rl.pieces import Piece, Places, StringMotion, TotalReward
 from lcc_rl.pieces.controllers import Population
 
@@ -85,15 +85,7 @@ def build_pieces(
         "nominal": nominal,
     }
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
-    leader = named.pop("leader", None)
-    if (leader is None) != string.ring:
-        raise ConfigError(
-            "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
-            f"scenario.road={scenario.road} and leader={leader}"
-        )
-    pieces: list[Piece] = []
-    if leader is not None:
-        pieces.append(build(leader, "scenario.pieces.leader", **resources))
+    pieces = _leader(scenario, named.pop("leader", None), resources)
     pieces += [Places(string), *_drivers(scenario, string, resources)]
     pieces.append(_motion(scenario, string, resources))
     pieces += [build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
@@ -106,6 +98,16 @@ def build_pieces(
     ]
     # The sum stays last, before collisions of the next step.
     return [*pieces, TotalReward(list(cfg.reward.terms), string)]
+
+
+def _leader(scenario: Any, node: Any, resources: dict[str, Any]) -> list[Piece]:
+    """Build the leader of an open road; a ring road has none."""
+    if (node is None) != (scenario.road == RING):
+        raise ConfigError(
+            "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
+            f"scenario.road={scenario.road} and leader={node}"
+        )
+    return [] if node is None else [build(node, "scenario.pieces.leader", **resources)]
 
 
 def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> list[Piece]:

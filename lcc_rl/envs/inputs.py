@@ -66,7 +66,8 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     scenario = cfg.scenario
     population = build(cfg.drivers, "drivers")
     if scenario.road == RING:
-        nobody = constant_profile(0.0, scenario.horizon, scenario.time_step, "ring")
+        names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
+        nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
         return Inputs(nobody, nobody, population)
     if cfg.get("leader") is not None:
         return _record_inputs(cfg, population)
@@ -81,10 +82,12 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
 
 
-def constant_profile(speed: float, horizon: int, time_step: float, name: str) -> Profiles:
-    """Return one profile at a constant speed [m/s], long enough for an episode."""
-    record = torch.full((max(2, horizon + 1),), speed)
-    return from_records([record], [name], [name], time_step)
+def constant_profiles(
+    speed: float, horizon: int, time_step: float, names: Sequence[str]
+) -> Profiles:
+    """Return profiles at a constant speed [m/s], long enough for an episode."""
+    records = [torch.full((max(2, horizon + 1),), speed) for _ in names]
+    return from_records(records, list(names), list(names), time_step)
 
 
 # Of the sweep that this process works on: its runs mostly differ in other things than the data.

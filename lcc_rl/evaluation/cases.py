@@ -14,7 +14,7 @@ from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.connected import COUNTERS, HYBRID
+from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
 
 WINDOWS = "windows"
 RECORDED = ("speed", "gap", "acceleration", "jerk", "speed_error", "leader_speed_error")

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 import torch
+from omegaconf import DictConfig
 from torch import Tensor
 
 from lcc_rl.config import require
@@ -84,31 +85,28 @@ def evaluate(
         ConfigError: if the batch size is not positive.
     """
     require(batch_size >= 1, f"evaluation.batch_size must be at least 1, got {batch_size}")
-    profiles, population = inputs.evaluation, inputs.population
-    count = len(population.time_gap)
+    profiles, count = inputs.evaluation, len(inputs.population.time_gap)
     profile, driver = pairs(len(profiles), count, drivers)
     kept = set(np.linspace(0, len(profile) - 1, max(sample_episodes, 1)).round().astype(int))
-    string = string_of(strategy.cfg)
-    time_step = strategy.cfg.scenario.time_step
+    cfg, time_step = any_leader(strategy.cfg), strategy.cfg.scenario.time_step
     episodes, steps = [], []
     for start in range(0, len(profile), batch_size):
-        part = slice(start, start + batch_size)
-        batch = len(profile[part])
-        env = build_env(any_leader(strategy.cfg), profiles, population, batch, 0, device, True)
-        given = reset_options(env, profile[part], driver[part], seed, count)
+        who = profile[start : start + batch_size], driver[start : start + batch_size]
+        env = build_env(cfg, profiles, inputs.population, len(who[0]), 0, device, True)
+        given = reset_options(env, *who, seed, count)
         record, alive = play(env, strategy.policy, given, [*KEYS, INDEX])
-        groups = grouped(record, string)
-        table = measure(groups, alive, time_step)
-        described = describe(strategy, profiles, population, profile[part], driver[part])
-        episodes.append(pd.concat([described, table], axis=1))
+        groups = grouped(record, string_of(cfg))
+        described = describe(strategy, profiles, inputs.population, *who)
+        table = pd.concat([described, measure(groups, alive, time_step)], axis=1)
+        episodes.append(table)
         if sample_episodes:
             inside = [index - start for index in sorted(kept) if 0 <= index - start < len(table)]
-            steps += list(sample(groups, alive, episodes[-1], inside, time_step))
+            steps += list(sample(groups, alive, table, inside, time_step))
     trace = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
     return pd.concat(episodes, ignore_index=True), trace
 
 
-def any_leader(cfg):  # type: ignore[no-untyped-def]
+def any_leader(cfg: DictConfig) -> DictConfig:
     """Return a configuration without the one record that its leader may be told to play.
 
     That record is one to train on: with other profiles at hand its number means nothing.

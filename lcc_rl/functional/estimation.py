@@ -12,6 +12,7 @@ plausible.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,26 +84,51 @@ def predict_and_update(
     Returns:
         Predicted acceleration, shape ``[*, 1]`` [m/s²], and the new belief.
     """
-    q, time_gap = belief.estimate[..., :1], belief.estimate[..., 1:]
-    variance_q, covariance, variance_t = belief.covariance.split(1, dim=-1)
+    model = _linearised(speed, gap, approach_rate, belief.estimate, constants)
+    measured = (speed_reached - speed) / time_step
+    informative = (speed_reached > 0.0) & (measured.abs() < constants.acceleration_limit)
+    return model.predicted, _updated(belief, model, measured, informative, measurement_error)
+
+
+class _Linear(NamedTuple):
+    """The IDM about a belief: the acceleration it predicts and its slopes by q and T."""
+
+    predicted: Tensor
+    slope_q: Tensor
+    slope_t: Tensor
+    curvature: Tensor
+
+
+def _linearised(
+    speed: Tensor, gap: Tensor, approach_rate: Tensor, estimate: Tensor, constants: IDMConstants
+) -> _Linear:
+    q, time_gap = estimate[..., :1], estimate[..., 1:]
     root = 2.0 * (constants.acceleration * constants.deceleration) ** 0.5
     inverse_gap = gap.clamp(min=constants.gap_floor).reciprocal()
     dynamic = (speed * (time_gap + approach_rate / root)).clamp(min=0.0)
     ratio = (constants.min_gap + dynamic) * inverse_gap
     free = power(speed / REFERENCE_SPEED, constants.exponent)
     predicted = limit(constants.acceleration * (1.0 - free * q - ratio * ratio), constants)
-    # Gradient of the model by (q, T); zero where T does not matter.
-    slope_q = -constants.acceleration * free
+    # The slope by T is zero where T does not matter.
     slope_t = (-2.0 * constants.acceleration) * ratio * (speed * inverse_gap) * (dynamic > 0.0)
-    measured = (speed_reached - speed) / time_step
-    informative = (speed_reached > 0.0) & (measured.abs() < constants.acceleration_limit)
+    curvature = constants.acceleration * (speed * inverse_gap).square()
+    return _Linear(predicted, -constants.acceleration * free, slope_t, curvature)
+
+
+def _updated(
+    belief: Belief, model: _Linear, measured: Tensor, informative: Tensor, measurement_error: float
+) -> Belief:
+    """Return the belief after one measured acceleration."""
+    q, time_gap = belief.estimate[..., :1], belief.estimate[..., 1:]
+    variance_q, covariance, variance_t = belief.covariance.split(1, dim=-1)
+    slope_q, slope_t = model.slope_q, model.slope_t
     spread_q = variance_q * slope_q + covariance * slope_t
     spread_t = covariance * slope_q + variance_t * slope_t
     # What the square of T adds to mean and variance of the model; exact for a Gaussian belief.
-    curvature = constants.acceleration * (speed * inverse_gap).square() * variance_t
+    curvature = model.curvature * variance_t
     total = slope_q * spread_q + slope_t * spread_t + 2.0 * curvature.square()
     weight = informative / (total + measurement_error**2)
-    surprise = (measured - predicted + curvature) * weight
+    surprise = (measured - model.predicted + curvature) * weight
     variance_q = variance_q - spread_q * spread_q * weight
     covariance = covariance - spread_q * spread_t * weight
     variance_t = variance_t - spread_t * spread_t * weight
@@ -113,7 +139,7 @@ def predict_and_update(
     time_gap = time_gap + covariance / variance_q * (bounded - q)
     estimate = torch.cat([bounded, time_gap.clamp(0.05, 10.0)], dim=-1)
     learned = torch.cat([variance_q, covariance, variance_t], dim=-1)
-    return predicted, Belief(estimate, learned)
+    return Belief(estimate, learned)
 
 
 class PopulationMean(torch.nn.Module):

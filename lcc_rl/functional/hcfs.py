@@ -143,16 +143,9 @@ def hybrid_decision(
         time_step: T [s].
         max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
     """
-    candidates = torch.stack([rule, learned])
-    free = candidates
-    if interval is not None:
-        candidates = candidates.clamp(*interval)
-    clamped = (candidates != free).any(0)
-    capped = torch.zeros_like(clamped)
-    if cap is not None:
-        bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
-        capped = (bounded != candidates).any(0)
-        candidates = bounded
+    candidates, clamped, capped = _bounded(
+        torch.stack([rule, learned]), interval, cap, max_acceleration
+    )
     rule, learned = candidates.unbind(0)
     earned = reward.one_step(speed, last_acceleration, candidates, leader_next, time_step)
     winner = (earned[1] > earned[0]).to(torch.int64)
@@ -163,3 +156,20 @@ def hybrid_decision(
     chosen = torch.where(winner.bool(), learned, rule)
     chosen = torch.where(switched, 0.5 * (rule + learned), chosen)
     return Decision(chosen, winner, switched, clamped, capped)
+
+
+def _bounded(
+    candidates: Tensor,
+    interval: tuple[Tensor, Tensor] | None,
+    cap: Tensor | None,
+    max_acceleration: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the candidates within jerk bound and safe cap, and whether either cut one (step 1)."""
+    free = candidates
+    if interval is not None:
+        candidates = candidates.clamp(*interval)
+    clamped = (candidates != free).any(0)
+    if cap is None:
+        return candidates, clamped, torch.zeros_like(clamped)
+    bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
+    return bounded, clamped, (bounded != candidates).any(0)

@@ -1,1 +1,1 @@
-"""Files written whole or not at all."""
+"""Reading and writing of result files."""

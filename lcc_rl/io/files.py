@@ -1,4 +1,4 @@
-"""File room: every file is written whole or not at all, and says what wrote it."""
+"""Atomic writing and checked reading of parquet tables and tensors."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ import pyarrow.parquet as pq
 import torch
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
-# From a version to the next: whoever raises SCHEMA_VERSION adds what older tables need.
+# Changes of a table from one schema version to the next, by the older version.
 MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
 PROCESSOR = "lcc_rl.processor"  # in a table's metadata
 
@@ -30,11 +31,11 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
 
     Args:
         path: the final path; its folder is made where it does not exist.
-        durable: survive a power cut, too; False for what is cheap to lose.
+        durable: flush to disk, so that the file survives a power cut.
 
     Raises:
-        ResultsError: if the file cannot be written (disk full, folder read-only …); what stood
-            at ``path`` before is untouched and no temporary file stays behind.
+        ResultsError: if the file cannot be written (disk full, folder read-only …); a former
+            file at ``path`` is kept and the temporary one removed.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -55,7 +56,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename in a folder survive a power cut, where the system lets folders be synced."""
+    """Flush a rename in a folder to disk, where the system supports it."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -65,7 +66,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of writers that were killed; none may be writing now."""
+    """Remove temporary files of killed writers; call it only while no writer is active."""
     for path in folder.glob(".*.tmp"):
         with suppress(OSError):
             path.unlink()
@@ -74,9 +75,9 @@ def remove_leftovers(folder: Path) -> None:
 def write_parquet(
     frame: pd.DataFrame, path: str | Path, metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write a table atomically; its metadata name schema, package, torch and processor.
+    """Write a table atomically, with schema, package, torch and processor in its metadata.
 
-    Trainings differ between kinds of processor by as much as between seeds, so a table says which.
+    The processor is recorded because trainings differ between processors as between seeds.
 
     Args:
         frame: the table; its index is not kept.
@@ -86,8 +87,6 @@ def write_parquet(
     Raises:
         ResultsError: if the file cannot be written.
     """
-    from lcc_rl import __version__
-
     own = {
         "lcc_rl.schema": SCHEMA_VERSION,
         "lcc_rl.version": __version__,
@@ -119,7 +118,7 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
         ResultsError: if the file is missing, damaged or of a newer schema.
     """
     table = _read(path, partial(pq.read_table, page_checksum_verification=True))
-    # Tables from elsewhere say nothing of a schema: they are read as they are.
+    # Tables of other origin have no schema version and are read unchanged.
     version = (table.schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
     if not version.isdigit() or int(version) > int(SCHEMA_VERSION):
         raise ResultsError(f"{path}: schema version {version}; this package reads {SCHEMA_VERSION}")
@@ -127,7 +126,7 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
 
 
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
-    """Read a parquet file, or say in one line why that cannot be."""
+    """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
     if not path.is_file():
         raise ResultsError(f"{path}: no such file")
@@ -138,7 +137,7 @@ def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
 
 
 def migrated(frame: pd.DataFrame, version: int) -> pd.DataFrame:
-    """Bring a table of an older schema up to the present one, a version at a time."""
+    """Convert a table of an older schema to the present one, version by version."""
     for old in range(version, int(SCHEMA_VERSION)):
         frame = MIGRATIONS[old](frame)
     return frame
@@ -161,7 +160,7 @@ def write_torch(content: Any, path: str | Path) -> None:
 
 
 def read_torch(path: str | Path) -> Any:
-    """Read tensors; code in the file is never run.
+    """Read tensors without running code in the file.
 
     Raises:
         ResultsError: if the file is missing, damaged or holds anything but tensors and plain
@@ -182,7 +181,7 @@ def read_torch(path: str | Path) -> Any:
 
 
 def _check_sums(path: Path) -> None:
-    """Compare every part of a weights file with its checksum, which torch itself leaves out."""
+    """Check every part of a weights file against its checksum, which torch does not."""
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:

@@ -3,10 +3,11 @@
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
 from lcc_rl.pieces.cbf import CBFFilter
-from lcc_rl.pieces.connected import CACC, HCFS, Communication, DeadBeat
+from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
 from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, TimeGap, TimeToCollision
+from lcc_rl.pieces.hybrid import HCFS
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.observation import Observation

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.functional.cacc import (
@@ -22,22 +19,14 @@ from lcc_rl.functional.cacc import (
     next_leader_speed,
     platoon_errors,
 )
-from lcc_rl.functional.hcfs import (
-    Decision,
-    PlatoonReward,
-    hybrid_decision,
-    jerk_interval,
-    safe_acceleration,
-)
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import entries_ahead, gather
-from lcc_rl.pieces.base import Feature, Key
+from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import LEADER, VEHICLES
 
 ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error")
 HEARD = (*ERRORS, "received_gap", "leader_speed", "leader_acceleration")
-HYBRID, COUNTERS = "hybrid", ("switches", "clamps", "cap_interventions")
 
 
 class Communication(Feature):
@@ -227,134 +216,3 @@ def check_leader(lookahead: str, controller: Controller) -> str:
             f"{', '.join(controller.string.names)}; say causal or hold"
         )
     return check_lookahead(lookahead, where)
-
-
-class HCFS(Controller):
-    """The hybrid car-following strategy: a rule or the action, the better of both each step.
-
-    Composes two candidates by H12–H14, see :func:`lcc_rl.functional.hcfs.hybrid_decision`: the
-    command of a rule and the action of a policy. Writes under ``"hybrid"``, ``[*batch, n, 1]``,
-    int64: ``winner`` (0 rule, 1 policy; −1 at reset) and since the start of the episode the
-    numbers of ``switches``, ``clamps`` (the jerk bound cut a candidate) and
-    ``cap_interventions``.
-
-    Args:
-        rule: the controller whose command is one candidate; of the same role.
-        time_step: duration of a step T [s].
-        max_acceleration: acceleration of action 1 [m/s²].
-        jerk_bound: J [m/s³]; the paper's 2 a_max/T = 30 never binds.
-        lookahead: how the leader's next speed is predicted: ``"causal"`` by v0 + a0 T, ``"hold"``
-            by v0; ``"oracle"`` knows it and serves as an upper bound only.
-        clamp: hold the candidates within the jerk bound; false is the literal rule, which
-            violates it.
-        safe_cap: hold the result below what braking allows; false is the literal rule, which in
-            long runs drives through the vehicle ahead: the reward has no spacing term.
-        braking: b of the safe cap [m/s²].
-        margin: gap that it keeps at standstill [m].
-        velocity_weight, speed_scale, jerk_weight, jerk_scale: of the reward compared, see
-            :class:`lcc_rl.functional.hcfs.PlatoonReward`.
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is unknown or out of range.
-    """
-
-    def __init__(
-        self,
-        rule: Controller,
-        time_step: float,
-        max_acceleration: float = 3.0,
-        jerk_bound: float = 30.0,
-        lookahead: str = "causal",
-        clamp: bool = True,
-        safe_cap: bool = True,
-        braking: float = 3.0,
-        margin: float = 0.5,
-        velocity_weight: float = 10.0,
-        speed_scale: float = 27.1,
-        jerk_weight: float = 0.036,
-        jerk_scale: float = 30.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        where = f"scenario.controllers.{role}"
-        require_positive(where, max_acceleration=max_acceleration, jerk_bound=jerk_bound)
-        if not 0 < braking <= max_acceleration:
-            raise ConfigError(
-                f"{where}.braking must lie in (0, {max_acceleration}], which is what the vehicles "
-                f"can do, got {braking}"
-            )
-        if not margin >= 0:
-            raise ConfigError(f"{where}.margin must not be negative, got {margin}")
-        own = [f"self.{name}" for name in ("speed", "acceleration", "received_gap", "speed_error")]
-        state = [(HYBRID, name) for name in ("winner", *COUNTERS)]
-        super().__init__(
-            string,
-            role,
-            [
-                f"{role}.action",
-                *own,
-                *leader_names(lookahead),
-                *(".".join(key) for key in state),
-                *rule.names,
-            ],
-            state,
-        )
-        self.rule, self.lookahead = rule, check_leader(lookahead, self)
-        self.time_step, self.max_acceleration = time_step, max_acceleration
-        self.jerk_bound, self.clamp, self.safe_cap = jerk_bound, clamp, safe_cap
-        self.braking, self.margin = braking, margin
-        self.reward = PlatoonReward(velocity_weight, speed_scale, jerk_weight, jerk_scale)
-
-    def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
-        """Return the commands, the winners and the counters."""
-        own, leader, (winner, *counts), rule = (
-            entries[:4],
-            entries[4:7],
-            entries[7:11],
-            entries[11:],
-        )
-        decision = self.decide(action, own, leader, winner, self.rule.command(*rule))
-        flags = (decision.switched, decision.clamped, decision.capped)
-        counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
-        return (decision.acceleration, decision.winner, *counted)
-
-    def decide(
-        self,
-        action: Tensor,
-        own: tuple[Tensor, ...],
-        leader: tuple[Tensor, ...],
-        last_winner: Tensor,
-        rule: Tensor,
-    ) -> Decision:
-        """Return the decision and what led to it."""
-        speed, last, gap, speed_error = own
-        interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
-        cap = safe_acceleration(
-            gap, speed, speed + speed_error, self.time_step, self.braking, self.margin
-        )
-        return hybrid_decision(
-            rule,
-            action.clamp(-1.0, 1.0) * self.max_acceleration,
-            speed,
-            last,
-            last_winner,
-            next_leader_speed(leader, self.lookahead, self.time_step),
-            interval if self.clamp else None,
-            cap if self.safe_cap else None,
-            self.reward,
-            self.time_step,
-            self.max_acceleration,
-        )
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        shape = (*batch, *self.event_shape)
-        for key in self.targets[1:]:
-            specs[key] = Unbounded(shape=shape, dtype=torch.int64, device=device)
-        return specs
-
-    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        super().begin(given, start)
-        winner = start.get((HYBRID, "winner"))
-        start.set((HYBRID, "winner"), torch.full_like(winner, -1))

@@ -23,9 +23,9 @@ KINDS = ("filtered", "stacked")
 class LeaderPreview(Feature):
     """The leader's speed some seconds ahead, as a message from further down the road would give.
 
-    Writes ``("preview", "speed")`` [m/s], ``[*batch, 1, horizons]``, one row for all. Beyond the end of a record its
-    last speed stands; a window cut from a longer record goes on in it. Reading the record is what
-    makes it an upper bound: no real message knows this much.
+    Writes ``("preview", "speed")`` [m/s], ``[*batch, 1, horizons]``: one row for all vehicles.
+    Beyond the end of a record its last speed stands; a window cut from a longer record continues
+    in it. Reading the record makes this an upper bound: no real message knows this much.
 
     Args:
         profiles: the leader's records.

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.data.profiles import Profiles
+from lcc_rl.data.profiles import Profiles, from_trajectories
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import choose, stream_id, uniform
 from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key
@@ -112,7 +112,7 @@ class NGSIMLeader(StepTransform):
         Raises:
             DataError: naming the file, column or row at fault.
         """
-        return cls(from_trajectories(path, time_step), horizon, time_step, **settings)  # noqa
+        return cls(from_trajectories(path, time_step), horizon, time_step, **settings)
 
     def compute(
         self, profile: Tensor, first: Tensor, speed: Tensor, step: Tensor, seed: Tensor

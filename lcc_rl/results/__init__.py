@@ -1,4 +1,4 @@
-"""Result room: parquet files, tables and figures."""
+"""Results of runs: parquet files, tables, figures and the page."""
 
 from lcc_rl.results.runs import load
 

@@ -1,4 +1,4 @@
-"""Result room: figures of a calibration, counterparts of Figs. 4 and 5 of the ALCC paper."""
+"""Figures of a calibration, counterparts of Figs. 4 and 5 of the ALCC paper."""
 
 from __future__ import annotations
 
@@ -29,9 +29,6 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
     Args:
         drivers: calibrated drivers of one mode or both.
 
-    Returns:
-        The figure; nothing is drawn to a screen.
-
     Raises:
         DataError: if the table is empty or lacks a column.
     """
@@ -61,10 +58,7 @@ def joint_figure(drivers: pd.DataFrame, mode: str | None = None) -> Figure:
 
     Args:
         drivers: calibrated drivers of one mode or both.
-        mode: which mode to draw; by default local where the table has it.
-
-    Returns:
-        The figure; nothing is drawn to a screen.
+        mode: the mode; by default local where the table has it.
 
     Raises:
         DataError: if the table is empty, lacks a column or has no such mode.
@@ -107,7 +101,7 @@ def _modes(drivers: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
-    """One box per mode; a parameter held constant becomes a line."""
+    """Draw a box per mode, or a line where the parameter was held constant."""
     _plain(axis)
     for place, (mode, series) in enumerate(values.items()):
         colour = COLOURS.get(mode, INK)
@@ -157,7 +151,7 @@ def _say_bound(axis: Axes, name: str, modes: dict[str, pd.DataFrame]) -> None:
 def _scatter(
     axis: Axes, speed: np.ndarray, gap: np.ndarray, bound: np.ndarray, colour: str
 ) -> None:
-    """Every driver a dot; those whose v0 lies on a bound hollow, since it is not identified."""
+    """Draw a dot for every driver, hollow where v0 lies on a bound and is not identified."""
     _plain(axis)
     axis.scatter(
         speed[~bound],

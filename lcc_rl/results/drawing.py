@@ -1,4 +1,4 @@
-"""Drawing room: what every figure of the package shares."""
+"""Creating, styling and saving figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def unbox(axis: Axes) -> None:
-    """Take away the lines of the frame that carry no information."""
+    """Remove the top and right line of the frame."""
     axis.spines[["top", "right"]].set_visible(False)
 
 

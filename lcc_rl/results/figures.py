@@ -1,4 +1,4 @@
-"""Figures of a study, each from parquet alone (ALCC Figs. 6, 7, 9 and 10)."""
+"""Figures of trainings and evaluations of a controlled car (ALCC Figs. 6, 7, 9 and 10)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.intervals import Estimate, band, share_saved
-from lcc_rl.results.tables import BASELINES, paired, savings
+from lcc_rl.results.tables import BASELINES, driver_savings, savings
 
 # Distinct without colour vision and in grey.
 COLOURS = {
@@ -37,22 +37,17 @@ def colour(strategy: str) -> str:
 
 
 def style(axis: Axes, xlabel: str, ylabel: str) -> None:
-    """Label an axis and take away what carries no information."""
+    """Label an axis and remove the top and right line of its frame."""
     axis.set_xlabel(xlabel)
     axis.set_ylabel(ylabel)
     unbox(axis)
 
 
 def learning_curve(training: pd.DataFrame) -> Figure:
-    """Episode reward over episodes, with a band (Fig. 6).
+    """Episode reward over episodes, see :func:`draw_curve` (Fig. 6).
 
     Args:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
-
-    Returns:
-        With several seeds of a variant the line is their mean and the band its 95 % bootstrap
-        interval; with a single one the rolling mean and the 5th to 95th percentile of the same
-        window.
     """
     figure = new_figure(7.0, 4.0)
     axis = figure.subplots()
@@ -61,7 +56,7 @@ def learning_curve(training: pd.DataFrame) -> Figure:
         mean, label = draw_curve(axis, rows, "episode_reward", str(variant))
         axis.lines[-1].set_label(label)
         floor = min(floor, float(mean.iloc[len(mean) // 5 :].min()))
-    # The first, random episodes are far below everything else and would set the scale.
+    # The first, random episodes would set the scale.
     axis.set_ylim(bottom=1.6 * floor - 1.0)
     style(axis, "training episodes", "mean reward per episode")
     axis.legend(frameon=False)
@@ -71,12 +66,14 @@ def learning_curve(training: pd.DataFrame) -> Figure:
 
 
 def draw_curve(axis: Axes, rows: pd.DataFrame, column: str, variant: str) -> tuple[pd.Series, str]:
-    """Draw the rolling mean of one variant's column over its seeds, with its band.
+    """Draw the rolling mean of one variant's column with a band.
+
+    Of several seeds the line is the mean and the band its 95 % bootstrap interval, as far as all
+    seeds have trained; of one seed the band spans the 5th to 95th percentile of the window.
 
     Returns:
-        The line that was drawn, and what its label should say of the seeds.
+        The line, and a label with the number of seeds.
     """
-    # Seeds of different length are compared as far as all of them went.
     curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
     smooth = curves.rolling(WINDOW, min_periods=1)
     line = smooth.mean().mean(axis=1)
@@ -115,7 +112,7 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 
 def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
-    """One episode's speeds, and what each strategy's two cars draw: the study at a glance."""
+    """Speeds of one episode, and the mean energies of both cars by strategy."""
     figure = new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     rows = _one_episode(steps, strategy)
@@ -146,7 +143,7 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
-    """Return the time series of a strategy's liveliest sample episode."""
+    """Return the sample episode of a strategy whose leader's speed varies most."""
     rows = steps[steps["strategy"] == strategy]
     if "training_seed" in rows and rows["training_seed"].notna().any():
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]
@@ -154,7 +151,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     spread = episodes.transform("std")
     first = rows.iloc[int(spread.to_numpy().argmax())]
     rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
-    # Of a string of followers the nearest one is shown.
+    # Of several followers the first is shown.
     nearest = {name: f"hdv{name[4:]}" for name in rows.columns if name.startswith("hdv1_")}
     return rows.rename(columns=nearest) if "hdv_speed" not in rows else rows
 
@@ -187,8 +184,7 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
 
 def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
     """Saving of the total energy per driver, strategy against baseline (Fig. 10)."""
-    by_driver = paired(episodes, "total_energy_kj").groupby("driver_id").mean()
-    saving = share_saved(by_driver[strategy], by_driver[baseline])
+    saving = driver_savings(episodes, "total_energy_kj", strategy, baseline)
     figure = new_figure(7.0, 3.8)
     axis = figure.subplots()
     label = f"total energy saved by {strategy}\nagainst {baseline} [%]"
@@ -204,7 +200,7 @@ def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> 
 
 
 def _with_interval(found: Estimate) -> str:
-    """Write a share and how sure it is."""
+    """Return a share and its interval, in words."""
     if np.isnan(found.low):
         return f"{100 * found.value:+.1f} % (1 training seed: no interval)"
     bounds = f"{100 * found.low:+.1f} … {100 * found.high:+.1f} %"
@@ -229,10 +225,10 @@ def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
 
 
 def write_study_figures(folder: str | Path) -> list[Path]:
-    """Draw every figure that the parquet files of an evaluation allow.
+    """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
-        folder: holds episodes.parquet and steps.parquet; figures go to ``figures`` in it.
+        folder: holds episodes.parquet and steps.parquet.
 
     Returns:
         The figures' paths.

@@ -1,4 +1,4 @@
-"""Interval room: how sure a mean over training seeds is, by bootstrap."""
+"""Bootstrap confidence intervals of means over training seeds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEED = 0  # of the resampling: the same rows give the same interval
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % interval over seeds; the bounds are missing where there is one seed.
+    """A value with its 95 % interval over seeds; of one seed the bounds are missing.
 
     Args:
         value: the estimate.
@@ -38,38 +38,28 @@ class Estimate:
 
 
 def mean(values: ArrayLike) -> Estimate:
-    """Estimate the mean over seeds.
-
-    Args:
-        values: one number per seed.
-
-    Returns:
-        The mean with its percentile-bootstrap interval.
-    """
+    """Return the mean of one number per seed with its percentile-bootstrap interval."""
     numbers = _numbers(values)
     if len(numbers) < 2:
         return Estimate(_mean(numbers), np.nan, np.nan)
-    low, high = _interval([numbers], np.mean)
-    return Estimate(_mean(numbers), low, high)
+    low, high = _bounds([numbers], np.mean)
+    return Estimate(_mean(numbers), float(low), float(high))
 
 
 def share_saved(value: Any, baseline: Any) -> Any:
-    """Return the share of a baseline's energy that is saved.
-
-    Positive where less is drawn, also where the baseline itself gains energy (by recuperation).
-    """
+    """Return the saved share of a baseline's energy, also where that is negative (recuperation)."""
     return (baseline - value) / abs(baseline)
 
 
 def saving(values: ArrayLike, baseline: ArrayLike, exact: bool = False) -> Estimate:
-    """Estimate the share saved against a baseline, of the means, see :func:`share_saved`.
+    """Return the share saved by the mean against that of a baseline, see :func:`share_saved`.
 
-    Seeds of two trainings have nothing in common, so each side is resampled on its own.
+    The seeds of two trainings are independent, so both sides are resampled independently.
 
     Args:
         values: mean energy of each seed.
         baseline: mean energy of each seed of the baseline.
-        exact: the baseline was not trained (a human driver): its one value is known.
+        exact: the baseline was not trained (a human driver): its value is known exactly.
 
     Returns:
         The share with its interval; without one where a trained side has a single seed.
@@ -79,13 +69,12 @@ def saving(values: ArrayLike, baseline: ArrayLike, exact: bool = False) -> Estim
     if len(own) < 2 or (len(other) < 2 and not exact):
         return Estimate(value, np.nan, np.nan)
     if exact:
-        low, high = _interval([own], lambda a, axis: share_saved(np.mean(a, axis), _mean(other)))
+        low, high = _bounds([own], lambda a, axis: share_saved(np.mean(a, axis), _mean(other)))
     else:
-        low, high = _interval(
-            [own, other],
-            lambda a, b, axis: share_saved(np.mean(a, axis), np.mean(b, axis)),
+        low, high = _bounds(
+            [own, other], lambda a, b, axis: share_saved(np.mean(a, axis), np.mean(b, axis))
         )
-    return Estimate(value, low, high)
+    return Estimate(value, float(low), float(high))
 
 
 def band(curves: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -97,30 +86,23 @@ def band(curves: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
     Returns:
         Lower and upper bound, each ``[points]``.
     """
+    return _bounds([curves], np.mean, RESAMPLES // 9, axis=1)
+
+
+def _bounds(
+    samples: list[NDArray[np.float64]], statistic: object, resamples: int = RESAMPLES, axis: int = 0
+) -> tuple[Any, Any]:
     found = bootstrap(
-        (curves,),
-        np.mean,
-        axis=1,
+        samples,
+        statistic,
+        axis=axis,
         vectorized=True,
-        n_resamples=RESAMPLES // 9,
+        n_resamples=resamples,
         confidence_level=CONFIDENCE,
         method="percentile",
         random_state=np.random.default_rng(SEED),
     )
     return found.confidence_interval.low, found.confidence_interval.high
-
-
-def _interval(samples: list[NDArray[np.float64]], statistic: object) -> tuple[float, float]:
-    found = bootstrap(
-        samples,
-        statistic,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        random_state=np.random.default_rng(SEED),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
 def _numbers(values: ArrayLike) -> NDArray[np.float64]:

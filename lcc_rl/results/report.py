@@ -1,4 +1,4 @@
-"""Report room: one self-contained page from text, tables and figures; no scripts, no network."""
+"""One self-contained HTML page from text, tables and figures, without scripts or network."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ summary { cursor: pointer; color: var(--accent); }
 pre { font-size: .8rem; line-height: 1.4; background: var(--band); padding: .8rem;
   overflow-x: auto; border-radius: 4px; }
 """
-# Says to the browser itself that nothing may be fetched and nothing may run.
+# The browser may fetch and run nothing.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
@@ -79,7 +79,7 @@ class Section:
 
 
 def write_report(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
-    """Write ``report.html``: everything inside it, nothing fetched, nothing run.
+    """Write ``report.html`` with all of its tables and figures inside.
 
     Args:
         folder: where the page goes.
@@ -114,15 +114,17 @@ def made(
     commands: Sequence[str],
     details: Sequence[tuple[str, str]] = (),
     runs: Iterable[Path] = (),
+    more: str = "",
 ) -> Section:
-    """Return the section that says how a study was made.
+    """Return the section about how a study was made.
 
     Args:
-        commands: what was typed, oldest first, with dates where known.
+        commands: the commands, oldest first, with dates where known.
         details: title and text of configurations and notes, folded away.
-        runs: a table of each training, which says where it ran.
+        runs: a parquet file of each training; its metadata name the processor.
+        more: further paragraphs.
     """
-    rows = [("lcc_rl" if name == "lcc_rl" else name, version(name)) for name in PACKAGES]
+    rows = [(name, version(name)) for name in PACKAGES]
     rows += [("Python", platform.python_version()), ("machine", platform.machine())]
     written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"This page was written on {written} from parquet files alone."
@@ -131,14 +133,9 @@ def made(
     if places:
         counted = (f"{place} ({count})" for place, count in places.most_common())
         text += f" Its trainings ran on: {', '.join(counted)}."
-    return Section(
-        "How it was made",
-        text,
-        tables=[
-            ("Versions that wrote this page", pd.DataFrame(rows, columns=["package", "version"]))
-        ],
-        details=[*listing, *details],
-    )
+    versions = pd.DataFrame(rows, columns=["package", "version"])
+    tables = [("Versions that wrote this page", versions)]
+    return Section("How it was made", text + more, tables, details=[*listing, *details])
 
 
 def _section(number: int, section: Section) -> str:
@@ -170,7 +167,7 @@ def _figure(caption: str, path: Path) -> str:
 
 
 def _smaller(png: bytes) -> bytes:
-    """Encode an image anew, every pixel as it is, in a third of the space."""
+    """Encode an image as lossless WebP, a third of the size."""
     buffer = BytesIO()
     with Image.open(BytesIO(png)) as image:
         image.save(buffer, "WEBP", lossless=True, exact=True)
@@ -217,7 +214,7 @@ def _is_number(values: pd.Series) -> bool:
 
 
 def _column(frame: pd.DataFrame, name: str) -> list[str]:
-    """Write the cells of a column, with its interval where it has one."""
+    """Format the cells of a column, with its interval where it has one."""
     values = frame[name]
     places = _places(values)
     cells = [_cell(value, places) for value in values]
@@ -231,7 +228,7 @@ def _column(frame: pd.DataFrame, name: str) -> list[str]:
 
 
 def _places(values: pd.Series) -> int:
-    """Decimals that give a column about four significant digits."""
+    """Return the decimals that give a column about four significant digits."""
     if not pd.api.types.is_float_dtype(values):
         return 0
     numbers = values.to_numpy(float)

@@ -1,4 +1,4 @@
-"""Run folders: what a run leaves behind, and how many runs become one table."""
+"""Files of a run folder: configuration, policy, and tables of many runs as one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import TARGET, config_hash, find_target, plain
+from lcc_rl.config import TARGET, find_target, plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.files import atomic_path, read_parquet, read_torch, write_torch
 
@@ -19,47 +19,10 @@ CONFIG = "config.yaml"
 PRETRAINED = "pretrained"
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
-# The rooms whose classes a stored configuration may name.
-REGISTRY = tuple(
-    f"lcc_rl.{room}"
-    for room in (
-        "agents",
-        "data",
-        "drivers",
-        "evaluation",
-        "functional",
-        "pieces",
-        "policies",
-        "runs.loggers",
-        "synthetic",
-    )
-)
+# Packages whose classes a stored configuration may name.
+ROOMS = "agents data drivers evaluation functional pieces policies runs.loggers synthetic"
+REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
-# Settings that say where and how to run, not what: they do not change any row.
-NOT_IDENTITY = (
-    "resume",
-    "compare",
-    "jobs",
-    "sweep",
-    "objective",
-    "logger",
-    "trust",
-    "training.keep_every",
-)
-
-
-def identity(cfg: DictConfig) -> str:
-    """Return the hash of everything in a configuration that determines the results."""
-    content = plain(cfg)
-    for key in NOT_IDENTITY:
-        *path, last = key.split(".")
-        node = content
-        for part in path:
-            node = node.get(part) or {}
-        node.pop(last, None)
-    if content.get("policy") is None:  # of use only where there is one
-        content.pop("policy", None)
-    return config_hash(content)
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
@@ -73,7 +36,7 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:
 
     Args:
         folder: the run's folder.
-        trust: modules outside this package that it may name, see :func:`check_targets`.
+        trust: modules outside this package that it may name.
 
     Raises:
         ConfigError: if the folder holds no run.
@@ -95,7 +58,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     Raises:
         ResultsError: if it is damaged.
     """
-    # The C loader reads a hundred runs in a second, OmegaConf's own in five.
+    # The C loader is five times as fast as OmegaConf's.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         content = yaml.load(path.read_text(), Loader=loader)  # safe: plain values only
@@ -107,7 +70,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None:
-    """Write a policy: its weights and, as text, the configuration it was trained with."""
+    """Write a policy's weights and, as text, the configuration of its training."""
     write_torch({"weights": dict(weights), "config": OmegaConf.to_yaml(plain(cfg))}, path)
 
 
@@ -131,13 +94,13 @@ def pretrained_path(variant: str) -> Path:
 def load_policy(
     path: str | Path, variant: str = "", trust: Sequence[str] = ()
 ) -> tuple[dict[str, Any], DictConfig]:
-    """Read a policy file, or that of a run folder; code in it is never run.
+    """Read a policy file without running code from it.
 
     Args:
-        path: the file or the folder; ``"pretrained"`` for the policy that ships for ``variant``,
-            ``"pretrained/reference"`` for that of another one.
-        variant: variant of the study at hand.
-        trust: modules outside this package that it may name, see :func:`check_targets`.
+        path: the file or a run folder; ``"pretrained"`` for the policy that ships for
+            ``variant``, ``"pretrained/reference"`` for that of another one.
+        variant: name of a variant.
+        trust: modules outside this package that it may name.
 
     Returns:
         The weights and the configuration.
@@ -165,17 +128,17 @@ def load_policy(
 
 
 def check_targets(cfg: DictConfig, where: str, trust: Sequence[str] = ()) -> None:
-    """Refuse a configuration from a file that names code outside this package's registry.
+    """Check that a stored configuration names no code outside :data:`REGISTRY`.
 
-    Building such a node would import and call whatever it names.
+    Building a node of it imports and calls what it names.
 
     Args:
         cfg: the configuration.
         where: the file it comes from, for the message.
-        trust: modules of the user's own that may be named, e.g. ``["mine"]``.
+        trust: further modules that may be named, e.g. ``["mine"]``.
 
     Raises:
-        ResultsError: naming the target, or the reference that has no place in a stored file.
+        ResultsError: naming the target, or a reference instead of a value.
     """
     content = cast(Mapping[str, Any], OmegaConf.to_container(cfg, resolve=False))
     for key, value in flatten(content):
@@ -190,17 +153,17 @@ def check_targets(cfg: DictConfig, where: str, trust: Sequence[str] = ()) -> Non
 
 
 def is_registered(target: str, where: str, trust: Sequence[str] = ()) -> bool:
-    """Whether a target, named in a file, is defined in a room of this package or is trusted.
+    """Whether a target is defined in :data:`REGISTRY` or in a trusted module.
 
     Raises:
-        ResultsError: if there is no such thing in a room of this package.
+        ResultsError: if a module of the registry has no such target.
     """
     module = target.rpartition(".")[0]
     if module in trust:
         return True
     if not module.startswith(REGISTRY):
         return False
-    # A room also holds what it imports, which is not its own: import_module, for one.
+    # A module also holds what it imports, such as import_module.
     try:
         found = find_target(target, where)
     except ConfigError as error:

@@ -1,4 +1,4 @@
-"""Stream figure room: leaders of two sets of episodes side by side."""
+"""Figures that compare the leaders of two sets of trajectories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of the platoon study, each from parquet alone (HCFS Figs. 4–12)."""
+"""Speeds, jerks and switching of a platoon's followers over time (HCFS Figs. 4–12)."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.runs import load_config
 
-# The three of the paper come first; the others stand in the tables.
-SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")
+SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
 NEAR, FAR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
 LEADER, BOUND = "#222222", "#b00020"
-PARTS = ("#e8e8e8", "#0072b2")
+PARENTS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
 
 
 def hue(follower: int, followers: int) -> tuple[float, ...]:
-    """Return the colour of a follower: from blue, the first, to orange, the last."""
+    """Return the colour of a follower, from blue (the first) to orange (the last)."""
     share = (follower - 1) / max(followers - 1, 1)
     return tuple((1.0 - share) * NEAR + share * FAR)
 
 
 def shown(steps: pd.DataFrame) -> list[str]:
-    """Return the strategies that figures show, of those there are; all where none is known."""
+    """Return the strategies of :data:`SHOWN` that there are; all where there is none of them."""
     names = list(dict.fromkeys(steps["strategy"]))
     return [name for name in SHOWN if name in names] or names
 
@@ -78,7 +78,13 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
 
 
 def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
-    """Which of its two parents drives each follower at each moment (Figs. 6, 9, 12)."""
+    """The controller that drives each follower over time, CACC or DDPG (Figs. 6, 9, 12).
+
+    Args:
+        steps: rows of steps.parquet; ``winner`` is 0 for CACC and 1 for DDPG.
+        case: name of the case.
+        strategy: name of a hybrid strategy.
+    """
     rows = steps[(steps["case"] == case) & (steps["strategy"] == strategy)]
     rows = rows[rows["follower"] > 0]
     raster = rows.pivot_table(index="follower", columns="time_s", values="winner")
@@ -87,10 +93,10 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     step = float(raster.columns[0])
     edges = np.append(raster.columns.to_numpy(float) - step, raster.columns[-1])
     rims = np.arange(len(raster) + 1) + 0.5
-    for value, colour in enumerate(PARTS):
-        mask = np.where(raster.to_numpy() == value, 1.0, np.nan)
-        axis.pcolormesh(edges, rims, mask, color=colour, edgecolors="none")
-        axis.plot([], [], "s", color=colour, label=("CACC", "DDPG")[value])
+    colours = ListedColormap(list(PARENTS.values()))
+    axis.pcolormesh(edges, rims, raster.to_numpy(), cmap=colours, vmin=0.0, vmax=1.0)
+    for name, colour in PARENTS.items():
+        axis.plot([], [], "s", color=colour, label=name)
     axis.set_yticks(raster.index)
     axis.set_xlabel("time [s]")
     axis.set_ylabel("follower")
@@ -102,14 +108,14 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
 
 
 def write_platoon_figures(folder: str | Path, target: Path | None = None) -> list[Path]:
-    """Draw every figure that an evaluation allows: three per case.
+    """Draw the figures of every case of an evaluation.
 
     Args:
         folder: holds config.yaml and steps.parquet.
-        target: where figures go; ``figures`` in the folder by default.
+        target: folder of the figures; ``figures`` in the first one by default.
 
     Returns:
-        The figures' paths, in the paper's order.
+        The figures' paths.
 
     Raises:
         ResultsError: if a table is missing or a figure cannot be written.

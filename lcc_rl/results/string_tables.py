@@ -1,8 +1,6 @@
-"""Tables of the platoon study, from the rows of episodes.parquet (HCFS Tables IV–VI)."""
+"""Tables of tracking error, jerk and reward of a platoon, from the rows of episodes.parquet."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -16,19 +14,18 @@ COUNTS = ("switches", "clamps", "cap_interventions")
 
 
 def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
-    """Summarise every strategy in one case, with the columns of the paper's Tables IV–VI.
+    """Summarise every strategy in one case, with the columns of Tables IV–VI of the HCFS paper.
 
     Args:
         episodes: rows of one or more evaluations, one per strategy, run and follower.
         case: name of the case; of ``"windows"`` the sums are means over the windows.
 
     Returns:
-        One row per strategy, sums over all followers and frames: Σ|e_v(i,0)| and its standard
-        deviation over them [m/s], Σ|jerk| likewise [m/s³], Σ reward; smallest gap [m], vehicles
-        that touched the one ahead, peak jerk, worst ratio of speed-error energy from vehicle to
-        vehicle, share of frames driven by the learned policy, switches and interventions. Of
-        several trainings the mean over seeds, of the reward with its 95 % interval; extremes and
-        collisions are those of all seeds.
+        One row per strategy. Sums run over followers and frames: Σ|e_v(i,0)| and its standard
+        deviation [m/s], Σ|jerk| and its standard deviation [m/s³], Σ reward with its 95 %
+        interval over seeds, switches and interventions, each the mean over seeds. Smallest gap
+        [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share of frames
+        driven by the learned policy are those of all seeds together.
 
     Raises:
         ConfigError: if there is no such case.
@@ -42,8 +39,7 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
 
 
 def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
-    # A group of a single training has no seed.
-    seeds = rows["training_seed"].fillna(-1)
+    seeds = rows["training_seed"].fillna(-1)  # not trained: no seed
     runs = rows.groupby(seeds)["run_id"].nunique()
 
     def per_run(column: str) -> pd.Series:
@@ -68,56 +64,6 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
     return row
 
 
-def rewards(episodes: pd.DataFrame, strategy: str, case: str) -> pd.DataFrame:
-    """Return Σ reward of every run, ``[runs × seeds]``; one column where nothing was learned."""
-    rows = episodes[(episodes["strategy"] == strategy) & (episodes["case"] == case)]
-    return rows.assign(training_seed=rows["training_seed"].fillna(-1)).pivot_table(
-        index="profile", columns="training_seed", values="reward", aggfunc="sum"
-    )
-
-
-def win_rates(
-    episodes: pd.DataFrame,
-    of: str = "hcfs",
-    against: Sequence[str] | None = None,
-    case: str = "windows",
-) -> pd.DataFrame:
-    """Compare a strategy with others on the same windows.
-
-    Args:
-        episodes: rows of one or more evaluations.
-        of: the strategy.
-        against: those it is compared with; all others by default.
-        case: where.
-
-    Returns:
-        One row per other strategy: share of the windows in which ``of`` earns more (a tie counts
-        half) and the mean difference of Σ reward, each per seed and then averaged, with the 95 %
-        interval over seeds. Learned parents are compared seed by seed.
-    """
-    own = rewards(episodes, of, case)
-    names = [n for n in dict.fromkeys(episodes["strategy"]) if n != of]
-    rows = []
-    for name in names if against is None else against:
-        other = rewards(episodes, name, case)
-        if len(other.columns) == 1:
-            other = pd.concat([other.iloc[:, 0]] * len(own.columns), axis=1, keys=own.columns)
-        shared = own.columns.intersection(other.columns)
-        difference = own[shared] - other[shared]
-        wins = (difference > 1e-6) + 0.5 * (difference.abs() <= 1e-6)
-        rows.append(
-            {
-                "strategy": of,
-                "against": name,
-                "trainings": len(shared),
-                "windows": len(difference),
-                **intervals.mean(wins.mean()).columns("wins_pct", 100.0),
-                **intervals.mean(difference.mean()).columns("reward_gain"),
-            }
-        )
-    return pd.DataFrame(rows)
-
-
 ROWS = (
     ("Σ|e_v| [m/s]", "speed_error_sum_mps", "{:.2f}"),
     ("std |e_v| [m/s]", "speed_error_std_mps", "{:.3f}"),
@@ -136,6 +82,6 @@ ROWS = (
 
 
 def as_rich(table: pd.DataFrame, title: str) -> Table:
-    """Draw a case's table for the terminal, a column per strategy."""
+    """Return a case's table for the terminal, a column per strategy."""
     caption = "sums over followers and frames, means over runs"
     return strategies_side_by_side(table, ROWS, title, caption)

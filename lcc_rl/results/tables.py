@@ -1,4 +1,4 @@
-"""Result tables: what the strategies cost and gain, from the rows of episodes.parquet."""
+"""Tables of energies, savings and safety per strategy, from the rows of episodes.parquet."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rich.table import Table
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
-LOST = "total_acceleration_loss_kj"  # tables of earlier releases lack it
-BASELINES = ("idm", "reference")  # what savings are told against
-HUMANS = ("direct", "idm")  # nothing was trained: one value, known exactly
+LOST = "total_acceleration_loss_kj"
+BASELINES = ("idm", "reference")
+HUMANS = ("direct", "idm")  # not trained: one value, known exactly
 
 CAR_COLUMNS = (
     *(f"{v}_{kind}" for v in ("cav", "total") for kind in ("energy_kj", "net_energy_kj")),
@@ -29,8 +29,19 @@ CAR_COLUMNS = (
 
 
 def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Put strategies side by side: one row per (profile, driver), the mean over training seeds."""
+    """Return a column per strategy and a row per (profile, driver), the mean over seeds."""
     return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
+
+
+def by_driver(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return a column per strategy and a row per driver, the mean over profiles and seeds."""
+    return paired(episodes, column).groupby("driver_id").mean()
+
+
+def driver_savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.Series:
+    """Return the share of a baseline's mean energy that a strategy saves, by driver."""
+    energy = by_driver(episodes, column)
+    return share_saved(energy[strategy], energy[baseline])
 
 
 def per_seed(episodes: pd.DataFrame, column: str) -> dict[str, pd.Series]:
@@ -44,7 +55,7 @@ def per_seed(episodes: pd.DataFrame, column: str) -> dict[str, pd.Series]:
 
 
 def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> Estimate:
-    """Estimate the share of a strategy's mean energy saved against a baseline."""
+    """Return the share of a strategy's mean energy saved against a baseline."""
     values = per_seed(episodes, column)
     if strategy not in values or baseline not in values:
         return Estimate(np.nan, np.nan, np.nan)
@@ -58,11 +69,9 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of one or more evaluations on the same profiles and drivers.
 
     Returns:
-        One row per strategy: mean energies (raw, net of kinetic energy, lost to accelerating, per
-        kilometre), saving
-        against the human baseline ``idm`` and against ``reference``, share of drivers worse off
-        than with each, and the safety measures. Savings are positive where energy is saved;
-        entries that do not exist for a strategy are missing.
+        One row per strategy: mean energies [kJ] and energy per kilometre, savings against the
+        baselines ``idm`` and ``reference`` as shares, positive where energy is saved, share of
+        drivers worse off, and the safety measures; missing where a strategy has none.
     """
     # A string without a controlled car has no energies of one.
     cars = [column for column in CAR_COLUMNS if column not in episodes]
@@ -95,18 +104,10 @@ def _against(
     names = [f"saving_vs_{baseline}", f"net_saving_vs_{baseline}", f"worse_than_{baseline}"]
     if not {strategy, baseline} <= set(total.columns) or strategy == baseline:
         return dict.fromkeys(names, float("nan"))
-    by_driver = total.groupby("driver_id")[[strategy, baseline]].mean()
-    return dict(
-        zip(
-            names,
-            (
-                share_saved(total[strategy].mean(), total[baseline].mean()),
-                share_saved(net[strategy].mean(), net[baseline].mean()),
-                float((by_driver[strategy] > by_driver[baseline]).mean()),
-            ),
-            strict=True,
-        )
-    )
+    shares = [share_saved(x[strategy].mean(), x[baseline].mean()) for x in (total, net)]
+    drivers = total.groupby("driver_id")[[strategy, baseline]].mean()
+    worse = float((drivers[strategy] > drivers[baseline]).mean())
+    return dict(zip(names, (*shares, worse), strict=True))
 
 
 ROWS = (
@@ -132,7 +133,7 @@ ROWS = (
 
 
 def as_rich(table: pd.DataFrame, title: str) -> Table:
-    """Draw a summary for the terminal, a column per strategy; positive savings are savings."""
+    """Return a summary as a table for the terminal, a column per strategy."""
     caption = "energies: mean per episode; direct: no controlled car"
     return strategies_side_by_side(table, ROWS, title, caption)
 
@@ -140,7 +141,7 @@ def as_rich(table: pd.DataFrame, title: str) -> Table:
 def strategies_side_by_side(
     table: pd.DataFrame, rows: Iterable[tuple[str, str, str]], title: str, caption: str
 ) -> Table:
-    """Draw a table for the terminal with a column per strategy.
+    """Return a table for the terminal with a column per strategy.
 
     Args:
         table: one row per strategy, named in the column ``strategy``.
@@ -161,7 +162,7 @@ def strategies_side_by_side(
 
 
 def show(table: Table) -> None:
-    """Print a table: as wide as the terminal, or as its content where there is none to fit."""
+    """Print a table, as wide as the terminal or, without one, as its content."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=max(console.measure(table).maximum, console.width))

@@ -1,1 +1,1 @@
-"""What a command does around its work: command line, sweeps, states of runs, progress, loggers."""
+"""Command line, sweeps, states of runs, progress and loggers."""

@@ -1,4 +1,4 @@
-"""Command-line room: what every Hydra entry point does around its own work."""
+"""Hydra entry points: errors in one line, exit codes, setup of torch."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config import explained, is_sweep
+from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible
@@ -25,32 +26,32 @@ from lcc_rl.runs.precision import set_precision
 from lcc_rl.runs.states import Busy, forget, input_error, is_finished, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
 
-# OSError: Hydra cannot make the run's folder, a disk is full, a file is not ours to read.
+# OSError: a folder cannot be made, a disk is full, a file cannot be read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 BAD_INPUT = 2
-NO_BEST = "No trials are completed"  # says Optuna
+NO_BEST = "No trials are completed"  # message of Optuna
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
-    """Make a function of a configuration a command: Hydra around it, clear errors around Hydra.
+    """Decorate a function of a configuration as a Hydra command.
 
-    Whatever is wrong with the input (an option, a file, a row) ends in one line on stderr and
-    exit code 2, and in ``error.txt`` of the run's folder; Ctrl-C in exit code 130. A bug still
-    shows its traceback. In a sweep a failed run does not stop the others; all are named at the end.
-    ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
+    An input error (option, file, row) is one line on stderr, exit code 2 and ``error.txt`` in the
+    run's folder; Ctrl-C is exit code 130; other errors show a traceback. In a sweep a failed run
+    does not stop the others. ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
 
     Args:
         config_name: the entry point's configuration in ``lcc_rl.conf``, without suffix.
     """
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        def checked(config: DictConfig) -> Any:
+            check_keys(config)
+            check_ignored(config, HydraConfig.get().overrides.task, is_sweep())
+            return function(config)
+
         @wraps(function)
         def job(config: DictConfig) -> Any:
-            def checked(config: DictConfig) -> Any:
-                check_keys(config)
-                return function(config)
-
             if is_sweep():
                 return run_job(checked, config, run_folder())
             return main_guard(recorded(checked))(config)
@@ -61,33 +62,38 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
         @wraps(function)
         def main() -> None:
-            wanted = TRACEBACK in os.environ
-            # Makes Hydra hand errors over instead of printing them in its own way.
-            os.environ.setdefault(TRACEBACK, "1")
-            guarded = sweep if wanted else main_guard(explaining(sweep, config_name))
-            try:
-                with interruptible():
-                    guarded(command)
-            finally:
-                if not wanted:
-                    os.environ.pop(TRACEBACK, None)
+            start(command, config_name)
 
         return main
 
     return decorate
 
 
+def start(command: Callable[[], Any], config_name: str) -> None:
+    """Run a Hydra command with this package's error messages and signal handlers."""
+    wanted = TRACEBACK in os.environ
+    # Hydra raises errors instead of printing them.
+    os.environ.setdefault(TRACEBACK, "1")
+    guarded = sweep if wanted else main_guard(explaining(sweep, config_name))
+    try:
+        with interruptible():
+            guarded(command)
+    finally:
+        if not wanted:
+            os.environ.pop(TRACEBACK, None)
+
+
 def sweep(command: Callable[[], Any]) -> None:
-    """Run a Hydra command; where it was a sweep, say how its runs ended."""
+    """Run a Hydra command; report how the runs of a sweep ended."""
     try:
         command()
     except KeyboardInterrupt:
         folder = SweepCallback.end()
         if folder is None:
             raise
-        raise Interrupted(f"stopped; the same command goes on in {folder}") from None
+        raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
     except ValueError as error:
-        # Hydra's plugin wants the best trial also where every one failed: conclude names those.
+        # Hydra's plugin asks for the best trial even if all failed; conclude reports those.
         if NO_BEST not in str(error):
             raise
     finally:
@@ -97,7 +103,7 @@ def sweep(command: Callable[[], Any]) -> None:
 
 
 def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
-    """Say what Hydra says about a wrong option again, with the nearest option that exists."""
+    """Add the nearest existing option to Hydra's message about a wrong one."""
 
     def explained_function(*arguments: Any) -> Any:
         try:
@@ -113,7 +119,7 @@ def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
 
 
 def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """Leave ``error.txt`` in the run's folder where it fails; a finished run stays finished."""
+    """Write ``error.txt`` into the run's folder on an error, unless the run is finished."""
 
     def recording(cfg: DictConfig) -> Any:
         folder = run_folder()
@@ -123,7 +129,7 @@ def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], An
         except (Interrupted, Busy):
             raise
         except Exception as error:
-            # A command that names a finished run by mistake is no failure of that run.
+            # A command that names a finished run by mistake does not make it a failed one.
             if not is_finished(folder):
                 record(folder, error)
             raise
@@ -132,7 +138,7 @@ def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], An
 
 
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn errors of the input into one line on stderr and exit code 2."""
+    """Turn input errors into one line on stderr and exit code 2."""
 
     @wraps(function)
     def guarded(*arguments: Any, **settings: Any) -> Any:
@@ -148,7 +154,7 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _stop(error: Exception) -> NoReturn:
-    """Print an error in one line; Hydra wraps those of a constructor, which says more."""
+    """Print an error, or the input error that Hydra wraps, in one line and exit."""
     cause = input_error(error)
     text = " ".join(str(cause or error).split())
     if isinstance(cause, Interrupted):
@@ -159,12 +165,12 @@ def _stop(error: Exception) -> NoReturn:
 
 
 def run_folder() -> Path:
-    """The folder of the present run, made by Hydra (the run's or the sweep job's)."""
+    """Return the folder that Hydra made for the present run or job."""
     return Path(HydraConfig.get().runtime.output_dir)
 
 
 def prepare_torch(cfg: DictConfig) -> torch.device:
-    """Check ``seed``, ``threads`` and ``device`` of a study, set up torch, return the device.
+    """Check ``seed``, ``threads`` and ``device``, set up torch and return the device.
 
     Raises:
         ConfigError: if one of them is of the wrong type or impossible on this machine.
@@ -181,6 +187,6 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
         raise ConfigError(f"device {cfg.device!r} is not available: {error}") from error
     torch.set_num_threads(cfg.threads)
     set_precision(cfg.get("matmul_precision", "highest"))
-    # TorchRL tells of every buffer it allocates.
+    # TorchRL logs every buffer it allocates.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     return device

@@ -1,4 +1,4 @@
-"""Interrupt room: what SIGINT and SIGTERM do before, during and after the work of a command."""
+"""Handlers of SIGINT and SIGTERM for commands."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 INTERRUPTED = 130  # exit code
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+Restore = Callable[[], None]
 
 
 def end_quietly() -> None:
-    """Let a command that only imports yet end with one line instead of a traceback or nothing."""
+    """Exit with one line instead of a traceback while a command is still importing."""
 
     def end(number: int, frame: Any) -> None:
         os.write(2, b"lcc_rl: interrupted\n")
@@ -23,55 +24,54 @@ def end_quietly() -> None:
         os._exit(INTERRUPTED)
 
     for kind in SIGNALS:
-        # Whoever started this in the background may have told it to ignore Ctrl-C.
+        # A shell may have started this process in the background with SIGINT ignored.
         if signal.getsignal(kind) is not signal.SIG_IGN:
             signal.signal(kind, end)
 
 
 def is_command() -> bool:
-    """Whether this package is being imported by ``python -m lcc_rl.…``, which says so itself."""
+    """Whether ``python -m`` is importing this package."""
     return sys.argv[:1] == ["-m"] and threading.current_thread() is threading.main_thread()
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """Make SIGTERM what Ctrl-C is, a KeyboardInterrupt, and Ctrl-C again what it was."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def _handled_by(action: Callable[[Restore], None], also_ignored: bool) -> Iterator[None]:
+    """Let signals call ``action(restore)`` in the main thread; restore the handlers at the end."""
+    main = threading.current_thread() is threading.main_thread()
+    before = {kind: signal.getsignal(kind) for kind in SIGNALS} if main else {}
 
-    def interrupt(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
+    def restore() -> None:
+        for kind, previous in before.items():
+            signal.signal(kind, previous)
 
-    before = {kind: signal.getsignal(kind) for kind in SIGNALS}
-    for kind, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(kind, interrupt)
+    for kind, previous in before.items():
+        if also_ignored or previous is not signal.SIG_IGN:
+            signal.signal(kind, lambda number, frame: action(restore))
     try:
         yield
     finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
+        restore()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGTERM and SIGINT."""
+
+    def interrupt(restore: Restore) -> None:
+        raise KeyboardInterrupt
+
+    with _handled_by(interrupt, also_ignored=False):
+        yield
 
 
 @contextmanager
 def stop_signal() -> Iterator[threading.Event]:
-    """Turn the first SIGINT or SIGTERM into a request to stop; the second acts at once."""
+    """Set the event on the first SIGINT or SIGTERM; the second one acts as before."""
     event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    before = {kind: signal.getsignal(kind) for kind in SIGNALS}
 
-    def request(number: int, frame: Any) -> None:
+    def request(restore: Restore) -> None:
         event.set()
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
+        restore()
 
-    for kind in before:
-        signal.signal(kind, request)
-    try:
+    with _handled_by(request, also_ignored=True):
         yield event
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)

@@ -1,9 +1,11 @@
-"""Logger room: training rows sent to TensorBoard, wandb or MLflow beside the parquet tables."""
+"""Loggers of training rows: TensorBoard, wandb and MLflow."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +18,17 @@ Row = Mapping[str, float]
 
 
 class Silent:
-    """Sends rows nowhere: training.parquet has them."""
+    """Logs nothing; training.parquet holds the rows."""
 
     @contextmanager
     def opened(self, folder: Path) -> Iterator[Callable[[Row], None]]:
-        """Yield a function that takes a row and drops it."""
+        """Yield a function that ignores a row."""
         yield lambda row: None
 
 
+@dataclass
 class RowLogger:
-    """Sends every training row to one of TorchRL's loggers, under the run folder's name.
+    """Logs every training row with one of TorchRL's loggers, under the run folder's name.
 
     Args:
         kind: ``"tensorboard"``, ``"wandb"`` or ``"mlflow"``.
@@ -37,19 +40,21 @@ class RowLogger:
         ConfigError: if the kind is unknown.
     """
 
-    def __init__(
-        self, kind: str, where: str | None = None, project: str = "lcc_rl", offline: bool = True
-    ) -> None:
-        if kind not in KINDS:
-            raise ConfigError(f"logger.kind must be one of {', '.join(KINDS)}, got {kind!r}")
-        self.kind, self.where, self.project, self.offline = kind, where, project, offline
+    kind: str
+    where: str | None = None
+    project: str = "lcc_rl"
+    offline: bool = True
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ConfigError(f"logger.kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
 
     @contextmanager
     def opened(self, folder: Path) -> Iterator[Callable[[Row], None]]:
-        """Yield a function that sends a row, at the step of its iteration.
+        """Yield a function that logs a row at its iteration.
 
         Raises:
-            ConfigError: if the package that it needs is not installed.
+            ConfigError: if the logger's package is not installed.
         """
         try:
             logger = self._make(folder)
@@ -58,7 +63,7 @@ class RowLogger:
                 f"logger={self.kind} is not installed: pip install -e '.[{self.kind}]' ({error})"
             ) from error
         try:
-            yield lambda row: _send(logger, row)
+            yield partial(_send, logger)
         finally:
             _close(logger, self.kind)
 

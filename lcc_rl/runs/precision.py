@@ -1,4 +1,4 @@
-"""Precision of matrix products: torch's option, checked on this machine before it is used."""
+"""Precision of float32 matrix products, with its error measured on this machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SINGLE = 1e-4  # relative error beyond which products are no longer single preci
 
 
 def set_precision(name: str) -> float:
-    """Choose torch's precision of float32 matrix products, and say what it does here.
+    """Set torch's precision of float32 matrix products and log the error here.
 
     Below ``highest`` torch may choose other kernels, which are faster on some processors; whether
     they compute in single precision at all depends on the machine, so the error is measured.

@@ -1,4 +1,4 @@
-"""Progress room: a live bar on a terminal, plain lines in a log, one small file for onlookers."""
+"""Progress of long jobs: a bar on a terminal, lines in a log, ``progress.json``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rich.console import Console
@@ -27,7 +26,7 @@ def clock(seconds: float) -> str:
 
 
 def bar(console: Console, shown: bool) -> Progress:
-    """Return a bar for tasks with a ``note``; it draws nothing where it is not to be shown."""
+    """Return a progress bar for tasks with a ``note``, disabled unless ``shown``."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -39,20 +38,20 @@ def bar(console: Console, shown: bool) -> Progress:
 
 
 class ProgressReporter:
-    """Shows how far a long job is: rate, ETA and current values.
+    """Reports rate, ETA and current values of a long job.
 
-    On a terminal a live bar, except in a sweep, which shows one table of all its runs
-    (:mod:`lcc_rl.runs.sweeps`); elsewhere a plain line at most every ``every`` seconds. The log
-    file gets the plain lines in both cases; ``folder/progress.json`` holds the latest state.
+    On a terminal a live bar, except in a sweep (:mod:`lcc_rl.runs.sweeps` draws one table);
+    otherwise a line at most every ``every`` seconds. The log file always gets the lines, and
+    ``folder/progress.json`` holds the latest state.
 
     Args:
-        title: what is being done.
+        title: name of the job.
         total: units of work in all.
         unit: name of a unit.
         start: units already done (after a resume).
-        folder: where ``progress.json`` is kept; None for nowhere.
-        every: seconds between plain lines.
-        console: where the bar is drawn; the standard error by default.
+        folder: folder of ``progress.json``; None for none.
+        every: seconds between lines.
+        console: console of the bar; standard error by default.
     """
 
     def __init__(
@@ -77,16 +76,11 @@ class ProgressReporter:
         self.bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.bar.stop()
 
     def update(self, done: int, values: Mapping[str, float] | None = None) -> None:
-        """Report that ``done`` units are finished, with values worth watching."""
+        """Report that ``done`` units are finished, with values to show."""
         elapsed = time.monotonic() - self.begun
         rate = (done - self.start) / max(elapsed, 1e-9)
         remaining = (self.total - done) / rate if rate > 0 else 0.0
@@ -103,7 +97,7 @@ class ProgressReporter:
         if not self.live:
             log.info(text)
             return
-        # The bar already says it on the terminal; only the log file is told.
+        # The terminal has the bar; only the log file gets the line.
         record = log.makeRecord(log.name, logging.INFO, "", 0, text, (), None)
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.FileHandler):
@@ -112,23 +106,19 @@ class ProgressReporter:
     def _write_state(self, done: int, remaining: float, values: Mapping[str, float]) -> None:
         if self.folder is None:
             return
-        state = {
-            "title": self.title,
-            "done": done,
-            "total": self.total,
-            "eta_s": round(remaining, 1),
-            **{name: float(f"{value:.6g}") for name, value in values.items()},
-        }
+        state = {"title": self.title, "done": done, "total": self.total}
+        state |= {"eta_s": round(remaining, 1)}
+        state |= {name: float(f"{value:.6g}") for name, value in values.items()}
         with atomic_path(self.folder / PROGRESS, durable=False) as temporary:
             temporary.write_text(json.dumps(state))
 
 
 def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> None:
-    """Show the progress of jobs in other processes until all are done or one has failed.
+    """Show the progress of jobs in other processes until all are done or one fails.
 
     Args:
-        jobs: the folder of each job, where its ``progress.json`` appears, and its future.
-        every: seconds between plain lines where there is no terminal.
+        jobs: folder (of ``progress.json``) and future of each job.
+        every: seconds between lines without a terminal.
     """
     console = Console(stderr=True)
     last = time.monotonic()

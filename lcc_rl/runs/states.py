@@ -1,7 +1,6 @@
-"""State room: whether a run is finished, running, stopped or failed, read from its folder alone.
+"""State of a run (finished, running, stopped, failed), read from its folder.
 
-A run holds a lock on its folder while it works, leaves ``error.txt`` when it fails, and writes its
-main table last. Nothing else is needed to know how it stands, from any process at any time.
+A run locks its folder while it works, writes ``error.txt`` when it fails and its main table last.
 """
 
 from __future__ import annotations
@@ -37,15 +36,15 @@ class Busy(LccError):
 
 @dataclass(frozen=True)
 class RunState:
-    """How a run stands.
+    """State of a run.
 
     Args:
-        name: its folder, relative to where one looked.
+        name: folder of the run, relative to the folder surveyed.
         state: one of ``STATES``.
         done: iterations done.
-        total: iterations in all; 0 where nothing is known yet.
-        eta_s: remaining seconds as the run itself estimates them, where it is running.
-        error: why it failed.
+        total: iterations in all; 0 if unknown.
+        eta_s: remaining time estimated by a running run [s].
+        error: first line of the error of a failed run.
     """
 
     name: str
@@ -58,10 +57,10 @@ class RunState:
 
 @contextmanager
 def claim(folder: Path) -> Iterator[None]:
-    """Hold a run's folder for this process; the system lets go of it however the process ends.
+    """Lock a run's folder; the lock is released however the process ends.
 
     Raises:
-        Busy: if another process holds it.
+        Busy: if another process holds the lock.
         ResultsError: if the folder cannot be written.
     """
     path = folder / LOCK
@@ -86,7 +85,7 @@ def _locked(path: Path) -> int:
         try:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Whoever held it before may have removed the file between the two calls.
+            # Another process may have removed the file between the two calls.
             if os.path.samestat(os.fstat(file), os.stat(path)):
                 return file
         except FileNotFoundError:
@@ -117,7 +116,7 @@ def is_claimed(folder: Path) -> bool:
 
 @contextmanager
 def working(folder: Path) -> Iterator[None]:
-    """Claim a folder, and record why the work in it failed, where it does."""
+    """Claim a folder and record an error raised inside."""
     with claim(folder):
         forget(folder)
         remove_leftovers(folder)
@@ -137,7 +136,7 @@ def forget(folder: Path) -> None:
 
 
 def record(folder: Path, error: Exception) -> None:
-    """Write ``error.txt``: one line that names the error, and the traceback of what is a bug."""
+    """Write ``error.txt``: the error in one line, with a traceback unless it is an input error."""
     text = one_line(error) + "\n"
     if not isinstance(input_error(error) or error, (LccError, OSError)):
         text += "\n" + "".join(traceback.format_exception(error))
@@ -146,31 +145,28 @@ def record(folder: Path, error: Exception) -> None:
 
 
 def input_error(error: BaseException) -> LccError | None:
-    """Return the error of this package behind one, which says more than what wraps it."""
+    """Return the error of this package that another one wraps."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LccError):
-        # OmegaConf says of its resolvers' errors that they came before its own, not that they
-        # are its cause.
+        # OmegaConf sets its resolvers' errors as context, not as cause.
         resolving = isinstance(cause, OmegaConfBaseException)
         cause = cause.__cause__ or (cause.__context__ if resolving else None)
     return cause
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error as one line: its own words where it is the input's fault, else its kind."""
-    cause = input_error(error)
-    if cause is not None:
-        return " ".join(str(cause).split())
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    """Return an error as one line; its type comes first unless it is an input error."""
+    text = str(input_error(error) or f"{type(error).__name__}: {error}")
+    return " ".join(text.split())
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether a run's folder holds the table that a run writes last."""
+    """Whether a run's folder holds the table that is written last."""
     return any((folder / table).exists() for table in RESULTS)
 
 
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
-    """Say how the run in a folder stands."""
+    """Return the state of the run in a folder."""
     progress = read_progress(folder) or {}
     done, total = int(progress.get("done", 0)), int(progress.get("total", 0))
     name = folder.name if name is None else name
@@ -186,7 +182,7 @@ def inspect_run(folder: Path, name: str | None = None) -> RunState:
 
 
 def read_progress(folder: Path) -> dict[str, float] | None:
-    """Return what ``progress.json`` of a run folder says, or None where there is none yet."""
+    """Return the content of a run's ``progress.json``, None if there is none."""
     try:
         return dict(json.loads((folder / PROGRESS).read_text()))
     except (OSError, ValueError):
@@ -194,7 +190,7 @@ def read_progress(folder: Path) -> dict[str, float] | None:
 
 
 def run_folders(root: Path) -> list[Path]:
-    """Return the run folders at or below a folder, sorted; those that only hold runs are none.
+    """Return the run folders at or below a folder, sorted, without those that contain runs.
 
     Raises:
         ResultsError: if there is no such folder.
@@ -212,7 +208,7 @@ def run_folders(root: Path) -> list[Path]:
 
 
 def survey(root: Path) -> list[RunState]:
-    """Say how every run at or below a folder stands.
+    """Return the state of every run at or below a folder.
 
     Raises:
         ResultsError: if there is no such folder.

@@ -1,4 +1,4 @@
-"""Sweep room: folders that the same command finds again, and what a sweep says when it ends."""
+"""Sweeps: names of folders, the plan, one run, the final report."""
 
 from __future__ import annotations
 
@@ -22,56 +22,53 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from rich.console import Console
 from rich.live import Live
 
+from lcc_rl.config import NOT_IDENTITY, identity
 from lcc_rl.errors import Interrupted, LccError
 from lcc_rl.io.files import atomic_path
-from lcc_rl.results.runs import NOT_IDENTITY, identity
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.search import go_on
+from lcc_rl.runs.search import resume_search
 from lcc_rl.runs.states import Busy, one_line, record, survey
 
 log = logging.getLogger("lcc_rl")
 
 PLAN = "sweep.json"
-LONGEST_NAME = 100  # characters of a folder's name that say what is in it
+LONGEST_NAME = 100  # characters of a folder's name before the hash
 SILENT = logging.CRITICAL + 1
-WAITING = None  # what a run returns to a sweeper that has no result of it; Optuna refuses NaN
+NO_RESULT = None  # returned to the sweeper; Optuna refuses NaN
 
 
 def register_resolvers() -> None:
-    """Make the names of a sweep's folders known to the configuration files."""
-    # Cached: every job must get the folder that the whole command was given.
+    """Register the OmegaConf resolvers of a sweep's folders and jobs."""
+    # Cached: every job must get the folder of the whole command.
     OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
     OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
     OmegaConf.register_new_resolver("lcc.jobs", parallel_jobs, replace=True)
 
 
 def sweep_name(given: str | None, typed: Sequence[str]) -> str:
-    """Return the name of a sweep's folder: the one given, or one made from what was typed.
-
-    The same command gets the same name, whatever the order of its overrides.
-    """
+    """Return the given name of a sweep's folder, or a hash of its overrides in any order."""
     if given:
         return str(given)
-    kept = sorted(that_matter(typed))
+    kept = sorted(result_overrides(typed))
     return f"sweep_{hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]}"
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Return the name of a run's folder: what the sweep varies, on one level, and the config hash.
+    """Return the name of a run's folder: the varied overrides and the hash of the configuration.
 
-    A folder of the same hash is found again whatever its name says.
+    An existing folder with the same hash is used again.
     """
     settings = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
     mark, sweep = identity(settings)[:8], Path(_root_.hydra.sweep.dir)
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
-    typed, varied = that_matter(_root_.hydra.overrides.task), read_plan(sweep).varied
+    typed, varied = result_overrides(_root_.hydra.overrides.task), read_plan(sweep).varied
     shown = ",".join(item for item in typed if key_of(item) in varied)
     text = re.sub(r"[^\w.=,+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
     return f"{text}_{mark}".lstrip("_")
 
 
-def that_matter(typed: Sequence[str]) -> list[str]:
+def result_overrides(typed: Sequence[str]) -> list[str]:
     """Return the overrides that change a result."""
     return [item for item in typed if key_of(item) not in NOT_IDENTITY]
 
@@ -82,7 +79,7 @@ def key_of(override: str) -> str:
 
 
 def parallel_jobs(threads: int) -> int:
-    """Return how many jobs of so many threads this machine's cores can hold."""
+    """Return the number of parallel jobs of ``threads`` threads for this machine's cores."""
     usable = getattr(os, "sched_getaffinity", None)
     cores = len(usable(0)) if usable else os.cpu_count() or 1
     return max(1, cores // max(1, int(threads)))
@@ -92,15 +89,14 @@ register_resolvers()
 
 
 class SweepCallback(Callback):
-    """Says at the start where a sweep's runs go, keeps their number for onlookers, draws them."""
+    """Writes the plan of a sweep at its start and draws its runs on a terminal."""
 
-    # Of the sweep of this process; Hydra tells nobody else where it is.
-    folder: Path | None = None
+    folder: Path | None = None  # of this process's sweep; Hydra does not keep it
     table: Live | None = None
-    lines: ClassVar[Any] = None  # how log lines are shown where there is no table
+    lines: ClassVar[Any] = None  # logging configuration without a table
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the plan and announce the folder."""
+        """Write the plan and log the folder."""
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
         plan = make_plan(config)
@@ -109,13 +105,14 @@ class SweepCallback(Callback):
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
-        go_on(config, alone=not any(state.state == "running" for state in survey(folder)))
+        running = any(state.state == "running" for state in survey(folder))
+        resume_search(config, alone=not running)
         if sys.stdout.isatty():
             self._draw(config, plan.runs)
 
     @classmethod
     def _draw(cls, config: DictConfig, planned: int) -> None:
-        """Show one table instead of lines; Hydra sets its lines up anew after every run."""
+        """Show a table instead of log lines, which Hydra configures again after every run."""
         hydra = config.hydra
         cls.lines = hydra.hydra_logging.copy()
         with read_write(config):
@@ -126,7 +123,7 @@ class SweepCallback(Callback):
 
     @classmethod
     def end(cls) -> Path | None:
-        """Finish the table and forget the sweep; return its folder, if there was one."""
+        """Stop the table; return the folder of the sweep, None without one."""
         if cls.table is not None:
             cls.table.stop()
             configure_log(cls.lines)
@@ -135,14 +132,14 @@ class SweepCallback(Callback):
 
 
 def mute() -> None:
-    """Keep log lines from the terminal, where they would cut the table up; files keep them."""
+    """Disable log lines on the terminal; log files keep them."""
     for handler in logging.getLogger().handlers:
         if type(handler) is logging.StreamHandler:
             handler.setLevel(SILENT)
 
 
 def limit_batches(config: DictConfig) -> None:
-    """Let submitit on one machine start only as many runs at once as its cores hold."""
+    """Limit submitit on one machine to the number of parallel jobs of its cores."""
     hydra = config.hydra
     if not str(hydra.launcher.get("_target_")).endswith(".LocalLauncher"):
         return
@@ -153,11 +150,11 @@ def limit_batches(config: DictConfig) -> None:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep is to do.
+    """Plan of a sweep.
 
     Args:
-        runs: how many runs it has; 0 where that is unknown.
-        varied: the dotted keys that differ between its runs.
+        runs: number of runs; 0 if unknown.
+        varied: dotted keys that differ between runs.
     """
 
     runs: int = 0
@@ -165,11 +162,11 @@ class Plan:
 
 
 def make_plan(config: DictConfig) -> Plan:
-    """Read off a sweep's configuration what it is to do."""
+    """Return the plan of a sweep's configuration."""
     sweeper = config.hydra.sweeper
     typed = [str(item) for item in config.hydra.overrides.task]
     typed += [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
-    parsed = OverridesParser.create().parse_overrides(that_matter(typed))
+    parsed = OverridesParser.create().parse_overrides(result_overrides(typed))
     swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
     if "n_trials" in sweeper:
@@ -179,7 +176,7 @@ def make_plan(config: DictConfig) -> Plan:
 
 
 def read_plan(folder: Path) -> Plan:
-    """Return what the sweep in a folder is to do; nothing is known where it holds none."""
+    """Return the plan of the sweep in a folder, an empty one if there is none."""
     try:
         return Plan(**json.loads((folder / PLAN).read_text()))
     except (OSError, ValueError, TypeError):
@@ -187,13 +184,13 @@ def read_plan(folder: Path) -> Plan:
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:
-    """Do one run of a sweep; a failure is recorded in its folder and does not stop the others.
+    """Do one run of a sweep; an error is recorded in its folder and does not stop the sweep.
 
     Returns:
-        What the function returns; None where it failed.
+        The function's result; None if it failed.
 
     Raises:
-        KeyboardInterrupt: where the user stopped it: that stops the sweep.
+        KeyboardInterrupt: if the user stopped the run; it stops the sweep.
     """
     if sys.stdout.isatty():
         mute()
@@ -201,22 +198,22 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         return function(cfg)
     except Interrupted as error:
         log.info("%s", error)
-        # As an ordinary exception it would stop this run only, and the next would begin.
+        # An ordinary exception would stop this run only.
         raise KeyboardInterrupt from error
     except Busy as error:
         log.info("%s: left to it", error)
-        return WAITING
+        return NO_RESULT
     except Exception as error:
         record(folder, error)
         log.error("%s failed: %s", folder.name, one_line(error))
-        return WAITING
+        return NO_RESULT
 
 
 def conclude(folder: Path) -> None:
-    """Say how a sweep ended.
+    """Log how a sweep ended.
 
     Raises:
-        LccError: if there was no run, or if runs failed, naming each with its error.
+        LccError: if there was no run or a run failed.
     """
     states = survey(folder)
     if not states:

@@ -1,1 +1,1 @@
-"""Study room: many runs of the entry points, and what they say together."""
+"""Studies: many runs of the entry points, with their tables, figures and page."""

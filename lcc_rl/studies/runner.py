@@ -1,4 +1,4 @@
-"""Study room: start many trainings side by side, skip what is finished, go on where one stopped."""
+"""Runs of a study: parallel trainings that resume and skip finished runs, and the study's notes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from lcc_rl.config import load, plain
+from lcc_rl.config import NOT_IDENTITY, identity, load, plain, require
 from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.io.files import atomic_path
-from lcc_rl.results.runs import CONFIG, NOT_IDENTITY, differing, flatten, load_config
+from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
 from lcc_rl.runs.sweeps import key_of
@@ -29,26 +29,29 @@ from lcc_rl.runs.sweeps import key_of
 log = logging.getLogger("lcc_rl")
 
 NOTES = "study.json"
+EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 FINISHED, FAILED, FOREIGN = "finished", "failed", "other settings"
+GIVEN = ("seed", "variant")  # set by the study for each of its runs
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training: its folder and what one would type after ``python -m lcc_rl.train``."""
+    """A training: its folder and the overrides of ``python -m lcc_rl.train``."""
 
     folder: Path
     overrides: tuple[str, ...]
 
     def compose(self) -> DictConfig:
-        """Return its configuration.
-
-        Raises:
-            ConfigError: if an override is unknown or of the wrong type.
-        """
+        """Return its configuration; a ConfigError for an unknown or wrong override."""
         return load("train", self.overrides)
 
+    @property
+    def finished(self) -> bool:
+        """Whether the training and its evaluation are complete."""
+        return (self.folder / EPISODES).exists()
+
     def command(self) -> list[str]:
-        """Return the command that starts it, or goes on with it where it has a checkpoint."""
+        """Return the command that starts the training, or resumes it from its checkpoint."""
         words = [sys.executable, "-m", "lcc_rl.train"]
         if (self.folder / "checkpoint.pt").exists():
             return [*words, f"resume={quoted(self.folder)}"]
@@ -57,26 +60,48 @@ class Run:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run: ``finished``, ``failed`` or ``other settings``, and the reason."""
+    """The status of a run (``finished``, ``failed`` or ``other settings``) and the reason."""
 
     run: Run
     status: str
     note: str = ""
 
 
+@dataclass(frozen=True)
+class BaseStudy:
+    """The settings that every study has.
+
+    Args:
+        folder: the study's folder.
+        recipe: ``experiment`` of every training; None for the defaults of the agent.
+        seeds: number of trainings of every learned variant, numbered from 0.
+        overrides: further settings of every run.
+        jobs: number of trainings at a time.
+        accept: settings in which a run found in the folder may differ.
+    """
+
+    folder: Path
+    recipe: str | None
+    seeds: int = 8
+    overrides: tuple[str, ...] = ()
+    jobs: int = 2
+    accept: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "jobs"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1")
+
+
 def quoted(path: str | Path) -> str:
-    """Return a path as Hydra's command line takes it, whatever characters are in it."""
+    """Return a path quoted for Hydra's command line."""
     return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-GIVEN = ("seed", "variant")  # what a study gives each of its runs
-
-
 def check_overrides(words: Sequence[str]) -> None:
-    """Check that what is left of a command line are overrides.
+    """Check that the remaining words of a command line are overrides.
 
     Raises:
-        ConfigError: if a word is an option or nothing, or sets what every run gets from the study.
+        ConfigError: if a word is no override, or sets what the study sets for every run.
     """
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
@@ -89,40 +114,58 @@ def check_overrides(words: Sequence[str]) -> None:
 
 
 def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> list[str]:
-    """List the settings in which a run's folder differs from what is wanted of it.
+    """List the settings in which the stored configuration of a run differs from the wanted one.
 
     Args:
         run: the run; its folder holds a configuration.
         wanted: the configuration it should have.
-        accept: dotted keys, or beginnings of them, that may differ (``data``, ``drivers.path``).
+        accept: dotted keys, or their beginnings, that may differ (``data``, ``drivers.path``).
 
     Returns:
         ``key: found → wanted`` for each.
     """
-    found, asked = (_settings(cfg) for cfg in (load_config(run.folder), wanted))
+    found, asked = (dict(flatten(plain(cfg))) for cfg in (load_config(run.folder), wanted))
+    ignored = (*NOT_IDENTITY, *accept)
     return [
         f"{key}: {found.get(key)} → {asked.get(key)}"
         for key in differing(found, asked)
-        if not any(key == item or key.startswith(f"{item}.") for item in accept)
+        if not any(key == item or key.startswith(f"{item}.") for item in ignored)
     ]
 
 
-def _settings(cfg: DictConfig) -> dict[str, Any]:
-    return {k: v for k, v in flatten(plain(cfg)) if not _no_matter(k)}
+def up_to_date(cfg: DictConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:
+    """Whether a folder holds the evaluation of a configuration, not older than its policies.
 
-
-def _no_matter(key: str) -> bool:
-    return any(key == item or key.startswith(f"{item}.") for item in NOT_IDENTITY)
+    Args:
+        cfg: configuration of the evaluation.
+        folder: folder of the evaluation.
+        policies: folders of the trainings that it evaluates.
+    """
+    table = folder / EPISODES
+    if not table.exists():
+        return False
+    done = load_config(folder)
+    newest = max(((path / "policy.pt").stat().st_mtime for path in policies), default=0.0)
+    same = identity(done) == identity(cfg) and list(done.compare) == list(cfg.compare)
+    return same and table.stat().st_mtime >= newest
 
 
 def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:
-    """Do what is left to do of all runs, ``jobs`` at a time; a failure does not stop the others.
+    """Run all unfinished trainings in parallel; a failure does not stop the others.
 
-    A run whose folder was made with other settings is left alone and reported.
+    A run whose folder was made with other settings is left as it is and reported.
+
+    Args:
+        runs: the trainings of a study.
+        jobs: number of trainings at a time.
+        accept: settings in which a run found in its folder may differ.
+
+    Returns:
+        The outcome of every run: those left out, those finished before, then those run now.
 
     Raises:
         ConfigError: if a run's settings are wrong; checked for all before the first starts.
-        Interrupted: on SIGINT or SIGTERM, after every training at hand is saved.
+        Interrupted: on SIGINT or SIGTERM, after every running training is saved.
     """
     outcomes, todo = [], []
     for run in runs:
@@ -132,7 +175,7 @@ def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[
         if other:
             log.error("%s: left out, it has other settings: %s", run.folder, "; ".join(other))
             outcomes.append(Outcome(run, FOREIGN, "; ".join(other)))
-        elif known and (run.folder / "episodes.parquet").exists():
+        elif known and run.finished:
             outcomes.append(Outcome(run, FINISHED))
         else:
             todo.append(run)
@@ -142,7 +185,7 @@ def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[
 
 
 def _start(runs: Sequence[Run], jobs: int) -> list[Outcome]:
-    """Run processes side by side; on an interrupt let each save its state."""
+    """Run processes in parallel; on an interrupt each saves its state."""
     children: set[subprocess.Popen[str]] = set()
     stopping = threading.Event()
     with ThreadPoolExecutor(jobs) as pool, interruptible():
@@ -153,7 +196,7 @@ def _start(runs: Sequence[Run], jobs: int) -> list[Outcome]:
             stopping.set()
             for child in list(children):
                 child.terminate()
-            raise Interrupted("stopped; the same command goes on from here") from None
+            raise Interrupted("stopped; the same command resumes from here") from None
 
 
 def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Event) -> Outcome:
@@ -161,7 +204,7 @@ def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Eve
         return Outcome(run, FAILED, "not started")
     run.folder.mkdir(parents=True, exist_ok=True)
     command, begun = run.command(), time.monotonic()
-    log.info("%s: %s", run.folder, "going on" if command[-1].startswith("resume=") else "started")
+    log.info("%s: %s", run.folder, "resumed" if command[-1].startswith("resume=") else "started")
     # A session of its own: the terminal's Ctrl-C reaches it once, through this process.
     child = subprocess.Popen(
         command,
@@ -186,7 +229,7 @@ def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Eve
 
 
 def note(folder: Path, study: str, command: str) -> None:
-    """Keep what was typed, and when, in the study's folder."""
+    """Append a command and its time to the notes in the study's folder."""
     notes = read_notes(folder)
     notes["study"] = study
     when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -195,7 +238,7 @@ def note(folder: Path, study: str, command: str) -> None:
 
 
 def note_problems(folder: Path, outcomes: Sequence[Outcome]) -> None:
-    """Keep which runs failed or differ, replacing what was known of these runs before."""
+    """Store which runs failed or differ; earlier notes on the same runs are replaced."""
     notes = read_notes(folder)
     problems = dict(notes.get("problems", {}))
     for outcome in outcomes:
@@ -208,7 +251,7 @@ def note_problems(folder: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 def read_notes(folder: Path) -> dict[str, Any]:
-    """Return what the study's folder says of itself; empty where it says nothing."""
+    """Return the notes in a study's folder; empty where there are none."""
     try:
         return dict(json.loads((folder / NOTES).read_text()))
     except (OSError, ValueError):

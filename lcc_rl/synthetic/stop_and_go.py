@@ -1,4 +1,4 @@
-"""Stop-and-go room: a stochastic leader in congested traffic."""
+"""Stochastic leaders in congested traffic."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StopAndGo:
-    """Leaders that chase a speed which jumps, as drivers do in stop-and-go waves.
+    """Leaders that track a target speed which jumps, as in stop-and-go waves.
 
-    Every leader has a congestion level, Gaussian over leaders. It aims at the sum of its level, a
-    wave and a ripple, cut off at zero, where it stands. Wave and ripple each take a new Gaussian
-    value after exponentially distributed times, the wave seldom and large, the ripple often and
-    small: no driver holds a speed exactly. The leader approaches the speed aimed at as a
-    critically damped second-order system, so that acceleration is continuous, within the limits
-    of ordinary driving. The jumps, rather than a Gaussian process, make the many calm and few
-    strong accelerations of recorded traffic.
+    Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of its
+    level, a wave and a ripple, at least zero. Wave and ripple each take a new Gaussian value after
+    exponentially distributed times; waves are rare and large, ripples frequent and small. The
+    speed follows the target as a critically damped second-order system within acceleration
+    limits, so that acceleration is continuous. Jumps reproduce the heavy-tailed accelerations of
+    recorded traffic better than a Gaussian process does.
 
     The default values are fitted to NGSIM I-80 by ``tools/fit_stream.py``: they minimise the
     distance between the leaders of the synthetic pairs and those of 264 real pairs in the mean
@@ -68,8 +67,8 @@ class StopAndGo:
     ) -> tuple[Array, Array]:
         """Drive leaders side by side.
 
-        Levels and jumps are stratified samples of their distributions: a stream has few leaders,
-        and its statistics should not hang on the luck of a seed.
+        Levels and jumps are stratified samples of their distributions, which reduces the variance
+        of a stream's statistics between seeds.
 
         Args:
             count: number of leaders.
@@ -84,15 +83,15 @@ class StopAndGo:
         shape = (steps + 1, count)
         wave = self.wave_spread_mps * jumps(shape, time_step / self.wave_s, generator)
         ripple = self.ripple_spread_mps * jumps(shape, time_step / self.ripple_s, generator)
-        return self._chase(np.maximum(level + wave + ripple, 0.0), time_step), level
+        return self._track(np.maximum(level + wave + ripple, 0.0), time_step), level
 
-    def _chase(self, aim: Array, time_step: float) -> Array:
-        """Speeds of leaders that respond to the speeds aimed at, both ``[steps + 1, count]``."""
-        speed = aim[0]
+    def _track(self, target: Array, time_step: float) -> Array:
+        """Speeds of leaders that track target speeds, both ``[steps + 1, count]``."""
+        speed = target[0]
         acceleration = np.zeros_like(speed)
         speeds = [speed]
-        for target in aim[1:]:
-            pull = (target - speed) / self.response_s**2 - 2.0 * acceleration / self.response_s
+        for wish in target[1:]:
+            pull = (wish - speed) / self.response_s**2 - 2.0 * acceleration / self.response_s
             wanted = acceleration + time_step * pull
             wanted = np.clip(wanted, -self.braking_limit, self.acceleration_limit)
             reached = np.maximum(speed + wanted * time_step, 0.0)

@@ -12,11 +12,10 @@ from helpers import POPULATION, compose, wavy_profiles
 
 from lcc_rl.agents.analytic import GradientTrainer
 from lcc_rl.agents.loop import derived_seed
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity
 
 SMALL = (
     "agent=analytic",

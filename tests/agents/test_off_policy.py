@@ -6,12 +6,12 @@ import pandas as pd
 import pytest
 import torch
 from helpers import POPULATION, compose, wavy_profiles
+from lcc_rl.agents.training import Trainer
 from tensordict import TensorDict
 
-from lcc_rl.agents.training import Trainer
+from lcc_rl.config import identity
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.runs import identity
 
 SMALL = (
     "training.episodes=16",

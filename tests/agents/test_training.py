@@ -8,14 +8,14 @@ import pandas as pd
 import pytest
 import torch
 from helpers import POPULATION, compose, wavy_profiles
+from lcc_rl.agents.training import Trainer
 
 from lcc_rl.agents.ddpg import Exploration
 from lcc_rl.agents.loop import episode_statistics
-from lcc_rl.agents.training import Trainer
+from lcc_rl.config import identity
 from lcc_rl.envs.factory import build_agent, build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_parquet, write_torch
-from lcc_rl.results.runs import identity
 
 SMALL = (
     "training.episodes=20",

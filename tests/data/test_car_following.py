@@ -10,7 +10,7 @@ import pytest
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.car_following import Criteria, ExtractionReport, extract
-from lcc_rl.data.episodes import SCHEMA, read_episodes, split_episodes, validate_episodes
+from lcc_rl.data.episodes import SCHEMA, read_episodes, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.errors import ConfigError, DataError
 
@@ -190,25 +190,25 @@ def test_impossible_criteria(arguments: dict[str, object], message: str) -> None
         Criteria(**arguments)  # type: ignore[arg-type]
 
 
+def identified(group: tuple[int, pd.DataFrame]) -> tuple[tuple[float, float], pd.DataFrame]:
+    """First time and position of an episode, and its rows."""
+    first = group[1].iloc[0]
+    return (round(first["time_s"], 1), round(float(first["follower_position_m"]), 1)), group[1]
+
+
 def test_all_real_pairs_are_recovered(shared_data: Path) -> None:
     found, _ = extract(read_ngsim(shared_data / "i80_pairs_ngsim_layout.csv.gz"), Criteria())
     truth = read_episodes(shared_data / "i80_pairs.parquet")
     assert found["episode"].nunique() == truth["episode"].nunique() == 264
-    # Ids differ; a pair is known by its first time and place, which no two pairs share.
-    expected = {
-        (round(pair["time_s"][0], 1), round(float(pair["follower_position_m"][0]), 1)): pair
-        for pair in split_episodes(truth)
-    }
+    # Ids differ; a pair is identified by its first time and position, which no two pairs share.
+    expected = dict(map(identified, truth.groupby("episode")))
     assert len(expected) == 264
-    for episode in split_episodes(found):
-        first = float(episode["follower_position_m"][0])
-        other = expected.pop((round(episode["time_s"][0], 1), round(first, 1)))
-        np.testing.assert_allclose(episode["time_s"], other["time_s"], atol=1e-3)
-        np.testing.assert_allclose(episode["gap_m"], other["gap_m"], atol=0.02, rtol=0)
-        for name in ("follower_speed_mps", "leader_speed_mps"):
-            np.testing.assert_allclose(episode[name], other[name], atol=0.01, rtol=0)
-        for name in ("follower_position_m", "leader_position_m", "leader_length_m"):
-            np.testing.assert_allclose(episode[name], other[name], atol=0.02, rtol=0)
+    tolerances = {"time_s": 1e-3, "follower_speed_mps": 0.01, "leader_speed_mps": 0.01}
+    for place, episode in map(identified, found.groupby("episode")):
+        other = expected.pop(place)
+        for name in (*SCHEMA,)[4:]:
+            tolerance = tolerances.get(name, 0.02)
+            np.testing.assert_allclose(episode[name], other[name], atol=tolerance, rtol=0)
     assert not expected
 
 

@@ -9,15 +9,9 @@ import torch
 from omegaconf import OmegaConf
 
 from lcc_rl.config import build, load
-from lcc_rl.data.cycles import (
-    RecordLeaders,
-    lively,
-    read_speed_record,
-    resample,
-    shipped_cycles,
-    stretch,
-)
+from lcc_rl.data.cycles import RecordLeaders, stretch, varying
 from lcc_rl.data.profiles import from_records
+from lcc_rl.data.speed_records import read_speed_record, resample, shipped_cycles
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 
@@ -149,10 +143,10 @@ def test_leaders_of_recorded_trajectories() -> None:
     assert not set(inputs.training.recordings) & set(inputs.evaluation.recordings)
 
 
-def test_lively_leaves_out_where_nothing_happens() -> None:
+def test_records_without_variation_are_left_out() -> None:
     still, moving = torch.full((9,), 5.0), torch.tensor([5.0, 6.0, 5.0, 6.5])
     profiles = from_records([still, moving], ["a", "b"], ["a", "b"], 0.2)
-    assert lively(profiles, 2.0).names == ("b",)
+    assert varying(profiles, 2.0).names == ("b",)
 
 
 def test_a_node_builds_its_own_leaders() -> None:

@@ -13,7 +13,6 @@ from lcc_rl.data.episodes import (
     COLUMNS,
     SCHEMA,
     read_episodes,
-    split_episodes,
     validate_episodes,
     write_episodes,
 )
@@ -57,16 +56,6 @@ def test_other_names_order_and_further_columns(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(
         read_episodes(tmp_path / "pairs.parquet"), validate_episodes(table(), "x")
     )
-
-
-def test_split_gives_each_episode_once() -> None:
-    parts = split_episodes(validate_episodes(table(), "x"))
-    assert [len(part["time_s"]) for part in parts] == [5, 3]
-    assert [part["episode"][0] for part in parts] == [4, 2]
-    assert set(parts[0]) == set(COLUMNS)
-    assert np.concatenate([part["follower_position_m"] for part in parts]).tolist() == [
-        *range(0, 16, 2)
-    ]
 
 
 def change(row: int, name: str, value: object) -> Callable[[Frame], Frame]:

@@ -19,26 +19,18 @@ from ngsim_text import (
     portal_text,
 )
 
-from lcc_rl.data.ngsim import Trajectories, read_ngsim, write_ngsim
-from lcc_rl.data.ngsim_layouts import BLOCK_BYTES
+from lcc_rl.data import ngsim_blocks
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.ngsim_writer import write_ngsim
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 
 FOOT = 0.3048
-TYPES = {
-    "recording": "category",
-    "vehicle": "int64",
-    "frame": "int32",
-    "segment": "int32",
-    "time_s": "float64",
-    "position_m": "float32",
-    "lane": "int16",
-    "length_m": "float32",
-    "vehicle_class": "int8",
-    "speed_mps": "float32",
-    "acceleration_mps2": "float32",
-    "preceding": "int64",
-    "space_headway_m": "float32",
-}
+TYPES = (
+    "recording category, vehicle int64, frame int32, segment int32, time_s float64, "
+    "position_m float32, lane int16, length_m float32, vehicle_class int8, speed_mps float32, "
+    "acceleration_mps2 float32, preceding int64, space_headway_m float32"
+)
 
 
 def read(folder: Path, text: str | bytes, name: str = "file.csv", **options: str) -> Trajectories:
@@ -75,7 +67,7 @@ LAYOUTS = {
 def test_every_layout_gives_the_same_samples(tmp_path: Path, layout: str, compressed: bool) -> None:
     text = LAYOUTS[layout].encode()
     samples = read(tmp_path, gzip.compress(text) if compressed else text).samples
-    assert {str(k): str(v) for k, v in samples.dtypes.items()} == TYPES
+    assert ", ".join(f"{name} {kind}" for name, kind in samples.dtypes.items()) == TYPES
     assert samples["vehicle"].tolist() == [7] * 20 + [9] * 20
     assert samples["frame"].tolist() == [*range(20), *range(20)]
     assert samples["segment"].tolist() == [0] * 20 + [1] * 20
@@ -107,41 +99,33 @@ def test_thousands_separators_are_numbers(tmp_path: Path) -> None:
     assert samples["preceding"].tolist() == [1_000_000, 0]
 
 
-def test_files_larger_than_a_block_lose_no_row(tmp_path: Path) -> None:
-    rows = [cells(vehicle, k) for vehicle in range(1, 61) for k in range(700)]
-    text = csv_text(rows)
-    assert len(text) < BLOCK_BYTES
-    text = csv_text(rows + [cells(vehicle, k) for vehicle in range(61, 121) for k in range(700)])
-    assert len(text) > BLOCK_BYTES
-    for content in (text, native_text([line.split(",") for line in text.splitlines()[1:]])):
+def test_files_larger_than_a_block_lose_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ngsim_blocks, "BLOCK_BYTES", 10_000)
+    rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
+    for content in (csv_text(rows), native_text(rows)):
+        assert len(content) > 5 * ngsim_blocks.BLOCK_BYTES
         read_back = read(tmp_path, content)
-        assert read_back.report.rows_kept == 84_000
-        assert read_back.report.segments == read_back.report.vehicles == 120
-        assert read_back.samples["position_m"].iloc[-1] == pytest.approx(6990 * FOOT)
+        assert read_back.report.rows_kept == 840
+        assert read_back.report.segments == read_back.report.vehicles == 12
+        assert read_back.samples["position_m"].iloc[-1] == pytest.approx(690 * FOOT)
 
 
-def test_error_in_a_later_block_names_the_line_of_the_file(tmp_path: Path) -> None:
-    rows = [cells(vehicle, k) for vehicle in range(1, 121) for k in range(700)]
-    rows[80_000] = cells(1, 0, v_Vel="fast")
-    with pytest.raises(DataError, match=r"file\.csv: line 80002, column 'v_Vel' holds 'fast'"):
+def test_error_in_a_later_block_names_the_line_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ngsim_blocks, "BLOCK_BYTES", 10_000)
+    rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
+    rows[800] = cells(1, 0, v_Vel="fast")
+    with pytest.raises(DataError, match=r"file\.csv: line 802, column 'v_Vel' holds 'fast'"):
         read(tmp_path, csv_text(rows))
 
 
 def test_blank_cells_where_nothing_needs_them(tmp_path: Path) -> None:
-    free = (
-        "Local_X",
-        "Global_X",
-        "Global_Y",
-        "v_Width",
-        "Total_Frames",
-        "Following",
-        "Time_Headway",
-        "Global_Time",
-        "v_Class",
-        "Preceding",
-        "Space_Headway",
-    )
-    read_back = read(tmp_path, csv_text([cells(7, k, **dict.fromkeys(free, "")) for k in (1, 2)]))
+    needed = ["Vehicle_ID", "Frame_ID", "Local_Y", "v_Length", "v_Vel", "v_Acc", "Lane_ID"]
+    free = dict.fromkeys(set(OFFICIAL.split(",")) - set(needed), "")
+    read_back = read(tmp_path, csv_text([cells(7, k, **free) for k in (1, 2)]))
     assert read_back.samples["preceding"].tolist() == [0, 0]
     assert read_back.samples["vehicle_class"].tolist() == [0, 0]
     assert read_back.samples["recording"].unique().tolist() == ["file#1"]

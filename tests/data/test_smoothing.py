@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 from ngsim_text import cells, csv_text, pair
 
-from lcc_rl.data.ngsim import Trajectories, read_ngsim
+from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.smoothing import ExponentialAverage, SavitzkyGolay, Smoothing
+from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import ConfigError
 
 FOOT = 0.3048

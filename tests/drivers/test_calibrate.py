@@ -1,49 +1,28 @@
 """The calibrate command: files, report, and one clear line for whatever is wrong."""
 
 import io
-import os
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import lcc_rl.conf
 import pandas as pd
 import pytest
+from commands import run_command
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from lcc_rl import calibrate
+from lcc_rl.commands import calibration
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.runs.cli import main_guard, prepare_torch
 
 CONF = Path(str(lcc_rl.conf.__file__)).parent
-SOURCE = """
-from types import SimpleNamespace
-import pandas as pd
-from lcc_rl.errors import DataError
-
-class Source:
-    def __init__(self, path: str) -> None:
-        self.path = path
-
-    def load(self):
-        try:
-            episodes = pd.read_parquet(self.path)
-        except OSError as error:
-            raise DataError(f"{self.path}: no such file") from error
-        return SimpleNamespace(episodes=episodes, report=["3 episodes read"])
-"""
 
 
 @pytest.fixture
-def source(tmp_path, monkeypatch, uneven_lengths):
-    """Folder with a data source of its own and an episode file."""
-    (tmp_path / "a_source.py").write_text(SOURCE)
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "own.yaml").write_text("_target_: a_source.Source\npath: ???\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
+def source(tmp_path, uneven_lengths):
+    """Folder with an episode file."""
     uneven_lengths.to_parquet(tmp_path / "episodes.parquet")
     return tmp_path
 
@@ -54,7 +33,7 @@ def cfg(source):
     calibration = OmegaConf.load(CONF / "calibration" / "base.yaml")
     quick = {"population": 8, "generations": 2, "founders": 1}
     changes = {"modes": ["local", "global"], "local_genetic": quick, "global_genetic": quick}
-    data = OmegaConf.load(source / "data" / "own.yaml")
+    data = OmegaConf.load(CONF / "data" / "episodes.yaml")
     data.path = str(source / "episodes.parquet")
     return OmegaConf.create(
         {
@@ -69,7 +48,7 @@ def cfg(source):
 
 def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     out = io.StringIO()
-    drivers = calibrate.run(cfg, tmp_path / "run", Console(file=out, width=100))
+    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     names = sorted(path.name for path in (tmp_path / "run").iterdir())
     assert names == ["calibration.png", "config.yaml", "drivers.parquet", "joint_distribution.png"]
     written = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
@@ -78,7 +57,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     assert metadata["report"].startswith("3 of 3 episodes used")
     assert '"modes": ["local", "global"]' in metadata["config"]
     assert len(bootstrap(tmp_path / "run" / "drivers.parquet")) == 3
-    for text in ("3 episodes read", "3 of 3 episodes used", "RMSPE [%]", "time gap [s]"):
+    for text in ("read 3 episodes", "3 of 3 episodes used", "RMSPE [%]", "time gap [s]"):
         assert text in out.getvalue()
 
 
@@ -99,7 +78,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, error, message):
     OmegaConf.update(cfg, key, value)
     with pytest.raises(error, match=message):
-        calibrate.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
+        calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
     assert not (tmp_path / "run").exists()
 
 
@@ -154,24 +133,19 @@ def test_device_and_threads_are_prepared():
     assert prepare_torch(cfg).type == "cpu"
 
 
-def command(source, *overrides):
-    paths = [str(source), os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    return subprocess.run(
-        [sys.executable, "-m", "lcc_rl.calibrate", "--config-dir", str(source), *overrides],
-        cwd=source,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+@pytest.fixture
+def command(source):
+    """Function that runs the command in the folder of the episode file."""
+    return partial(run_command, "lcc_rl.calibrate", cwd=source)
 
 
-def test_command_writes_into_the_run_folder(source):
-    quick = "calibration.local_genetic.generations=2"
-    done = command(source, "data=own", "data.path=episodes.parquet", quick, "hydra.run.dir=here")
-    assert done.returncode == 0, done.stderr
+def test_command_writes_into_the_run_folder(source, command):
+    quick = [f"calibration.local_genetic.{name}" for name in ("generations=2", "population=8")]
+    (source / "data").mkdir()
+    node = "_target_: lcc_rl.data.sources.EpisodesSource\npath: episodes.parquet\n"
+    (source / "data" / "own.yaml").write_text(node)
+    own = ["--config-dir", str(source), "data=own", "hydra.run.dir=here"]
+    done = command(*own, *quick, check=True)
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
     assert "v0 on a bound" in done.stdout
@@ -181,8 +155,8 @@ def test_command_writes_into_the_run_folder(source):
     ("override", "message"),
     [("data.path=/no/such", "/no/such: no such file"), ("calibration=locl", "'locl'")],
 )
-def test_command_ends_bad_input_with_one_line_and_code_two(source, override, message):
-    done = command(source, "data=own", override)
+def test_command_ends_bad_input_with_one_line_and_code_two(command, override, message):
+    done = command("data=episodes", "data.path=episodes.parquet", override)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

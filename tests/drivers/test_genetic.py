@@ -96,22 +96,12 @@ def test_stopping_rule_ends_a_search_that_stands_still():
     assert found.evaluations == 32 * (8 + 3)
 
 
+BAD = dict.fromkeys(["generations", "founders", "tournament", "patience", "mutation_start"], 0)
+BAD |= dict.fromkeys(["blend", "tolerance", "mutation_end", "difference_rate"], -1.0)
+
+
 @pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("population", 3),
-        ("generations", 0),
-        ("founders", 0),
-        ("tournament", 0),
-        ("patience", 0),
-        ("elites", 1.5),
-        ("difference_rate", -0.1),
-        ("mutation_rate", 2.0),
-        ("mutation_start", 0.0),
-        ("mutation_end", -1.0),
-        ("blend", -1.0),
-        ("tolerance", -1.0),
-    ],
+    ("setting", "value"), [*BAD.items(), ("population", 3), ("elites", 1.5), ("mutation_rate", 2)]
 )
 def test_impossible_settings_are_named(setting, value):
     with pytest.raises(ConfigError, match=setting):

@@ -14,12 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from lcc_rl.config import config_hash, load, plain
+from lcc_rl.config import config_hash, identity, load, plain
 from lcc_rl.data.episodes import COLUMNS, read_episodes, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.errors import DataError, LccError
 from lcc_rl.io.files import read_parquet, read_torch, write_parquet
-from lcc_rl.results.runs import identity, load_config, save_config
+from lcc_rl.results.runs import load_config, save_config
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
 FUZZ = settings(

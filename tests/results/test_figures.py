@@ -9,6 +9,7 @@ from study_frames import episodes, training
 
 from lcc_rl.results import figures as study_figures
 from lcc_rl.results.drawing import save
+from lcc_rl.studies.alcc import comparison_figures
 from lcc_rl.studies.alcc import figures as alcc_figures
 
 
@@ -77,9 +78,18 @@ FIGURES = {
         lambda: alcc_figures.generalization_figure(episodes()),
         ["paper, 4 profiles", "n = 2", "mean of 2 seeds"],
     ),
-    "ablations": (lambda: alcc_figures.comparison_figure(ablated()), ["no safety", "n = 2 seeds"]),
-    "followers": (lambda: alcc_figures.followers_figure(strings()), ["human drivers", "2 seeds"]),
-    "single": (lambda: alcc_figures.single_profile_figure(single()), ["profile 12", "idm", "kJ"]),
+    "ablations": (
+        lambda: comparison_figures.comparison_figure(ablated()),
+        ["no safety", "n = 2 seeds"],
+    ),
+    "followers": (
+        lambda: comparison_figures.followers_figure(strings()),
+        ["human drivers", "2 seeds"],
+    ),
+    "single": (
+        lambda: comparison_figures.single_profile_figure(single()),
+        ["profile 12", "idm", "kJ"],
+    ),
 }
 
 

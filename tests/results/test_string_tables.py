@@ -1,14 +1,18 @@
-"""Tables of the platoon by hand, from rows made up for it."""
+"""Tables and figures of the platoon from small tables with known values."""
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
+from lcc_rl.evaluation.platoon_cases import measure
+from matplotlib.colors import to_rgb
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.platoon_cases import measure
-from lcc_rl.results.string_tables import case_table, win_rates
+from lcc_rl.results.string_figures import PARENTS, switching
+from lcc_rl.results.string_tables import case_table
+from lcc_rl.studies.hcfs.tables import win_rates
 
 
 def series() -> dict[str, torch.Tensor]:
@@ -84,3 +88,21 @@ def test_win_rates_by_hand() -> None:
     # Against its own parent, seed by seed: 1 win, 2 losses, 1 tie; then 4 wins.
     assert table.loc["ddpg", "wins_pct"] == pytest.approx((37.5 + 100.0) / 2)
     assert table.loc["ddpg", "windows"] == 4
+
+
+def test_switching_has_the_colour_of_the_controller_that_drives() -> None:
+    winners = np.array([[0, 0, 1, 1], [1, 0, 0, 0], [0, 1, 0, 1]])  # follower × time
+    rows = [
+        {"strategy": "hcfs", "case": "case 1", "follower": f + 1, "time_s": 0.2 * (t + 1)}
+        | {"winner": float(winners[f, t])}
+        for f in range(3)
+        for t in range(4)
+    ]
+    figure = switching(pd.DataFrame(rows), "case 1")
+    figure.canvas.draw()
+    pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255.0
+    colours = np.array([to_rgb(colour) for colour in PARENTS.values()])
+    centres = [(0.2 * t + 0.1, f + 1) for f in range(3) for t in range(4)]
+    places = figure.axes[0].transData.transform(centres).astype(int)
+    drawn = np.array([pixels[len(pixels) - y, x] for x, y in places])
+    np.testing.assert_allclose(drawn, colours[winners.ravel()], atol=1 / 255)

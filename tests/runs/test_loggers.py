@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.runs import identity
 from lcc_rl.runs.loggers import RowLogger, Silent
 
 ROWS = [{"iteration": float(i), "episode_reward": -10.0 * i} for i in (1, 2)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.runs.search import go_on
+from lcc_rl.runs.search import resume_search
 
 optuna = pytest.importorskip("optuna", reason="extra sweeps")
 SPACE = {"agent.gamma": optuna.distributions.UniformDistribution(0.0, 1.0)}
@@ -40,7 +40,7 @@ def test_only_what_lacks_is_left(tmp_path, caplog, wanted, left) -> None:
     cfg = search(tmp_path, wanted)
     OmegaConf.set_readonly(cfg, True)
     with caplog.at_level("INFO", "lcc_rl"):
-        go_on(cfg, alone=True)
+        resume_search(cfg, alone=True)
     assert cfg.hydra.sweeper.n_trials == left
     assert ("finished before" in caplog.text) == (left == 0)
 
@@ -49,7 +49,7 @@ def test_a_trial_that_was_cut_off_is_tried_first_and_queued_once(tmp_path) -> No
     study = begun(tmp_path)
     lost = study.get_trials()[3].params
     for _ in range(2):
-        go_on(search(tmp_path, 5), alone=True)
+        resume_search(search(tmp_path, 5), alone=True)
     again = study.ask(SPACE)
     assert again.params == lost
     assert study.ask(SPACE).params != lost
@@ -57,13 +57,13 @@ def test_a_trial_that_was_cut_off_is_tried_first_and_queued_once(tmp_path) -> No
 
 def test_the_trials_of_others_at_work_are_left_to_them(tmp_path) -> None:
     study = begun(tmp_path)
-    go_on(search(tmp_path, 5), alone=False)
+    resume_search(search(tmp_path, 5), alone=False)
     assert [trial.state.name for trial in study.get_trials()].count("WAITING") == 0
 
 
 def test_a_search_that_has_not_begun_and_a_grid_are_left_alone(tmp_path) -> None:
     cfg = search(tmp_path, 5)
-    go_on(cfg, alone=True)
+    resume_search(cfg, alone=True)
     assert cfg.hydra.sweeper.n_trials == 5
     grid = OmegaConf.create({"hydra": {"sweeper": {"_target_": "hydra…BasicSweeper"}}})
-    go_on(grid, alone=True)
+    resume_search(grid, alone=True)

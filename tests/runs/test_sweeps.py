@@ -13,14 +13,13 @@ from pathlib import Path
 import compare_launchers
 import pandas as pd
 import pytest
+from commands import DATA, HORIZON, run_command, tiny
 from omegaconf import OmegaConf
-from test_entry_points import tiny
 
 from lcc_rl import results, train
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import identity
 from lcc_rl.runs import cli
 from lcc_rl.runs.states import ERROR, Busy, claim
 from lcc_rl.runs.sweeps import (
@@ -175,15 +174,12 @@ def test_objectives_are_columns_of_the_summary(tmp_path) -> None:
         train.run(tiny("train", "objective=kj_per_k"), tmp_path / "b")
 
 
-def sweep(cwd: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
-    return subprocess.run(typed, cwd=cwd, capture_output=True, text=True, timeout=300)
+SWEEP = ("experiment=smoke", "variant=idm", *DATA, HORIZON, "sweep=mine")
 
 
 def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path) -> None:
-    words = ["experiment=smoke", "variant=idm", "data.platoons=4", "data.recordings=2"]
-    words += ["agent.time_gap=1.2,-1", "scenario.horizon=40", "sweep=mine"]
-    first = sweep(tmp_path, *words)
+    words = ["lcc_rl.train", "-m", *SWEEP, "agent.time_gap=1.2,-1"]
+    first = run_command(*words, cwd=tmp_path)
     assert first.returncode == 2, first.stderr
     assert "1 of 2 runs failed" in first.stderr
     assert "Traceback" not in first.stderr
@@ -191,7 +187,7 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     folder = tmp_path / "outputs" / "train" / "mine"
     assert read_plan(folder) == Plan(2, ["agent.time_gap"])
     assert results.load(folder)["run"].nunique() == 1
-    second = sweep(tmp_path, *words)
+    second = run_command(*words, cwd=tmp_path)
     assert "finished before" in second.stdout
     assert second.returncode == 2
 
@@ -212,9 +208,7 @@ def on_terminal(cwd: Path, *words: str) -> str:
 
 
 def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
-    words = ["experiment=smoke", "variant=idm", "data.platoons=4", "data.recordings=2"]
-    words += ["agent.time_gap=1.2,1.3,-1", "scenario.horizon=40", "sweep=mine"]
-    shown = on_terminal(tmp_path, *words)
+    shown = on_terminal(tmp_path, *SWEEP, "agent.time_gap=1.2,1.3,-1")
     table, _, end = shown.rpartition("┘")
     assert "waiting" in table
     assert "3 runs: 2 finished, 1 failed" in end

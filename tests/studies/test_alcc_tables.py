@@ -6,6 +6,7 @@ import pytest
 from study_frames import episodes, training
 
 from lcc_rl.results.tables import per_seed, savings
+from lcc_rl.studies.alcc import paper_tables
 from lcc_rl.studies.alcc import tables as alcc_tables
 
 # Mean energy of the human driver: + 2 kJ per driver number, + 5 kJ for the second of two profiles.
@@ -82,7 +83,7 @@ def test_a_collision_is_over_the_limit() -> None:
 
 
 def test_table_iv_finds_the_best_and_the_worst_driver() -> None:
-    table = alcc_tables.table_iv(episodes()).set_index(["driver", "strategy", "from"])
+    table = paper_tables.table_iv(episodes()).set_index(["driver", "strategy", "from"])
     ours = table.xs("this study", level="from")
     # Over both profiles; driver 0 is the one that alcc costs 20 kJ.
     assert ours.loc[("worst", "alcc"), "hdv_energy_kj"] == pytest.approx(40.0 + 5.0 + 20.0)
@@ -98,29 +99,29 @@ def test_table_iv_finds_the_best_and_the_worst_driver() -> None:
 
 
 def test_paper_numbers_agree_with_each_other() -> None:
-    for cav, hdv, total in alcc_tables.PAPER_TABLE_IV.values():
+    for cav, hdv, total in paper_tables.PAPER_TABLE_IV.values():
         assert cav + hdv == pytest.approx(total, abs=0.011)
-    reference, alcc = (alcc_tables.PAPER_TABLE_IV[name][2] for name in ("reference", "alcc"))
+    reference, alcc = (paper_tables.PAPER_TABLE_IV[name][2] for name in ("reference", "alcc"))
     assert 100 * (1 - alcc / reference) == pytest.approx(4.38, abs=0.005)
-    human = alcc_tables.PAPER_HUMAN
+    human = paper_tables.PAPER_HUMAN
     assert 100 * (1 - human["A"] / human["B"]) == pytest.approx(22.1, abs=0.05)
 
 
 def test_holistic_counts_drivers_that_are_worse_off() -> None:
-    table = alcc_tables.holistic(episodes())
+    table = paper_tables.holistic(episodes())
     assert table["drivers_worse_off"].tolist() == ["1 of 3", "1 of 3", "138 of 923"]
     assert table.loc[0, "worst_driver_pct"] == pytest.approx(100 * (1 - 151 / 140))
 
 
 def test_generalization_has_every_profile_and_the_papers_four() -> None:
-    table = alcc_tables.generalization(episodes())
+    table = paper_tables.generalization(episodes())
     assert len(table) == 2
     human = 2.0 + 20.0 / 3
     assert table.loc[1, "saving_pct"] == pytest.approx(
         100 * (1 - (86.0 + 50.0 + human) / (85.0 + 60.0 + 2.0))
     )
     assert table.loc[0, "reference_energy_kj"] == pytest.approx(85.0 + 52.0)
-    row = alcc_tables.generalization_row(episodes())
+    row = paper_tables.generalization_row(episodes())
     assert row["profiles"].tolist() == [2, 2, 4]
     assert row.loc[2, "median_pct"] == pytest.approx((7.00 + 8.04) / 2)
     headline = alcc_tables.headline(episodes()).set_index(["strategy", "against"])
@@ -128,7 +129,7 @@ def test_generalization_has_every_profile_and_the_papers_four() -> None:
 
 
 def test_human_energy_by_hand() -> None:
-    table = alcc_tables.human_energy(episodes()).set_index(["behind", "energy"])
+    table = paper_tables.human_energy(episodes()).set_index(["behind", "energy"])
     row = table.loc[("reference", "raw")]
     assert row["scenario_A_kj"] == pytest.approx(57.0)
     assert row["scenario_B_kj"] == pytest.approx(67.0)

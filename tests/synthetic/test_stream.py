@@ -22,8 +22,9 @@ from lcc_rl.drivers.population import bootstrap, fixed
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.io.files import read_parquet
+from lcc_rl.synthetic.lane import Stream, draw_drivers
 from lcc_rl.synthetic.stop_and_go import StopAndGo, jumps, stratified_normal
-from lcc_rl.synthetic.stream import Stream, StreamSource, draw_drivers, truth_path
+from lcc_rl.synthetic.stream import StreamSource, truth_path
 
 SMALL: dict[str, Any] = {"recordings": 2, "platoons": 4, "vehicles": 3, "duration_s": (35.0, 50.0)}
 MATCH = 0.15  # the accepted deviation of every compared number

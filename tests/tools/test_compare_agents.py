@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from pathlib import Path
 
+import compare_agents as tool
 import pandas as pd
 import pytest
+from agent_results import course
 from helpers import compose
 
 from lcc_rl import train
@@ -15,13 +16,6 @@ from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.runs import save_config
-
-PATH = Path(__file__).parents[2] / "tools" / "compare_agents.py"
-SPEC = importlib.util.spec_from_file_location("compare_agents", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-tool = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(tool)
 
 
 def fabricate(folder: Path, variant: str, energy: float, *overrides: str) -> None:
@@ -32,6 +26,7 @@ def fabricate(folder: Path, variant: str, energy: float, *overrides: str) -> Non
             "strategy": variant,
             "total_energy_kj": [energy - 1.0, energy + 1.0],
             "total_net_energy_kj": energy,
+            "total_acceleration_loss_kj": 0.2 * energy,
             "share_ttc_unsafe": 0.0,
             "share_time_gap_long": [0.0, 0.02],
             "collided": False,
@@ -77,7 +72,7 @@ def test_policies_kept_on_the_way_are_evaluated_once(tmp_path) -> None:
     for path in (folder / "policies").iterdir():
         path.unlink()
     tool.evaluate_kept(options)  # there is nothing to evaluate: what was done stays
-    assert tool.course(folder)["total_energy_kj"].notna().tolist() == [True, False, True]
+    assert course(folder)["total_energy_kj"].notna().tolist() == [True, False, True]
     assert tool.main(["agents", "--draw", "--out", str(tmp_path)]) == 0
 
 
@@ -117,7 +112,7 @@ def test_every_run_it_would_start_composes(part, tmp_path) -> None:
     words = [part, "--seeds", "1", "--out", str(tmp_path), "experiment=smoke"]
     options, overrides = tool.parser().parse_known_args(words)
     options.overrides = overrides
-    runs = tool.PARTS[part][0](options)
+    runs = [*tool.PARTS[part][0](options), tool.human(options)]
     assert len(runs) == {"agents": 4 * 2 + 1, "knowledge": 7}[part]
     assert len({run.folder for run in runs}) == len(runs)
     for run in runs:

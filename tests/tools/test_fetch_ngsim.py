@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from types import ModuleType
 from urllib.parse import parse_qs, urlparse
 
+import fetch_ngsim
 import pytest
 
 from lcc_rl.data.ngsim import read_ngsim
 
-TOOL = Path(__file__).resolve().parents[2] / "tools" / "fetch_ngsim.py"
+Capture = pytest.CaptureFixture[str]
 HEADER = (
     '"vehicle_id","frame_id","total_frames","global_time","local_x","local_y","global_x",'
     '"global_y","v_length","v_width","v_class","v_vel","v_acc","lane_id","o_zone","d_zone",'
@@ -78,17 +76,6 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fetch_ngsim", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fetch_ngsim"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
 def portal() -> Iterator[Portal]:
     with Portal() as server:
@@ -99,9 +86,9 @@ def portal() -> Iterator[Portal]:
         thread.join()
 
 
-def run(tool: ModuleType, portal: Portal, output: Path, *options: str) -> int:
+def run(portal: Portal, output: Path, *options: str) -> int:
     common = ["--base-url", portal.url, "--output", str(output), "--page-rows", "10"]
-    return int(tool.main([*common, "--pause", "0.01", "--retries", "2", *options]))
+    return int(fetch_ngsim.main([*common, "--pause", "0.01", "--retries", "2", *options]))
 
 
 def ids(path: Path) -> list[int]:
@@ -111,10 +98,10 @@ def ids(path: Path) -> list[int]:
 
 
 def test_a_location_arrives_whole_and_is_readable(
-    tool: ModuleType, portal: Portal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    portal: Portal, tmp_path: Path, capsys: Capture
 ) -> None:
     output = tmp_path / "new" / "i80.csv"
-    assert run(tool, portal, output, "--location", "i-80") == 0
+    assert run(portal, output, "--location", "i-80") == 0
     assert ids(output) == list(range(1, 26))
     assert portal.pages() == ["0", "10", "20"]
     assert [path.name for path in output.parent.iterdir()] == ["i80.csv"]
@@ -126,8 +113,8 @@ def test_a_location_arrives_whole_and_is_readable(
     assert "min left" in printed
 
 
-def test_all_locations(tool: ModuleType, portal: Portal, tmp_path: Path) -> None:
-    assert run(tool, portal, tmp_path / "all.csv") == 0
+def test_all_locations(portal: Portal, tmp_path: Path) -> None:
+    assert run(portal, tmp_path / "all.csv") == 0
     assert len(ids(tmp_path / "all.csv")) == 35
 
 
@@ -140,46 +127,42 @@ def fail_from(offset: int, status: int = 503) -> Callable[..., tuple[int, bytes,
     return spoil
 
 
-def test_an_interrupted_download_goes_on_where_it_stopped(
-    tool: ModuleType, portal: Portal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_interrupted_download_is_resumed(
+    portal: Portal, tmp_path: Path, capsys: Capture
 ) -> None:
     output = tmp_path / "i80.csv"
     portal.spoil = fail_from(20)
-    assert run(tool, portal, output, "--location", "i-80") == 1
+    assert run(portal, output, "--location", "i-80") == 1
     assert not output.exists()
     assert portal.pages() == ["0", "10", "20", "20", "20"]  # tried three times
     assert "failed 3 times, last: 503" in capsys.readouterr().err
     with open(tmp_path / ".i80.csv.part", "ab") as file:
         file.write(b'"half a pa')  # a page that was cut off while it was written
     portal.spoil, portal.asked = None, []
-    assert run(tool, portal, output, "--location", "i-80") == 0
+    assert run(portal, output, "--location", "i-80") == 0
     assert portal.pages() == ["20"]
     assert ids(output) == list(range(1, 26))
-    assert "going on from 20 of 25 rows" in capsys.readouterr().out
+    assert "resuming from 20 of 25 rows" in capsys.readouterr().out
 
 
-def test_a_partial_file_of_another_query_is_not_continued(
-    tool: ModuleType, portal: Portal, tmp_path: Path
-) -> None:
+def test_a_partial_file_of_another_query_is_not_continued(portal: Portal, tmp_path: Path) -> None:
     output = tmp_path / "file.csv"
     portal.spoil = fail_from(20)
-    assert run(tool, portal, output, "--location", "i-80") == 1
+    assert run(portal, output, "--location", "i-80") == 1
     portal.spoil = None
-    assert run(tool, portal, output, "--location", "us-101") == 0
+    assert run(portal, output, "--location", "us-101") == 0
     assert ids(output) == list(range(1, 11))
 
 
 @pytest.mark.parametrize("state", ["", "{}", "[1]", '{"query": 1, "total": 25, "x": 2}'])
-def test_a_damaged_state_begins_again(
-    tool: ModuleType, portal: Portal, tmp_path: Path, state: str
-) -> None:
+def test_a_damaged_state_begins_again(portal: Portal, tmp_path: Path, state: str) -> None:
     (tmp_path / ".i80.csv.state").write_text(state)
     (tmp_path / ".i80.csv.part").write_text("junk")
-    assert run(tool, portal, tmp_path / "i80.csv", "--location", "i-80") == 0
+    assert run(portal, tmp_path / "i80.csv", "--location", "i-80") == 0
     assert ids(tmp_path / "i80.csv") == list(range(1, 26))
 
 
-def test_failures_that_pass_are_retried(tool: ModuleType, portal: Portal, tmp_path: Path) -> None:
+def test_failures_that_pass_are_retried(portal: Portal, tmp_path: Path) -> None:
     failures = iter([(500, b"", 0), (200, b"cut", 900), (429, b"", 0), (200, b"", 50)])
 
     def spoil(query: dict[str, str], content: bytes) -> tuple[int, bytes, int]:
@@ -190,16 +173,14 @@ def test_failures_that_pass_are_retried(tool: ModuleType, portal: Portal, tmp_pa
         )
 
     portal.spoil = spoil
-    assert run(tool, portal, tmp_path / "i80.csv", "--location", "i-80") == 0
+    assert run(portal, tmp_path / "i80.csv", "--location", "i-80") == 0
     assert ids(tmp_path / "i80.csv") == list(range(1, 26))
     assert next(failures, None) is None
 
 
-def test_refusals_are_not_retried(
-    tool: ModuleType, portal: Portal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refusals_are_not_retried(portal: Portal, tmp_path: Path, capsys: Capture) -> None:
     portal.spoil = fail_from(0, status=404)
-    assert run(tool, portal, tmp_path / "i80.csv") == 1
+    assert run(portal, tmp_path / "i80.csv") == 1
     assert len(portal.asked) == 1
     assert "404" in capsys.readouterr().err
 
@@ -239,38 +220,33 @@ def generous(query: dict[str, str], content: bytes) -> tuple[int, bytes, int]:
     ],
 )
 def test_a_wrong_answer_never_becomes_the_file(
-    tool: ModuleType,
     portal: Portal,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capture,
     spoil: Callable[..., tuple[int, bytes, int]],
     message: str,
 ) -> None:
     output = tmp_path / "i80.csv"
     portal.spoil = spoil
-    assert run(tool, portal, output, "--location", "i-80") == 1
+    assert run(portal, output, "--location", "i-80") == 1
     assert message in capsys.readouterr().err
     assert not output.exists()
     portal.spoil = None  # and the next attempt succeeds
-    assert run(tool, portal, output, "--location", "i-80") == 0
+    assert run(portal, output, "--location", "i-80") == 0
     assert sorted(set(ids(output))) == list(range(1, 26))
     assert len(ids(output)) == 25
 
 
-def test_no_connection(
-    tool: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_connection(tmp_path: Path, capsys: Capture) -> None:
     arguments = ["--base-url", "http://127.0.0.1:9", "--output", str(tmp_path / "x.csv")]
-    assert tool.main([*arguments, "--retries", "1", "--pause", "0.01"]) == 1
+    assert fetch_ngsim.main([*arguments, "--retries", "1", "--pause", "0.01"]) == 1
     error = capsys.readouterr().err
     assert "http://127.0.0.1:9/resource/8ect-6jqj.json" in error
     assert "failed 2 times" in error
 
 
-def test_an_existing_file_is_kept(
-    tool: ModuleType, portal: Portal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_existing_file_is_kept(portal: Portal, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "i80.csv").write_text("mine")
-    assert run(tool, portal, tmp_path / "i80.csv") == 1
+    assert run(portal, tmp_path / "i80.csv") == 1
     assert "exists already" in capsys.readouterr().err
     assert (tmp_path / "i80.csv").read_text() == "mine"

@@ -14,8 +14,9 @@ from scipy.optimize import differential_evolution
 
 from benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.drivers.idm_fit import DEFAULT_BOUNDS, fit
+from lcc_rl.drivers.idm_fit import fit
 from lcc_rl.drivers.observed import Observed, observe
+from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants
 
 NAMES = ("desired_speed", "time_gap")

@@ -1,8 +1,6 @@
-"""Figures of the ALCC study over seeds, each from parquet alone; the paper's number is named."""
+"""Figures of the ALCC study, with the numbers of their counterparts in the paper."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -13,14 +11,10 @@ from matplotlib.figure import Figure
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.drawing import new_figure
 from lcc_rl.results.figures import colour, draw_curve, style
-from lcc_rl.results.tables import HUMANS, paired, per_seed, savings
-from lcc_rl.studies.alcc.tables import (
-    PAPER_GENERALIZATION,
-    comparison,
-    generalization,
-)
+from lcc_rl.results.tables import by_driver, savings
+from lcc_rl.studies.alcc.comparison_figures import INK, SOFT, whiskers
+from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 
-INK, SOFT = "#222222", "#8a8a8a"
 TERMS = {
     "episode_reward": "total reward",
     "reward_safety": "safety (TTC)",
@@ -69,7 +63,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
             line, labels[str(variant)] = draw_curve(axis, rows, name, str(variant))
             floor = min(floor, float(line.iloc[len(line) // 5 :].min()))
             top = max(top, float(line.max()))
-        # As in the learning curve: the first, random episodes would set the scale.
+        # The first, random episodes would set the scale.
         axis.set_ylim(1.5 * floor - 0.2, top + 0.05 * (top - floor) + 0.05)
         style(axis, "", "")
         axis.set_title(label, fontsize=10)
@@ -93,22 +87,22 @@ def distributions(episodes: pd.DataFrame) -> Figure:
     axes = figure.subplots(1, 2)
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
     for axis, vehicle in zip(axes, ("cav", "hdv"), strict=True):
-        by_driver = paired(episodes, f"{vehicle}_energy_kj").groupby("driver_id").mean()
+        energy = by_driver(episodes, f"{vehicle}_energy_kj")
         for place, name in enumerate(names):
-            if name in by_driver:
-                _flat_box(axis, by_driver[name].to_numpy(float), place, colour(name))
+            if name in energy:
+                _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
         axis.set_yticks(range(len(names)), names if vehicle == "cav" else [""] * len(names))
         axis.set_ylim(len(names) - 0.4, -0.6)
         axis.margins(x=0.12)
         style(axis, "energy [kJ per episode]", "")
-        axis.set_title(f"{titles[vehicle]}, n = {len(by_driver)} drivers", fontsize=10)
+        axis.set_title(f"{titles[vehicle]}, n = {len(energy)} drivers", fontsize=10)
     note = "box: quartiles; whiskers: 5th to 95th percentile; diamond and number: mean"
     figure.supxlabel(note, fontsize=8, color=SOFT)
     return figure
 
 
 def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
-    """Draw one lying box with its mean beside it."""
+    """Draw a horizontal box with its mean beside it."""
     lowest, low, median, high, highest = np.percentile(values, [5, 25, 50, 75, 95])
     axis.hlines(place, lowest, highest, color=hue, lw=1.2)
     axis.barh(place, high - low, 0.5, low, color=hue, alpha=0.35, edgecolor=hue)
@@ -132,7 +126,7 @@ def generalization_figure(
     values, places = table["saving_pct"].to_numpy(float), np.arange(len(table))
     figure = new_figure(9.0, 4.0)
     axis = figure.subplots()
-    _whiskers(axis, places, table, "saving_pct", colour(strategy), upright=True)
+    whiskers(axis, places, table, "saving_pct", colour(strategy), upright=True)
     axis.plot(places, values, "o", color=colour(strategy), label=_label(episodes, strategy))
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
     axis.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label="paper, 4 profiles")
@@ -152,7 +146,7 @@ def generalization_figure(
 
 
 def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
-    """Scale an axis by the bulk of its values, and write those beyond it at its border."""
+    """Scale an axis by most of its values, and write the outliers at its border."""
     limit = 2.0 * max(float(np.percentile(np.abs(values), 85)), max(PAPER_GENERALIZATION))
     axis.set_ylim(-limit, limit)
     for place, value in zip(places, values, strict=True):
@@ -174,141 +168,3 @@ def _label(episodes: pd.DataFrame, strategy: str) -> str:
     if seeds > 1:
         return f"this study, mean of {seeds} seeds, 95 % interval"
     return "this study, 1 seed (no interval)"
-
-
-def _whiskers(
-    axis: Axes,
-    places: Sequence[float] | np.ndarray,
-    table: pd.DataFrame,
-    column: str,
-    hue: str,
-    upright: bool = False,
-) -> None:
-    """Draw the intervals of a column, where it has any."""
-    low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
-    draw = axis.vlines if upright else axis.hlines
-    draw(places, low, high, color=hue, lw=2.0, alpha=0.6)
-
-
-PANELS = {
-    "saving_against_idm_pct": ("total energy saved\nagainst idm [%]", 0.0),
-    "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
-    "long_time_gap_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
-}
-
-
-def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
-    """What each change of the study does to energy, safety and efficiency (no counterpart).
-
-    Args:
-        episodes: rows of the evaluations; those of the study itself come first.
-        by: the column that names the change.
-    """
-    table = comparison(episodes, by)
-    names = list(dict.fromkeys(table[by]))
-    figure = new_figure(10.0, 1.3 + 0.42 * len(names))
-    axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
-    for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
-        strategies = list(dict.fromkeys(table["strategy"]))
-        for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
-            part = table[table["strategy"] == strategy]
-            rows = [names.index(name) + offset for name in part[by]]
-            _whiskers(axis, rows, part, column, colour(strategy))
-            axis.plot(part[column], rows, "o", color=colour(strategy), ms=5, label=strategy)
-        axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
-        axis.axhline(0.5, color=SOFT, lw=0.6)
-        axis.grid(visible=True, axis="x", color="#e6e6e6", linewidth=0.8)
-        axis.set_axisbelow(True)
-        style(axis, label, "")
-        axis.tick_params(axis="y", length=0)
-    axes[0].set_yticks(range(len(names)), [str(name).replace("_", " ") for name in names])
-    axes[0].set_ylim(len(names) - 0.4, -0.6)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
-    note = f"n = {_how_many(table['seeds'])}; lines: 95 % interval; dashed: the study's limit"
-    figure.supxlabel(note, fontsize=8, color=SOFT)
-    return figure
-
-
-def _how_many(seeds: pd.Series) -> str:
-    """Write the numbers of seeds of a column, each once, leaving out what was not trained."""
-    counts = sorted({int(count) for count in seeds if str(count).isdigit()})
-    return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
-
-
-def _abreast(count: int, reach: float) -> np.ndarray:
-    """Return evenly spread places around zero, at most ``reach`` from it; one alone is there."""
-    return reach * np.linspace(-1.0, 1.0, count) * (count > 1)
-
-
-def followers_figure(episodes: pd.DataFrame) -> Figure:
-    """What regard for the human drivers behind saves, against their number (no counterpart).
-
-    Args:
-        episodes: rows of the evaluations of all trained strategies, with the column
-            ``followers``.
-    """
-    table = comparison(episodes, "followers")
-    table = table[table["strategy"] != "reference"]
-    column = "saving_against_reference_pct"
-    figure = new_figure(6.5, 3.8)
-    axis = figure.subplots()
-    names = list(dict.fromkeys(table["strategy"]))
-    for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
-        part = table[table["strategy"] == name]
-        label = f"{name}, {_how_many(part['seeds'])}"
-        places = part["followers"].to_numpy(float) + offset
-        axis.plot(places, part[column], "o-", color=colour(name), label=label)
-        _whiskers(axis, places, part, column, colour(name), upright=True)
-    axis.axhline(0.0, color=INK, lw=0.8)
-    axis.legend(frameon=False, loc="lower left")
-    words = "total energy saved\nagainst reference [%]"
-    style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
-    return figure
-
-
-def single_profile_figure(episodes: pd.DataFrame) -> Figure:
-    """One profile for training and evaluation: every seed beside the human (no counterpart).
-
-    Args:
-        episodes: rows of the evaluations, with the column ``study_profile``.
-    """
-    groups = dict(iter(episodes.groupby("study_profile", sort=True)))
-    figure = new_figure(max(7.5, 1.8 + 1.9 * len(groups)), 4.2)
-    axis = figure.subplots()
-    seen: set[str] = set()
-    for place, part in enumerate(groups.values()):
-        energy = per_seed(part, "total_energy_kj")
-        human = float(energy["idm"].mean())
-        axis.hlines(human, place - 0.36, place + 0.36, color=colour("idm"), lw=2.5)
-        _once(axis, seen, "idm", "idm (human driver)", "-")
-        learned = [name for name in energy if name not in HUMANS]
-        for number, strategy in enumerate(sorted(learned, reverse=True)):
-            values = energy[strategy].to_numpy(float)
-            centre = place - 0.16 + 0.32 * number
-            jitter = centre + _abreast(len(values), 0.1)
-            axis.plot(jitter, values, "o", color=colour(strategy), ms=5, alpha=0.6, mew=0)
-            axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=colour(strategy), lw=2)
-            _once(axis, seen, strategy, f"{strategy}: seeds and mean", "o")
-    labels = [f"profile {name!s}\n{_gain(part)}" for name, part in groups.items()]
-    axis.set_xticks(range(len(groups)), labels, fontsize=9)
-    axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-    style(axis, "profile used for training and evaluation", "total energy [kJ per episode]")
-    figure.legend(loc="outside upper center", frameon=False, ncols=3)
-    return figure
-
-
-def _gain(episodes: pd.DataFrame) -> str:
-    """Write what regard for the driver behind brings on one profile."""
-    energy = per_seed(episodes, "total_energy_kj")
-    if not {"alcc", "reference"} <= set(energy):
-        return ""
-    # Not a percentage: in a jam a profile's energy can be near zero.
-    return f"alcc {energy['alcc'].mean() - energy['reference'].mean():+.1f} kJ\nagainst reference"
-
-
-def _once(axis: Axes, seen: set[str], strategy: str, label: str, mark: str) -> None:
-    """Put a strategy into the legend the first time it appears."""
-    if strategy not in seen:
-        seen.add(strategy)
-        axis.plot([], [], mark, color=colour(strategy), label=label)

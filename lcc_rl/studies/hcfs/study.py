@@ -1,65 +1,56 @@
-"""Study room: the HCFS study, from drive cycles to every training and evaluation that it needs."""
+"""The HCFS study: trainings and evaluations from drive cycles to parquet files."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import pandas as pd
 from omegaconf import DictConfig
 
-from lcc_rl.config import load, require
-from lcc_rl.envs.factory import Inputs, build_policy, load_inputs
-from lcc_rl.evaluation.monte_carlo import Strategy
-from lcc_rl.evaluation.platoon_cases import (
-    LEARNED,
-    changed,
-    evaluate_and_write,
-    load_learned,
-    named_gains,
-    yardsticks,
+from lcc_rl.commands.evaluation import evaluate_and_write
+from lcc_rl.commands.pipeline import known_settings
+from lcc_rl.config import load, plain
+from lcc_rl.envs import Inputs, load_inputs
+from lcc_rl.evaluation.strategies import (
+    Strategy,
+    baselines,
+    check_policy,
+    driven_by,
+    with_weights,
 )
-from lcc_rl.pipeline import known_settings
-from lcc_rl.results.runs import identity, load_config, save_config
+from lcc_rl.results.runs import load_policy, save_config
 from lcc_rl.runs.cli import prepare_torch
-from lcc_rl.studies.runner import FINISHED, Outcome, Run, note, note_problems, run_all
-from lcc_rl.train import EPISODES
+from lcc_rl.studies.runner import (
+    EPISODES,
+    FINISHED,
+    BaseStudy,
+    Outcome,
+    Run,
+    note,
+    note_problems,
+    run_all,
+    up_to_date,
+)
 
 log = logging.getLogger("lcc_rl")
 
-YARDSTICKS = "yardsticks"
+LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
+BASELINES = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
 
 
 @dataclass(frozen=True)
-class Study:
-    """What to run, and where.
+class Study(BaseStudy):
+    """The settings of the HCFS study; its trainings are those of the DDPG parent."""
 
-    Args:
-        folder: where everything goes.
-        recipe: ``experiment`` of every training.
-        seeds: trainings of the DDPG parent, numbered from 0.
-        overrides: further settings of every run.
-        jobs: trainings at a time.
-        accept: settings in which a run found in the folder may differ.
-    """
-
-    folder: Path
-    recipe: str = "paper_hcfs"
-    seeds: int = 8
-    overrides: tuple[str, ...] = ()
-    jobs: int = 2
-    accept: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("seeds", "jobs"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1")
+    recipe: str | None = "paper_hcfs"
 
     def runs(self) -> list[Run]:
         """Return a training of the DDPG parent per seed."""
-        # Every strategy drives the whole record in the evaluation; a training need not.
+        # Only the study's evaluation drives the full-length record.
         own = (f"experiment={self.recipe}", f"variant={LEARNED}", *self.overrides)
         return [
             Run(
@@ -76,14 +67,14 @@ class Study:
 
 
 def run(study: Study, command: str = "") -> list[Outcome]:
-    """Train the DDPG parents and evaluate every strategy; whatever is finished is skipped.
+    """Train the DDPG parents and evaluate every strategy; finished runs are skipped.
 
     Args:
-        study: what to run.
-        command: what was typed, to be kept in the folder.
+        study: the settings.
+        command: the command line, stored in the folder's notes.
 
     Returns:
-        What became of every training.
+        The outcome of every training.
 
     Raises:
         LccError: one clear error for wrong settings or files.
@@ -96,61 +87,59 @@ def run(study: Study, command: str = "") -> list[Outcome]:
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     target = study.folder / "evaluation"
-    _evaluate(yardsticks(cfg), cfg, inputs, target / YARDSTICKS, None)
+    _evaluate(baselines(cfg), cfg, inputs, target / BASELINES)
     done = [outcome.run.folder for outcome in outcomes if outcome.status == FINISHED]
     for number, folder in enumerate(sorted(done)):
-        # The whole record is long: the first training drives it for all.
+        # Of the trainings only the first drives the full-length record, which takes long.
         own = study.evaluation(
             f"policy='{folder}'", *(() if number == 0 else ("evaluation.full_length=false",))
         )
-        agent, learned = load_learned(own, inputs)
-        strategies = hybrid_strategies(own, agent.policy, learned.seed)
+        weights, trained = load_policy(folder)
+        check_policy(own, trained)
+        own.agent = trained.agent
+        learned = with_weights(own, weights, trained.seed, str(folder), inputs.population)
+        strategies = hybrid_strategies(own, learned)
         _evaluate(strategies, own, inputs, target / folder.name, folder)
     return outcomes
 
 
-def hybrid_strategies(cfg: DictConfig, learned: object, seed: int) -> list[Strategy]:
-    """Build the DDPG parent and every hybrid of it that the study compares.
+def hybrid_strategies(cfg: DictConfig, learned: Strategy) -> list[Strategy]:
+    """Build the DDPG parent and the hybrids that the study compares.
 
     ``hcfs``: as configured, with the tuned rule; ``hcfs untuned``: with the paper-like rule;
-    ``hcfs J=10``: a jerk bound that binds; ``hcfs literal``: without the clamp to that bound and
-    without the safe cap, as printed; ``hcfs oracle``: knows the leader's next speed.
+    ``hcfs J=10``: jerk bound of 10 m/s³; ``hcfs literal``: as printed, without the clamp to that
+    bound and without the safe cap; ``hcfs oracle``: knows the leader's next speed.
+
+    Args:
+        cfg: configuration of the evaluation of ``hcfs``.
+        learned: the trained policy, driving alone.
     """
-    untuned = cfg.copy()
-    for name, gain in named_gains(UNTUNED).items():
-        untuned.controller.rule[name] = gain
-    kinds = {
-        "hcfs": cfg,
-        "hcfs untuned": untuned,
-        "hcfs J=10": changed(cfg, jerk_bound=10.0),
-        "hcfs literal": changed(cfg, jerk_bound=10.0, clamp=False, safe_cap=False),
-        "hcfs oracle": changed(cfg, lookahead="oracle"),
+    hybrid = plain(cfg.deployed)
+    gains = plain(load("evaluate", ["variant=cacc", f"gains={UNTUNED}"]).gains)
+    changes: dict[str, dict[str, Any]] = {
+        "hcfs": {},
+        "hcfs untuned": {"rule": {**hybrid["rule"], **gains}},
+        "hcfs J=10": {"jerk_bound": 10.0},
+        "hcfs literal": {"jerk_bound": 10.0, "clamp": False, "safe_cap": False},
+        "hcfs oracle": {"lookahead": "oracle"},
     }
+    alone = driven_by(cfg, cfg.scenario.controllers.automated)
     return [
-        Strategy(LEARNED, cfg, learned, seed),
-        *(Strategy(name, own, build_policy(own, learned), seed) for name, own in kinds.items()),
+        replace(learned, name=LEARNED, cfg=alone),
+        *(
+            replace(learned, name=name, cfg=driven_by(cfg, {**hybrid, **change}))
+            for name, change in changes.items()
+        ),
     ]
 
 
 def _evaluate(
-    strategies: Sequence[Strategy],
-    cfg: DictConfig,
-    inputs: Inputs,
-    folder: Path,
-    trained: Path | None,
-) -> pd.DataFrame | None:
-    """Evaluate into a folder, unless it holds the same already."""
-    if _up_to_date(cfg, folder, trained):
-        return None
+    strategies: Sequence[Strategy], cfg: DictConfig, inputs: Inputs, folder: Path, *trained: Path
+) -> None:
+    """Evaluate into a folder, unless that is done."""
+    if up_to_date(cfg, folder, trained):
+        return
     log.info("evaluating %d strategies into %s", len(strategies), folder)
     (folder / EPISODES).unlink(missing_ok=True)  # never beside another configuration
     save_config(cfg, folder)
-    return evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)
-
-
-def _up_to_date(cfg: DictConfig, folder: Path, trained: Path | None) -> bool:
-    table = folder / EPISODES
-    if not table.exists() or identity(load_config(folder)) != identity(cfg):
-        return False
-    newest = 0.0 if trained is None else (trained / "policy.pt").stat().st_mtime
-    return table.stat().st_mtime >= newest
+    evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)

@@ -1,0 +1,116 @@
+"""Options that were given but have no effect, and options of former releases under new names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString, parse_string
+
+AUTO = "scenario.controllers.automated"
+# Former spellings as regular expressions, and what to say instead; \1 is what the bracket holds.
+RENAMED = (
+    (
+        r"scenario\.followers=(.*)",
+        r"scenario.string='automated human*\1' (a platoon: 'automated*\1')",
+    ),
+    (r"variant=barrier", "variant=cbf"),
+    (r"\+filter=barrier", "+filter=cbf"),
+    (r"scenario=direct", "scenario.string=human"),
+    (r"scenario\.pieces\.cav\.initial_gap_range", "training.gap_range"),
+    (r"scenario\.pieces\.cav\.initial_time_gap", "scenario.start.automated.time_gap"),
+    (r"scenario\.pieces\.cav\.standstill_gap", "scenario.start.automated.standstill_gap"),
+    (r"scenario\.pieces\.(?:cav|platoon)\.max_acceleration", f"{AUTO}.max_acceleration"),
+    (r"scenario\.pieces\.hdv\.cap_time_gap", "scenario.start.human.cap_time_gap"),
+    (r"scenario\.pieces\.hdv\.", "scenario.controllers.human."),
+    (r"scenario\.pieces\.platoon\.safe_headway", "scenario.start.automated.headway"),
+    (r"scenario\.pieces\.platoon\.", "scenario.start.automated."),
+    (r"scenario\.pieces\.errors\.", "scenario.pieces.communication."),
+    (r"scenario\.pieces\.barrier\.", "scenario.filters.automated."),
+    (r"scenario\.pieces\.(?:cav|hdv)_(power|ttc|time_gap)\b", r"scenario.pieces.\1"),
+    (r"scenario\.pieces\.hdv_predicted_power", "scenario.pieces.predicted_power"),
+    (r"observation\.scales\.cav", "observation.scales.self"),
+    (r"observation\.scales\.hdv", "observation.scales.behind"),
+    (r"agent=coast", f"controller@{AUTO}=constant agent=none"),
+    (r"agent=(idm|cacc|deadbeat)", rf"controller@{AUTO}=\1 agent=none"),
+    (r"agent\.final_share", "agent.final_lr_fraction"),
+    (r"agent\.sampled=true", f"{AUTO}.desired_speed=null {AUTO}.time_gap=null"),
+    (r"agent\.(desired_speed|time_gap|lookahead|k[1-4])\b", rf"{AUTO}.\1"),
+    (r"controller\.", "deployed."),
+)
+
+
+def renamed_option(overrides: Sequence[str]) -> ConfigError | None:
+    """Return the error for an option of a former release, naming today's; None for none."""
+    for item in overrides:
+        for old, new in RENAMED:
+            if re.match(rf"[~+]*{old}" if not old.startswith(r"\+") else old, item):
+                said = re.sub(rf"^[~+]*{old.lstrip(chr(92) + '+')}", new, item.lstrip("+~"))
+                return ConfigError(f"{item}: this option has a new name; say {said}")
+    return None
+
+
+def check_ignored(cfg: DictConfig, overrides: Sequence[str], sweep: bool = False) -> None:
+    """Refuse options that the configuration at hand would ignore.
+
+    Args:
+        cfg: configuration of a study.
+        overrides: what was typed.
+        sweep: the runs of a sweep share what was typed, so what one of them learns by may be
+            given to another that learns nothing.
+
+    Raises:
+        ConfigError: naming the option and why it has no effect.
+    """
+    if "variant" not in cfg or "scenario" not in cfg:
+        return
+    reasons = dict(_without_effect(cfg, sweep))
+    for item in overrides:
+        key = item.lstrip("+~").partition("=")[0].partition("@")[0]
+        for prefix, reason in reasons.items():
+            if (key == prefix or key.startswith(f"{prefix}.")) and item != "agent=none":
+                raise ConfigError(f"{item} has no effect: {reason}")
+
+
+def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
+    """Yield options that have no effect on a configuration, and why."""
+    scenario = cfg.scenario
+    string = _string(scenario)
+    ring = scenario.road == RING
+    if ring:
+        for key in ("data", "split", "leader"):
+            yield key, "a ring road has no leader"
+    elif cfg.get("leader") is not None and "source" not in cfg.leader:
+        for key in ("data", "split"):
+            yield key, "the leader drives the records of leader=…; say leader=trajectories"
+    if not ring:
+        for key in ("circumference", "vehicle_length", "initial_speed"):
+            yield f"scenario.{key}", "it belongs to scenario.road=ring"
+    if set(string.names) == {AUTOMATED} and not _is_human(scenario.controllers.get(AUTOMATED)):
+        for key in ("drivers", "evaluation.drivers"):
+            yield key, f"there is no human driver in scenario.string={scenario.string}"
+    for group in ("controllers", "start"):
+        for role in scenario[group]:
+            if role not in string.names:
+                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+    if not OmegaConf.is_dict(cfg.get("agent")) or "_target_" not in cfg.agent:
+        for key in () if sweep else ("agent", "training"):
+            yield key, f"variant {cfg.variant} learns nothing"
+    unused = {"episodes": ("full_length",), "vehicles": ("batch_size", "sample_episodes")}
+    for name in unused.get(cfg.evaluation.rows, ()):
+        yield f"evaluation.{name}", f"it is unused with evaluation.rows={cfg.evaluation.rows}"
+
+
+def _string(scenario: Any) -> VehicleString:
+    pattern = scenario.string
+    if isinstance(pattern, DictConfig):
+        pattern = OmegaConf.to_container(pattern)
+    return parse_string(pattern, scenario.road)
+
+
+def _is_human(node: Any) -> bool:
+    return node is not None and str(node.get("_target_", "")).endswith((".IDM", ".Handover"))

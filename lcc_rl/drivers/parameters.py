@@ -1,0 +1,56 @@
+"""Names, table columns and bounds of the IDM parameters that a calibration fits (A6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcc_rl.errors import ConfigError, unknown_name
+
+# Table column of every parameter, in the order of the genes.
+COLUMNS = {
+    "desired_speed": "desired_speed_mps",
+    "time_gap": "time_gap_s",
+    "acceleration": "acceleration_mps2",
+    "deceleration": "deceleration_mps2",
+    "min_gap": "min_gap_m",
+}
+DEFAULT_BOUNDS = {
+    "desired_speed": (5.0, 40.0),
+    "time_gap": (0.3, 4.0),
+    "acceleration": (0.3, 4.0),
+    "deceleration": (0.3, 5.0),
+    "min_gap": (0.5, 5.0),
+}
+MODES = {"local": ("desired_speed", "time_gap"), "global": tuple(COLUMNS)}
+SHARED = ("acceleration", "deceleration", "min_gap")
+# A parameter this close to a bound, as a share of the range, counts as being on it.
+BOUND_TOLERANCE = 0.005
+
+Bounds = Mapping[str, Sequence[float]]
+Limits = dict[str, tuple[float, float]]
+
+
+def checked_bounds(bounds: Bounds | None) -> Limits:
+    """Fill in default bounds and check the given ones.
+
+    Raises:
+        ConfigError: if a parameter is unknown or its bounds are not 0 < lower < upper.
+    """
+    limits = dict(DEFAULT_BOUNDS)
+    for name, pair in (bounds or {}).items():
+        if name not in COLUMNS:
+            raise unknown_name("IDM parameter", name, COLUMNS)
+        if len(pair) != 2 or not 0.0 < pair[0] < pair[1] < np.inf:
+            raise ConfigError(f"bounds of {name!r} must be 0 < lower < upper, got {list(pair)}")
+        limits[name] = (float(pair[0]), float(pair[1]))
+    return limits
+
+
+def at_bound(values: NDArray[np.float64], bounds: tuple[float, float]) -> NDArray[np.bool_]:
+    """Whether parameters lie on their lower or upper bound."""
+    low, high = bounds
+    margin = BOUND_TOLERANCE * (high - low)
+    return (values <= low + margin) | (values >= high - margin)

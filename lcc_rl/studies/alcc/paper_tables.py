@@ -1,0 +1,176 @@
+"""Tables of the ALCC study beside the numbers that the paper prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lcc_rl.results.intervals import share_saved
+from lcc_rl.results.tables import by_driver, driver_savings, per_seed, savings
+from lcc_rl.studies.alcc.tables import KINDS
+
+PAPER, OURS = "paper", "this study"
+NAMES = {"": "raw", "net_": "net of kinetic energy"}  # of the keys of KINDS
+# Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
+PAPER_TABLE_IV = {"reference": (214.85, 193.89, 408.74), "alcc": (226.46, 164.38, 390.84)}
+PAPER_IMPROVEMENT = {"mean": 4.38, "best": 14.43, "worst": -4.92}
+PAPER_WORSE = (138, 923)
+PAPER_GENERALIZATION = (7.00, 8.04, 9.35, 4.62)
+PAPER_HUMAN = {"A": 165.38, "B": 212.39}
+PAPER_HUMAN_SAVING = {"mean": 22.1, "least": 16.7, "most": 34.7}
+
+
+def table_iv(
+    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+) -> pd.DataFrame:
+    """Energies behind the mean, best and worst driver (Table IV of the paper).
+
+    The best driver is the one with the largest saving of total energy over profiles and seeds.
+
+    Returns:
+        Rows for both controllers and each driver, this study's and the paper's: CAV, HDV and
+        total energy [kJ], and the total saved [%], raw and net of kinetic energy.
+    """
+    columns = [f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in KINDS.values()]
+    energies = {column: by_driver(episodes, column) for column in columns}
+    saved = driver_savings(episodes, "total_energy_kj", strategy, baseline)
+    drivers: dict[str, Any] = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
+    rows = []
+    for label, driver in drivers.items():
+        own = {x: t.mean() if driver is None else t.loc[driver] for x, t in energies.items()}
+        for name in (baseline, strategy):
+            row: dict[str, object] = {"driver": label, "strategy": name, "from": OURS}
+            row |= {column: energy[name] for column, energy in own.items()}
+            for kind, column in KINDS.items():
+                energy = own[f"total_{column}"]
+                share = 100.0 * share_saved(energy[strategy], energy[baseline])
+                row[f"{kind}saving_pct"] = share if name == strategy else np.nan
+            rows += [row, *_paper_row(label, name, strategy)]
+    return pd.DataFrame(rows)
+
+
+def _paper_row(driver: str, name: str, strategy: str) -> list[dict[str, object]]:
+    """Return the paper's row: energies of the mean driver, savings only of the others."""
+    row: dict[str, object] = {"driver": driver, "strategy": name, "from": PAPER}
+    if driver == "mean" and name in PAPER_TABLE_IV:
+        keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
+        row |= dict(zip(keys, PAPER_TABLE_IV[name], strict=True))
+    if name == strategy == "alcc":
+        row["saving_pct"] = PAPER_IMPROVEMENT[driver]
+    return [row] if len(row) > 3 else []
+
+
+def holistic(
+    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+) -> pd.DataFrame:
+    """Saving of the total energy per driver beside the paper's (Fig. 10): one row each."""
+    rows = []
+    for kind, column in KINDS.items():
+        found = savings(episodes, f"total_{column}", strategy, baseline)
+        saved = 100.0 * driver_savings(episodes, f"total_{column}", strategy, baseline)
+        rows.append(
+            {
+                "from": f"{OURS}, {NAMES[kind]}",
+                **found.columns("mean_saving_pct", 100.0),
+                "best_driver_pct": saved.max(),
+                "worst_driver_pct": saved.min(),
+                "drivers_worse_off": f"{int((saved < 0).sum())} of {len(saved)}",
+            }
+        )
+    columns = ("mean_saving_pct", "best_driver_pct", "worst_driver_pct")
+    paper = dict(zip(columns, PAPER_IMPROVEMENT.values(), strict=True))
+    rows.append({"from": PAPER, **paper, "drivers_worse_off": "{} of {}".format(*PAPER_WORSE)})
+    return pd.DataFrame(rows)
+
+
+def generalization(
+    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+) -> pd.DataFrame:
+    """Saving of the total energy on every held-out profile, with its interval over seeds.
+
+    Returns:
+        One row per profile: the baseline's mean energy [kJ], ``saving_pct`` and
+        ``net_saving_pct`` of the strategy against the baseline, and ``saving_against_idm_pct``.
+    """
+    rows = []
+    for profile, part in episodes.groupby("profile_id", sort=True):
+        row: dict[str, object] = {"profile_id": profile, "profile": part["profile"].iloc[0]}
+        row[f"{baseline}_energy_kj"] = per_seed(part, "total_energy_kj")[baseline].mean()
+        for kind, column in KINDS.items():
+            found = savings(part, f"total_{column}", strategy, baseline)
+            row |= found.columns(f"{kind}saving_pct", 100.0)
+        against = savings(part, "total_energy_kj", strategy, "idm")
+        rows.append(row | against.columns("saving_against_idm_pct", 100.0))
+    return pd.DataFrame(rows)
+
+
+def generalization_row(
+    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+) -> pd.DataFrame:
+    """Distribution of the savings over held-out profiles, beside the paper's four profiles.
+
+    Returns:
+        Rows for this study's raw and net energy and for the paper: ``together_pct``, the saving
+        of the energy of all profiles, and the least, median and largest of a profile.
+    """
+    table = generalization(episodes, strategy, baseline)
+    rows = []
+    for kind, column in KINDS.items():
+        together = savings(episodes, f"total_{column}", strategy, baseline)
+        spread = _spread(table[f"{kind}saving_pct"].tolist())
+        row = {"from": f"{OURS}, {NAMES[kind]}", **together.columns("together_pct", 100.0)}
+        rows.append(row | spread)
+    return pd.DataFrame([*rows, {"from": PAPER, **_spread(PAPER_GENERALIZATION)}])
+
+
+def _spread(values: Sequence[float]) -> dict[str, float | int]:
+    numbers = np.asarray(values, float)
+    return {
+        "profiles": len(numbers),
+        "least_pct": float(numbers.min()),
+        "median_pct": float(np.median(numbers)),
+        "most_pct": float(numbers.max()),
+        "profiles_with_saving": int((numbers > 0).sum()),
+    }
+
+
+def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Human driver's energy behind a controlled car (A) and directly behind the leader (B; Fig. 9).
+
+    Returns:
+        One row per strategy and kind of energy: both means [kJ], the saving of A [%] with its
+        interval over seeds, and the least and largest saving of a driver.
+    """
+    rows: list[dict[str, object]] = []
+    for strategy in per_seed(episodes, "total_energy_kj"):
+        for kind, column in KINDS.items():
+            found = savings(episodes, f"hdv_{column}", strategy, "direct")
+            energy = by_driver(episodes, f"hdv_{column}")
+            saved = 100.0 * share_saved(energy[strategy], energy["direct"])
+            rows.append(
+                {
+                    "behind": strategy,
+                    "energy": NAMES[kind],
+                    "scenario_A_kj": energy[strategy].mean(),
+                    "scenario_B_kj": energy["direct"].mean(),
+                    **found.columns("saving_pct", 100.0),
+                    "least_driver_pct": saved.min(),
+                    "most_driver_pct": saved.max(),
+                    "drivers_better_off": f"{int((saved > 0).sum())} of {len(saved)}",
+                }
+            )
+    rows.append(
+        {
+            "behind": f"alcc ({PAPER})",
+            "energy": "raw",
+            "scenario_A_kj": PAPER_HUMAN["A"],
+            "scenario_B_kj": PAPER_HUMAN["B"],
+            "saving_pct": PAPER_HUMAN_SAVING["mean"],
+            "least_driver_pct": PAPER_HUMAN_SAVING["least"],
+            "most_driver_pct": PAPER_HUMAN_SAVING["most"],
+        }
+    )
+    return pd.DataFrame(rows)

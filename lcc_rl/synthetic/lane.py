@@ -1,0 +1,174 @@
+"""Platoons of IDM drivers behind stochastic leaders on one lane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lcc_rl.data.units import FRAME
+from lcc_rl.drivers.parameters import COLUMNS
+from lcc_rl.drivers.population import DriverPopulation
+from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
+from lcc_rl.synthetic.stop_and_go import StopAndGo
+
+Array = NDArray[np.float64]
+
+# A driver whose desired speed is below this multiple of its platoon's level would fall behind.
+KEEPS_UP = 1.2
+WARM_UP_S = 30.0  # driven but not recorded, so that no pair starts in equilibrium
+PAUSE_S = 20.0  # between the platoons of a recording
+AUTOMOBILE = 2  # NGSIM vehicle class
+LENGTHS_M = (4.6, 0.45, 3.5, 6.0)  # mean, standard deviation and range of automobile lengths
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A synthetic stream.
+
+    Args:
+        samples: one row per vehicle and frame in SI units, with the columns that
+            :func:`lcc_rl.data.ngsim_writer.write_ngsim` needs, and time_s. Positions are of the
+            front bumper; acceleration is the backward difference of speed.
+        truth: one row per IDM driver: recording, vehicle, preceding, and its parameters
+            desired_speed_mps, time_gap_s, acceleration_mps2, deceleration_mps2, min_gap_m.
+    """
+
+    samples: pd.DataFrame
+    truth: pd.DataFrame
+
+
+def drive_platoons(
+    leader: StopAndGo,
+    drivers: DriverPopulation,
+    vehicles: int,
+    seen: NDArray[np.int64],
+    noise: float,
+    generator: np.random.Generator,
+) -> Stream:
+    """Simulate platoons that drive one after another on one lane.
+
+    Args:
+        leader: stochastic leader of every platoon.
+        drivers: population from which the followers are drawn.
+        vehicles: vehicles per platoon, the leader included.
+        seen: recorded steps of every platoon ``[platoons]``.
+        noise: relative noise of the drivers' acceleration (A18).
+        generator: source of all randomness.
+    """
+    warm_up = round(WARM_UP_S / FRAME)
+    steps = warm_up + int(seen.max())
+    ahead, level = leader.drive(len(seen), steps, FRAME, generator)
+    shape = (vehicles - 1, len(seen))
+    ranks = [drivers.select(row) for row in draw_drivers(drivers, level, shape, generator)]
+    xi = torch.from_numpy(generator.uniform(0.0, noise, (steps, *shape)))
+    speed, gap = follow(torch.from_numpy(ahead), ranks, xi)
+    mean, spread, shortest, longest = LENGTHS_M
+    length = generator.normal(mean, spread, (vehicles, len(seen))).clip(shortest, longest)
+    samples = _samples(speed, _positions(speed, gap, length), length, warm_up, seen)
+    return Stream(samples, _truth(ranks))
+
+
+def draw_drivers(
+    drivers: DriverPopulation, level: Array, shape: tuple[int, int], generator: np.random.Generator
+) -> Tensor:
+    """Draw drivers that can keep up with their platoon.
+
+    Args:
+        drivers: the population.
+        level: congestion level of every platoon ``[platoons]`` [m/s].
+        shape: drivers per platoon and platoons.
+        generator: source of all randomness.
+
+    Returns:
+        Indices into the population, of the given shape; where no driver is fast enough, the
+        fastest.
+    """
+    order = torch.argsort(drivers.desired_speed, stable=True)
+    ascending = drivers.desired_speed[order].numpy()
+    slowest = np.searchsorted(ascending, KEEPS_UP * level).clip(max=len(drivers) - 1)
+    place = slowest + generator.random(shape) * (len(drivers) - slowest)
+    return order[torch.from_numpy(place.astype(np.int64))]
+
+
+def follow(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
+    """Drive platoons behind their leaders, from the equilibrium at the first speed.
+
+    Args:
+        ahead: speeds of the leaders ``[time + 1, platoons]`` [m/s].
+        ranks: the drivers, one population of ``platoons`` drivers for each place in the platoon.
+        xi: relative error of the executed acceleration ``[time, ranks, platoons]`` (A18).
+
+    Returns:
+        Speeds ``[time + 1, vehicles, platoons]``, the leaders' included [m/s], and gaps
+        ``[time + 1, ranks, platoons]`` [m].
+    """
+    speeds, gaps = [ahead], []
+    for rank, drivers in enumerate(ranks):
+        own, leading = (drivers.desired_speed.double(), drivers.time_gap.double()), speeds[-1]
+        start = equilibrium_gap(leading[0], *own, drivers.constants)
+        noise = xi[:, rank].__getitem__
+        speed, gap, _ = simulate_follower(
+            leading, leading[0], start, *own, drivers.constants, FRAME, noise
+        )
+        speeds.append(speed)
+        gaps.append(gap)
+    return torch.stack(speeds, 1).numpy(), torch.stack(gaps, 1).numpy()
+
+
+def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
+    """Parameters of all drivers, in the order of their ids."""
+    vehicle = _identity(len(ranks) + 1, len(ranks[0]))[1:].T.ravel()
+    parameters = [drivers.parameters() for drivers in ranks]
+    columns = {"vehicle": vehicle, "preceding": vehicle - 1}
+    for name, column in COLUMNS.items():
+        columns[column] = torch.stack([own[name] for own in parameters]).T.flatten().numpy()
+    return pd.DataFrame(columns)
+
+
+def _positions(speed: Array, gap: Array, length: Array) -> Array:
+    """Front bumpers ``[time, vehicles, platoons]`` [m]; the last vehicle starts at its length."""
+    step = 0.5 * FRAME * (speed[1:, 0] + speed[:-1, 0])
+    first = np.concatenate([np.zeros_like(step[:1]), np.cumsum(step, axis=0)])
+    behind = np.cumsum(gap + length[:-1], axis=1)
+    return np.concatenate([first[:, None], first[:, None] - behind], axis=1)
+
+
+def _identity(vehicles: int, platoons: int) -> NDArray[np.int64]:
+    """Vehicle ids ``[vehicles, platoons]``, from 1, platoon by platoon."""
+    return np.arange(1, vehicles * platoons + 1).reshape(platoons, vehicles).T
+
+
+def _samples(
+    speed: Array, position: Array, length: Array, warm_up: int, seen: NDArray[np.int64]
+) -> pd.DataFrame:
+    """Rows of the recorded part; platoon after platoon along the time of the recording."""
+    vehicles, platoons = length.shape
+    time, platoon = np.nonzero(np.arange(len(speed) - warm_up)[:, None] < seen)
+    start = np.concatenate([[0], np.cumsum(seen + round(PAUSE_S / FRAME))[:-1]])
+    row = time + warm_up
+    entry = position[warm_up, -1] - length[-1]
+    identity = _identity(vehicles, platoons)
+    parts = [
+        pd.DataFrame(
+            {
+                "vehicle": identity[rank, platoon],
+                "frame": time + start[platoon] + 1,
+                "position_m": position[row, rank, platoon] - entry[platoon],
+                "lane": 1,
+                "length_m": length[rank, platoon],
+                "vehicle_class": AUTOMOBILE,
+                "speed_mps": speed[row, rank, platoon],
+                "acceleration_mps2": (speed[row, rank, platoon] - speed[row - 1, rank, platoon])
+                / FRAME,
+                "preceding": identity[rank, platoon] - 1 if rank else 0,
+            }
+        )
+        for rank in range(vehicles)
+    ]
+    samples = pd.concat(parts).sort_values(["vehicle", "frame"], ignore_index=True)
+    return samples.assign(time_s=samples["frame"] * FRAME)

@@ -1,0 +1,190 @@
+"""The commands of the package run inside the test process, and the settings that shrink them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, chdir, contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from importlib import import_module
+from io import StringIO
+from pathlib import Path
+from unittest.mock import patch
+
+import pandas as pd
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from lcc_rl.config import load
+from lcc_rl.io.files import read_parquet
+from lcc_rl.runs.interrupts import SIGNALS
+
+# Data that take a fraction of a second to generate; enough for every entry point.
+DATA = ("data.platoons=2", "data.recordings=2")
+HORIZON = "scenario.horizon=40"
+QUICK = "calibration.local_genetic.generations=2"
+AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")
+NO_AGENT = ("experiment=smoke", *DATA, HORIZON)
+TINY = (*NO_AGENT, *AGENT)
+
+
+def tiny(entry: str, *overrides: str, agent: bool = True) -> DictConfig:
+    """Compose an entry point's configuration, shrunk; without the settings of a learning agent."""
+    return load(entry, [*(TINY if agent else NO_AGENT), *overrides])
+
+
+def assert_same_tables(one: Path, two: Path) -> None:
+    """Check that two runs left the same rows, float for float."""
+    for table in ("training", "episodes", "steps"):
+        frames = (read_parquet(folder / f"{table}.parquet") for folder in (one, two))
+        pd.testing.assert_frame_equal(*frames, check_exact=True)
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command left behind."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run_command(module: str, *words: str, cwd: Path, check: bool = False) -> Done:
+    """Run an entry point as ``python -m`` would, without a new process.
+
+    A fresh interpreter imports torch, TorchRL and Hydra for seven seconds. Here the process's
+    state is put back afterwards. An exception that a process would end on is raised.
+
+    Args:
+        module: for example ``"lcc_rl.train"``.
+        words: what is typed after the module.
+        cwd: working directory of the command.
+        check: whether another exit code than 0 is an error of the test.
+    """
+    main, code = import_module(module).main, 0
+    with process_state(module, words, cwd) as (out, err):
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    done = Done(code, out.getvalue(), err.getvalue())
+    assert not check or done.returncode == 0, done.stderr
+    return done
+
+
+def jobs_in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the pipeline train in a thread, one variant at a time, instead of new processes."""
+
+    def threads(max_workers: int, mp_context: object) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(1)
+
+    monkeypatch.setattr("lcc_rl.commands.pipeline.ProcessPoolExecutor", threads)
+
+
+# -- real processes --------------------------------------------------------------------------------
+
+
+def start(module: str, *words: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start an entry point in a process, and a process group, of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", module, *words],
+        cwd=cwd,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def run_process(module: str, *words: str, cwd: Path) -> Done:
+    """Run an entry point in a process of its own to its end."""
+    with start(module, *words, cwd=cwd) as child:
+        _, errors = child.communicate(timeout=300)
+    return Done(child.returncode, "", errors)
+
+
+def wait_for(path: Path, child: subprocess.Popen[str], seconds: float = 120.0) -> None:
+    """Wait until a process has written a file."""
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert child.poll() is None, child.communicate()[1]
+        assert time.monotonic() < deadline, f"{path} did not appear"
+        time.sleep(0.02)
+
+
+# -- the state of this process ---------------------------------------------------------------------
+
+
+@contextmanager
+def process_state(
+    module: str, words: tuple[str, ...], cwd: Path
+) -> Iterator[tuple[StringIO, StringIO]]:
+    """Give a command its arguments, folder and output; put back what it changes."""
+    out, err = StringIO(), StringIO()
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    # A fresh process has no Hydra; a state that stays would make the next load a sweep's.
+    hydra, job = GlobalHydra.instance().hydra, HydraConfig.instance().cfg
+    GlobalHydra.instance().clear()
+    HydraConfig.instance().cfg = None
+    with ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        stack.enter_context(patch.object(sys, "argv", [module, *words]))
+        stack.enter_context(patch.dict(os.environ))
+        stack.enter_context(chdir(cwd))
+        stack.enter_context(kept_logging())
+        stack.enter_context(kept_signals())
+        stack.enter_context(redirect_stdout(out))
+        stack.enter_context(redirect_stderr(err))
+        try:
+            yield out, err
+        finally:
+            GlobalHydra.instance().hydra = hydra
+            HydraConfig.instance().cfg = job
+            torch.set_num_threads(threads)
+            torch.set_float32_matmul_precision(precision)
+
+
+@contextmanager
+def kept_signals() -> Iterator[None]:
+    """Put signal handlers back; a command meets those of a process started by a shell."""
+    before = {kind: signal.getsignal(kind) for kind in SIGNALS}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+
+
+@contextmanager
+def kept_logging() -> Iterator[None]:
+    """Put loggers back as they were, and close the files that were opened meanwhile."""
+    names = [None, *(name for name, kind in _known() if isinstance(kind, logging.Logger))]
+    loggers = [logging.getLogger(name) for name in names]
+    before = [(log, log.level, log.disabled, log.propagate, log.handlers[:]) for log in loggers]
+    try:
+        yield
+    finally:
+        old = {id(handler) for *_, handlers in before for handler in handlers}
+        everyone = [logging.getLogger(), *(log for _, log in _known())]
+        for log in everyone:
+            for handler in list(getattr(log, "handlers", ())):
+                if id(handler) not in old:
+                    log.removeHandler(handler)
+                    handler.close()
+        for log, level, disabled, propagate, handlers in before:
+            log.setLevel(level)
+            log.disabled, log.propagate, log.handlers = disabled, propagate, handlers
+
+
+def _known() -> list[tuple[str, object]]:
+    return list(logging.Logger.manager.loggerDict.items())
