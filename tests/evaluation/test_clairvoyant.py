@@ -11,36 +11,34 @@ import torch
 from helpers import POPULATION, compose, wavy_profiles
 from tensordict import TensorDict
 
-from lcc_rl.evaluate import trained
+from lcc_rl.envs import Inputs
 from lcc_rl.evaluation.clairvoyant import clairvoyant, misses, path_energy
-from lcc_rl.evaluation.monte_carlo import Strategy, evaluate
+from lcc_rl.evaluation.episodes import evaluate
+from lcc_rl.evaluation.strategies import Strategy, trained
+from lcc_rl.functional.pattern import parse_string
 from lcc_rl.results.runs import load_policy
 
 STEPS = 60
 BOTH = ["total_steady_energy_kj", "total_acceleration_loss_kj"]
 
 
-class Given:
-    """As much of a study's inputs as a strategy needs."""
-
-    population = POPULATION
+INPUTS = Inputs(wavy_profiles(2), wavy_profiles(2), POPULATION)
 
 
 def learned() -> Strategy:
     cfg = compose("alcc", f"scenario.horizon={STEPS}")
-    return trained(cfg, "pretrained", load_policy("pretrained", "alcc"), Given())  # type: ignore[arg-type]
+    return trained(cfg, "pretrained", load_policy("pretrained", "alcc"), POPULATION)
 
 
 def played(strategy: Strategy) -> pd.DataFrame:
-    return evaluate(strategy, wavy_profiles(2), POPULATION, 2, 10_000, seed=1)[0]
+    return evaluate(strategy, INPUTS, 2, 10_000, seed=1)[0]
 
 
 def test_who_knows_the_profile_saves() -> None:
     start, told = learned(), []
     best = clairvoyant(
         start,
-        wavy_profiles(2),
-        POPULATION,
+        INPUTS,
         drivers=2,
         seed=1,
         iterations=30,
@@ -60,16 +58,12 @@ def test_who_knows_the_profile_saves() -> None:
 
 
 def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
-    """One episode of one step, the car as given and a driver at rest behind it."""
-
-    def number(value: float) -> torch.Tensor:
-        return torch.full((1, 1, 1), value)
-
+    """One episode of one step, the automated vehicle as given, a driver at rest far behind it."""
     time_gap = gap / max(speed, 1.0)
-    cav = {"gap": gap, "relative_speed": relative_speed, "time_gap": time_gap, "speed": speed}
-    entries = {key: number(value) for key, value in cav.items()}
-    hdv = {"speed": torch.zeros(1, 1, 1, 1)}
-    one = {"cav": entries, "hdv": hdv}
+    own = {"gap": gap, "relative_speed": relative_speed, "time_gap": time_gap, "speed": speed}
+    behind = {"gap": 100.0, "relative_speed": 0.0, "time_gap": 100.0, "speed": 0.0}
+    entries = {key: torch.tensor([own[key], behind[key]]).view(1, 1, 2, 1) for key in own}
+    one = {"vehicles": entries}
     return TensorDict({**one, "next": one}, batch_size=[1, 1])
 
 
@@ -84,7 +78,8 @@ def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
     ],
 )
 def test_misses(gap, relative_speed, speed, missed) -> None:
-    assert float(misses(moment(gap, relative_speed, speed))) == pytest.approx(missed, abs=1e-4)
+    found = misses(moment(gap, relative_speed, speed), parse_string("automated human"))
+    assert float(found) == pytest.approx(missed, abs=1e-4)
 
 
 def test_path_energy_at_constant_speed() -> None:
