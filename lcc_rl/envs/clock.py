@@ -52,6 +52,12 @@ class Clock(EnvBase):
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon
         self.generator = torch.Generator()
+        # As TorchRL's multi-agent environments name the members of each group.
+        self.group_map = {
+            str(key[0]): [f"{key[0]}_{i}" for i in range(shape[0])]
+            for key, shape in (actions or {}).items()
+            if not isinstance(key, str)
+        }
         count = Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=self.device)
         times = Composite(

@@ -52,6 +52,8 @@ class SingleAgent(Transform):
 
     def _shown(self, specs: Composite, part: str, names: tuple[str, ...]) -> Composite:
         spec = specs[part]
+        if AUTOMATED not in spec.keys():  # noqa: SIM118  a rule drives: there is no action
+            return specs
         group = spec[AUTOMATED]
         for name in names:
             if name in group.keys():  # noqa: SIM118  a spec is no dict

@@ -156,7 +156,7 @@ EARLY = (
 )
 
 
-@pytest.mark.parametrize("overrides", [EARLY, WHOLE])
+@pytest.mark.parametrize("overrides", [pytest.param(EARLY, marks=pytest.mark.slow), WHOLE])
 def test_learns_to_keep_going(tmp_path, overrides) -> None:
     rows = make(
         tmp_path,

@@ -1,0 +1,256 @@
+"""Environments of every variant and of mixed strings: specs, TorchRL's vectors, refused shapes."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from helpers import (
+    ACTION,
+    OBSERVATION,
+    PLATOON,
+    POPULATION,
+    REWARD,
+    VARIANTS,
+    composed,
+    single_env,
+    small_env,
+    string,
+    wavy_profiles,
+)
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
+
+from lcc_rl.envs import Inputs, build_env, make_env
+from lcc_rl.envs.checks import check_pieces
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.functional.pattern import parse_string
+from lcc_rl.pieces import (
+    Action,
+    Controller,
+    Feature,
+    NGSIMLeader,
+    Places,
+    StringMotion,
+    TimeGap,
+    TimeGapStart,
+    TimeToCollision,
+)
+
+RING = ("scenario=ring", "scenario.horizon=20", "scenario.circumference=200")
+MIXTURES = {
+    "pattern": ("alcc", (string("human*2 (automated human*2)*2"),)),
+    "drawn": ("alcc", ("scenario.string={size: 6, penetration: 0.34}",)),
+    "ring": ("reference", (*RING, string("human*2 automated human*2 automated"))),
+    "drawn ring": ("reference", (*RING, "scenario.string={size: 6, penetration: 0.34}")),
+    "platoon with a human": ("ddpg", (string("automated*2 human automated*2"),)),
+    "CACC with a human": ("cacc", (string("automated*2 human automated*2"),)),
+    "hybrid with a human": ("hcfs", (string("automated*2 human automated*2"),)),
+    "two roles": ("alcc", (string("automated cacc human"), "+gains=tuned")),
+}
+CACC = (
+    "+controller@scenario.controllers.cacc=cacc",
+    "+scenario.start.cacc={_target_: lcc_rl.pieces.TimeGapStart}",
+    "+scenario.pieces.communication={_target_: lcc_rl.pieces.Communication, connected: [cacc]}",
+)
+
+
+def mixture(name: str, batch_size=()):
+    variant, overrides = MIXTURES[name]
+    overrides = (*overrides, *CACC) if name == "two roles" else overrides
+    cfg = deployed(composed(f"variant={variant}", "scenario.horizon=20", *overrides))
+    return build_env(cfg, wavy_profiles(), POPULATION, batch_size)
+
+
+@pytest.mark.parametrize("batch_size", [(), 3])
+@pytest.mark.parametrize("name", list(MIXTURES))
+def test_specs_of_mixed_strings(name, batch_size) -> None:
+    check_env_specs(mixture(name, batch_size), break_when_any_done="both")
+
+
+@pytest.mark.parametrize("variant", [v for v in VARIANTS if v != "direct"])
+@pytest.mark.parametrize("batch_size", [(), 3])
+def test_specs_of_the_single_agent_view(variant, batch_size) -> None:
+    env = single_env(variant, batch_size, [string("automated")] if variant in PLATOON else [])
+    check_env_specs(env, break_when_any_done="both")
+    shape = env.batch_size
+    assert env.full_reward_spec["reward"].shape == (*shape, 1)
+    data = env.rollout(3)
+    assert data["observation"].shape[:-1] == (*shape, 3)
+    assert data["next", "reward"].shape == (*shape, 3, 1)
+    assert OBSERVATION not in data.keys(True)
+
+
+def test_the_single_agent_view_shows_the_same_numbers() -> None:
+    group, single = small_env("alcc", 3, seed=5), single_env("alcc", 3, seed=5)
+    one = group.rollout(20, lambda td: td.set(ACTION, torch.full((3, 1, 1), 0.2)))
+    two = single.rollout(20, lambda td: td.set("action", torch.full((3, 1), 0.2)))
+    assert torch.equal(one[OBSERVATION].squeeze(-2), two["observation"])
+    assert torch.equal(one["next", *REWARD].squeeze(-2), two["next", "reward"])
+    for name, term in two["next", "reward_terms"].items():
+        assert torch.equal(one["next", "automated", "reward_terms", name].squeeze(-2), term)
+    assert torch.equal(one["next", "vehicles", "gap"], two["next", "vehicles", "gap"])
+
+
+def test_who_may_ask_for_the_single_agent_view(monkeypatch) -> None:
+    inputs = Inputs(wavy_profiles(), wavy_profiles(), POPULATION)
+    monkeypatch.setattr("lcc_rl.envs.factory.load_inputs", lambda cfg: inputs)
+    tiny = ["scenario.horizon=20"]
+    assert "action" in make_env("alcc", 2, tiny).full_action_spec.keys(True, True)
+    # Where a rule drives, there is an observation and a reward, but no action.
+    ruled = make_env("idm", 2, tiny)
+    assert not list(ruled.full_action_spec.keys(True, True))
+    check_env_specs(ruled)
+    group = make_env("alcc", 2, tiny, single=False)
+    assert set(group.full_action_spec.keys(True, True)) == {ACTION}
+    with pytest.raises(ConfigError, match="single=True needs one automated vehicle, the string ha"):
+        make_env("alcc", 2, [*tiny, string("automated*2")], single=True)
+
+
+# -- TorchRL's vectors of environments -------------------------------------------------------------
+
+
+def vectorised(view: str):
+    if view == "single":
+        return single_env("alcc", 2, seed=1)
+    return small_env("alcc", 2, [string("(automated human)*2")], seed=1)
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize("view", ["single", "group"])
+def test_in_torchrls_vectors_of_environments(kind, view) -> None:
+    own = {"mp_start_method": "fork"} if kind is ParallelEnv else {}  # spawning takes 25 s
+    env = kind(2, partial(vectorised, view), **own)
+    try:
+        check_env_specs(env)
+        env.set_seed(0)
+        data = env.rollout(10, break_when_any_done=False)
+    finally:
+        env.close()
+    assert data.shape == (2, 2, 10)
+    assert torch.isfinite(data["next", "vehicles", "gap"]).all()
+    # Each environment has episodes of its own.
+    seeds = data["episode", "seed"][..., 0, 0]
+    assert seeds.unique().numel() == 4
+
+
+def test_the_group_is_what_torchrls_multi_agent_tools_expect() -> None:
+    env = mixture("pattern", 3)
+    td = env.rollout(4)
+    assert td["automated"].keys() >= {"observation", "action", "index"}
+    for key in (OBSERVATION, ACTION, ("next", *REWARD)):
+        assert td[key].shape[:3] == (3, 4, 2), key
+    assert env.action_keys == [ACTION]
+    assert env.reward_keys[0] == REWARD or REWARD in env.reward_keys
+
+
+# -- what is refused when an environment is built --------------------------------------------------
+
+STRING = parse_string("automated*4")
+START = {"automated": TimeGapStart()}
+
+
+def pieces(*more):
+    leader = NGSIMLeader(wavy_profiles(), 20, 0.1)
+    return [leader, Places(STRING), Action(string=STRING), StringMotion(STRING, 0.1, START), *more]
+
+
+def check(*more) -> None:
+    check_pieces(pieces(*more), 20, {ACTION: (4, 1)})
+
+
+class Wide(Feature):
+    """Writes a row per pair of vehicles where its spec says a row per vehicle."""
+
+    def __init__(self) -> None:
+        super().__init__([("vehicles", "gap")], [("vehicles", "wide")], (4, 1))
+
+    def compute(self, gap: Tensor) -> Tensor:
+        return gap.unsqueeze(-2).expand(*gap.shape[:-1], 4, 1)
+
+
+class Broken(Feature):
+    """Cannot compute on such a string."""
+
+    def __init__(self) -> None:
+        super().__init__([("vehicles", "gap")], [("vehicles", "broken")], (4, 1))
+
+    def compute(self, gap: Tensor) -> Tensor:
+        return gap + torch.zeros(3, 1)
+
+
+class Whole(Controller):
+    """Commands whole numbers."""
+
+    reads = ("self.gap",)
+
+    def command(self, gap: Tensor) -> Tensor:
+        return gap.long()
+
+
+def test_what_fits_is_accepted() -> None:
+    check(TimeGap(STRING))
+
+
+@pytest.mark.parametrize(
+    ("piece", "words"),
+    [
+        (Wide, r"Wide writes vehicles\.wide as \[4, 4, 1\] .* spec says \[4, 1\]"),
+        (Broken, "Broken does not fit the string of vehicles"),
+        (
+            lambda: StringMotion(STRING, 0.1, START),
+            r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",
+        ),
+        (
+            lambda: TimeToCollision(parse_string("automated*3")),
+            r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* says \[3, 1\]",
+        ),
+        (
+            lambda: Action(string=parse_string("automated*4"), role="other"),
+            r"Action reads other\.action, but only automated vehicles have an action",
+        ),
+    ],
+)
+def test_a_piece_that_does_not_fit_is_refused(piece, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        check(piece())
+
+
+def test_a_command_of_another_type_is_refused() -> None:
+    made = pieces()
+    made[2] = Whole(STRING)
+    with pytest.raises(
+        ConfigError, match=r"Whole writes command\.automated as \[4, 1\] torch.int6"
+    ):
+        check_pieces(made, 20, {})
+
+
+@pytest.mark.parametrize(
+    ("variant", "overrides", "words"),
+    [
+        ("alcc", ["scenario.pieces.time_gap=null"], r"reads vehicles\.time_gap, which no piece"),
+        ("alcc", ["scenario.pieces.estimator=null"], r"reads human\.predicted_acceleration, which"),
+        ("ddpg", ["scenario.pieces.communication=null"], r"reads vehicles\.gap_error, which no"),
+        ("alcc", [string("automated truck")], "has the role 'truck', but scenario.controllers nam"),
+        ("alcc", [string("automated human"), "scenario.road=ring"], "a ring road has no leader"),
+        ("alcc", ["scenario.circumference=100"], "circumference=100 has no effect: it belongs to"),
+        ("direct", ["+filter=cbf"], r"filters\.automated: no vehicle has that role"),
+        ("alcc", ["scenario.start.human=null"], r"scenario\.start lacks human"),
+        ("alcc", [string("automated (human")], "this bracket is never closed at character 11"),
+        ("alcc", ["reward.terms=null"], "terms"),
+    ],
+)
+def test_a_configuration_that_does_not_fit_is_refused(variant, overrides, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        small_env(variant, 2, overrides)
+
+
+def test_reset_options_are_in_the_state_spec() -> None:
+    env = small_env("alcc", 2)
+    keys = set(env.full_state_spec.keys(True, True))
+    assert {("leader", "profile"), ("leader", "start"), ("human", "driver")} <= keys
+    td = env.reset(TensorDict({("human", "driver"): torch.tensor([[[3]], [[4]]])}, [2]))
+    assert td["human", "driver"].flatten().tolist() == [3, 4]
