@@ -88,7 +88,10 @@ class Observation(Feature):
                 seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
         vehicles = max(entry.shape[-2] for entry in seen)
         # Where all see the same, such as a preview of the leader, there is one row for all.
-        rows = [entry.expand(*entry.shape[:-2], vehicles, -1) for entry in seen]
+        rows = [
+            entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
+            for entry in seen
+        ]
         return torch.cat(rows, dim=-1) * self.constants
 
 
