@@ -11,10 +11,10 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.factory import build_env
+from lcc_rl.envs import build_env
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
-VARIANTS = ("alcc", "reference", "own_energy", "barrier", "idm", "direct", *PLATOON)
+VARIANTS = ("alcc", "reference", "own_energy", "cbf", "idm", "direct", *PLATOON)
 POPULATION = bootstrap()
 
 
