@@ -135,5 +135,9 @@ def check_sizes(cfg: DictConfig) -> None:
         not measured or cfg.evaluation.rows != "episodes",
         f"scenario.pieces lacks {measured}, which the evaluation measures",
     )
+    require(
+        cfg.evaluation.rows != "vehicles" or pieces.get("communication") is not None,
+        "evaluation.rows=vehicles measures speed errors, which scenario.pieces.communication writes",
+    )
     step = cfg.scenario.time_step
     require(step > 0, f"scenario.time_step must be positive, got {step}")

@@ -60,7 +60,7 @@ def run(
         cfg = load_config(folder, tuple(cfg.trust))
     elif (folder / CHECKPOINT).exists() and not resume:
         raise ConfigError(
-            f"{folder} already holds a training; go on with resume={folder} or choose another "
+            f"{folder} already holds a training; resume it with resume={folder} or choose another "
             "hydra.run.dir"
         )
     with working(folder):
