@@ -215,7 +215,7 @@ def test_a_mistake_in_the_string_is_pointed_at(tmp_path, string, words) -> None:
 
 def test_a_string_in_which_nobody_is_automated(tmp_path) -> None:
     nobody = "scenario.string={size: 10, penetration: 0}"
-    with pytest.raises(ConfigError, match="nobody is automated.* say agent=none"):
+    with pytest.raises(ConfigError, match=r"nobody is automated.* say agent=none"):
         training.run(tiny("train", "variant=alcc", nobody), tmp_path / "a", quiet=True)
     cfg = tiny("evaluate", "variant=alcc", nobody, "agent=none", agent=False)
     rows = evaluation.run(cfg, tmp_path / "b", quiet=True)
