@@ -1,1 +1,1 @@
-"""Configuration room: Hydra's yaml files, importable as ``lcc_rl.conf``."""
+"""Hydra's configuration files, importable as ``lcc_rl.conf``."""

@@ -1,4 +1,9 @@
-"""lcc_rl: learn and compare car-following controllers in mixed traffic."""
+"""Learn and compare car-following controllers in mixed traffic.
+
+``lcc_rl.make_env`` builds a TorchRL environment of a string of vehicles, ``lcc_rl.results`` reads
+what runs leave behind. The commands are ``python -m lcc_rl.train``, ``evaluate``, ``calibrate``,
+``pipeline`` and ``status``.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import inspect
 import json
@@ -39,7 +40,7 @@ def chosen_folder(resumed: str | None, fresh: str) -> str:
     """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew.
 
     Raises:
-        ConfigError: if there is no run to go on with.
+        ConfigError: if there is no run to resume.
     """
     if resumed and not (Path(resumed) / "config.yaml").is_file():
         raise ConfigError(f"resume={resumed}: not a run folder: it has no config.yaml")
@@ -187,7 +188,10 @@ SIMPLE: dict[Any, tuple[type, ...]] = {float: (float, int), int: (int,), bool: (
 
 def _check_types(target: Any, given: Mapping[str, Any], where: str) -> None:
     """Check numbers, flags and text against the annotations of the constructor."""
-    function = target.__init__ if inspect.isclass(target) else target
+    function = target
+    # The generated constructor of a dataclass does not know the names of its module.
+    if inspect.isclass(target) and not dataclasses.is_dataclass(target):
+        function = target.__init__
     try:
         hints = typing.get_type_hints(function)
     except (NameError, TypeError):

@@ -12,6 +12,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString, parse_string
 
 AUTO = "scenario.controllers.automated"
+NO_AGENT = ("agent=none", "agent=null")
 # Former spellings as regular expressions, and what to say instead; \1 is what the bracket holds.
 RENAMED = (
     (
@@ -71,6 +72,8 @@ def check_ignored(cfg: DictConfig, overrides: Sequence[str], sweep: bool = False
     reasons = dict(_without_effect(cfg, sweep))
     for item in overrides:
         key = item.lstrip("+~").partition("=")[0].partition("@")[0]
+        if item in NO_AGENT:
+            continue
         for prefix, reason in reasons.items():
             if (key == prefix or key.startswith(f"{prefix}.")) and item != "agent=none":
                 raise ConfigError(f"{item} has no effect: {reason}")

@@ -28,8 +28,7 @@ def main(cfg: DictConfig) -> None:
         others = [item for item in overrides if not item.startswith("resume=")]
         if others:
             raise ConfigError(
-                "resume goes on with the settings the job was started with; remove "
-                + " ".join(others)
+                "a resumed job keeps the settings it was started with; remove " + " ".join(others)
             )
         if not (folder / OVERRIDES).is_file():
             raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {OVERRIDES}")

@@ -24,7 +24,7 @@ def main(cfg: DictConfig) -> float | list[float]:
     others = [item for item in typed if item.split("=")[0] not in own]
     if cfg.resume is not None and others:
         raise ConfigError(
-            f"resume goes on with the settings the run was started with; remove {' '.join(others)}"
+            f"a resumed run keeps the settings it was started with; remove {' '.join(others)}"
         )
     folder = Path(cfg.resume) if cfg.resume is not None else run_folder()
     episodes = complete(cfg, folder) if is_sweep() else run(cfg, folder)

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import lcc_rl.conf
 import pytest
-from helpers import PLATOON, POPULATION, VARIANTS, compose, wavy_profiles
-from omegaconf import OmegaConf
+from helpers import POPULATION, VARIANTS, compose, wavy_profiles
+from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import build, config_hash, find_target, load
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.agents.factory import build_agent, learns
+from lcc_rl.config import TARGET, build, config_hash, find_target, load
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import RewardTerm
+from lcc_rl.policies import shared_policy
+from lcc_rl.policies.actor import ACTION
 
 CONF = Path(lcc_rl.conf.__file__).parent
+
+
+LEARNED = ("alcc", "reference", "own_energy", "ddpg", "hcfs")
 
 
 def options(group: str) -> list[str]:
@@ -29,9 +39,14 @@ def options(group: str) -> list[str]:
 def test_every_variant_composes_builds_and_runs(entry, variant) -> None:
     cfg = load(entry, [f"variant={variant}", "experiment=smoke"])
     assert cfg.variant == variant
-    env = build_env(cfg, wavy_profiles(), POPULATION, 2)
-    policy = build_agent(cfg, POPULATION).policy
-    assert env.rollout(10, policy).shape[0] == 2
+    assert learns(cfg) or cfg.agent is None
+    assert rolled_out(cfg, 10).shape[0] == 2
+
+
+def rolled_out(cfg: DictConfig, steps: int):
+    """Play a few steps with the agent's policy where there is one."""
+    policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
+    return build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(steps, policy)
 
 
 def test_the_tests_know_every_variant() -> None:
@@ -39,41 +54,36 @@ def test_the_tests_know_every_variant() -> None:
 
 
 @pytest.mark.parametrize("experiment", options("experiment"))
-@pytest.mark.parametrize("entry", ["train", "pipeline"])
+@pytest.mark.parametrize("entry", ["train", "evaluate", "pipeline"])
 def test_every_experiment_composes(entry, experiment) -> None:
-    cfg = load(entry, [f"experiment={experiment}"])
+    variant = ["variant=ddpg"] if experiment == "paper_hcfs" else []
+    cfg = load(entry, [f"experiment={experiment}", *variant])
     build_agent(cfg, POPULATION)
     assert cfg.training.episodes % cfg.training.environments == 0
 
 
-@pytest.mark.parametrize("group", ["split", "drivers", "agent"])
+@pytest.mark.parametrize("group", ["split", "drivers", "agent", "leader", "data", "logger"])
 def test_every_option_of_a_group_builds(group) -> None:
     for option in options(group):
-        gains = OmegaConf.load(CONF / "gains" / "tuned.yaml")
-        node = OmegaConf.create(
-            {"gains": gains, "x": OmegaConf.load(CONF / group / f"{option}.yaml")}
-        ).x
-        if OmegaConf.missing_keys(node):
+        root = OmegaConf.create({"data": {}, "split": {}, "x": files()[f"{group}/{option}.yaml"]})
+        node = root.x
+        if OmegaConf.missing_keys(node) or TARGET not in node:
             continue
         node.pop("defaults", None)  # Hydra's business, not the constructor's
-        built = build(
-            node,
-            group,
-            population=POPULATION,
-            max_acceleration=3.0,
-            time_step=0.1,
-            observation_size=7,
-            action_size=1,
-            seed=0,
-        )
-        assert built is not None
+        if option == "trajectories":
+            node.source, node.split = (
+                files()[x] for x in ("data/stream.yaml", "split/single.yaml")
+            )
+        given = {"time_step": 0.1, "observation_size": 7, "action_size": 1, "seed": 0}
+        assert build(node, group, population=POPULATION, **given) is not None
 
 
 @pytest.mark.parametrize("variant", options("variant"))
 @pytest.mark.parametrize("experiment", options("experiment"))
 def test_every_recipe_serves_every_variant(experiment, variant) -> None:
     cfg = load("train", [f"experiment={experiment}", f"variant={variant}"])
-    assert build_agent(cfg, POPULATION).policy is not None
+    assert not learns(cfg) or build_agent(cfg, POPULATION).policy is not None
+    assert learns(cfg) == (variant in LEARNED)
 
 
 def test_paper_recipe_is_what_the_defaults_are() -> None:
@@ -83,38 +93,167 @@ def test_paper_recipe_is_what_the_defaults_are() -> None:
     assert config_hash(load("train", recipe)) == config_hash(load("train", plain))
 
 
-def test_constructor_arguments_and_yaml_are_in_parity() -> None:
-    """Every argument of a piece is in its yaml, offered by the factory, or a name's default."""
-    offered = {"profiles", "population", "time_step", "horizon", "name", "reads"}
-    naming = {
-        "predecessor",
-        "vehicle",
-        "strings",
-        "event_shape",
-        "followers",
-        "acceleration",
-        "power",
-        "reads",
-        "platoon",
-        "leader",
-    }
-    for variant in VARIANTS:
-        one_car = variant in ("alcc", "reference", "own_energy", "idm")
-        filtered = ["+filter=barrier"] if one_car else []
-        cfg = compose(variant, *filtered)
-        nodes = {**cfg.scenario.pieces, **cfg.reward.terms}
-        if variant in PLATOON:
-            own = ("agent", "observation", "leader")
-            nodes |= {f"{group} of {variant}": cfg[group] for group in own}
-            offered |= {"max_acceleration", "learned", "path", "observation_size", "action_size"}
-            offered |= {"seed", "device"}
-        if cfg.controller is not None:
-            nodes["controller"] = cfg.controller
-        for name, node in nodes.items():
-            signature = set(inspect.signature(find_target(node["_target_"], name)).parameters)
-            given = {key for key in node if not key.startswith("_")}
-            assert given <= signature, name
-            assert signature - given <= offered | naming, (name, signature - given)
+# -- controllers -----------------------------------------------------------------------------------
+
+# The scenario that a controller of conf/controller fits: what it reads must be there.
+SCENARIO_OF = {"cacc": "cacc", "deadbeat": "cacc", "hcfs": "hcfs"}
+
+
+@pytest.mark.parametrize("controller", options("controller"))
+def test_every_controller_drives_the_automated_vehicles(controller) -> None:
+    variant = SCENARIO_OF.get(controller, "alcc")
+    choice = f"controller@scenario.controllers.automated={controller}"
+    cfg = load("train", [f"variant={variant}", choice, "scenario.horizon=20"])
+    learned = controller in ("action", "hcfs")
+    policy = shared_policy(build_agent(cfg, POPULATION).policy) if learned else None
+    env = build_env(cfg, wavy_profiles(), POPULATION, 2)
+    data = env.rollout(3, policy, break_when_any_done=False)
+    assert data.shape == (2, 3)
+    assert data["next", "vehicles", "acceleration"].isfinite().all()
+    assert (env.action_keys == [("automated", "action")]) == learned
+
+
+# -- parity of files and constructors --------------------------------------------------------------
+
+
+@cache
+def files() -> dict[str, DictConfig]:
+    """Every file below conf, by its name there."""
+    paths = sorted(CONF.rglob("*.yaml"))
+    return {path.relative_to(CONF).as_posix(): OmegaConf.load(path) for path in paths}
+
+
+def nodes(value: Any, where: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield every node that describes an object of this package, and its place."""
+    if isinstance(value, dict):
+        if str(value.get(TARGET, "")).startswith("lcc_rl."):
+            yield where, value
+        for key, inner in value.items():
+            yield from nodes(inner, f"{where}.{key}")
+
+
+def defaults(target: Any) -> dict[str, Any]:
+    """Return the defaults of a constructor, or of its dataclass of settings."""
+    own = getattr(target, "Settings", target)
+    parameters = inspect.signature(own).parameters.items()
+    found = {name: p.default for name, p in parameters if p.default is not p.empty}
+    for field in dataclasses.fields(own) if dataclasses.is_dataclass(own) else ():
+        if field.default_factory is not dataclasses.MISSING:
+            found[field.name] = field.default_factory()
+    return found
+
+
+def as_lists(value: Any) -> Any:
+    return [as_lists(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+# A class that the files describe more than once has the defaults of its first use.
+EXCEPTIONS = {
+    "agent/analytic.yaml": "nodes of pieces, of which a constructor has none",
+    "agent/analytic.yaml.surrogates.hdv_energy": "second use of EnergyReward",
+    "calibration/base.yaml": "which mode, and nodes, are the choice of a file",
+    "calibration/base.yaml.global_genetic": "second use of GeneticSettings",
+    "controller/idm.yaml": "one driver without noise; the class is that of drivers who differ",
+    "data/ngsim.yaml": "node of criteria, which are none by default",
+    "data/stream.yaml": "nodes of leader and criteria; their own defaults are compared",
+    "drivers/calibrated.yaml": "the path is asked for",
+    "drivers/i80.yaml": "the shipped table has both modes; null takes the same one",
+    "drivers/kde.yaml": "as for i80",
+    "leader/openacc.yaml": "the path is asked for; records are those of the file",
+    "leader/paper.yaml": "the path is asked for; records are those of the file",
+    "leader/udds.yaml": "cases and records are those of the file",
+    "reward/alcc.yaml.terms.hdv_energy": "second use of EnergyReward",
+    "scenario/leading_cruise.yaml.pieces.predicted_power": "second use of MotorPower",
+    "scenario/platoon.yaml.pieces.leader": "a platoon's leader; the first use is that of alcc",
+    "split/single_training.yaml": "node of another split",
+    "split/vehicle.yaml": "second use of Split",
+}
+
+
+def test_values_of_files_are_the_defaults_of_constructors() -> None:
+    root, different, compared = load("train", ["variant=hcfs"]), {}, 0
+    for name, content in files().items():
+        for where, node in nodes(OmegaConf.to_container(content, resolve=False), name):
+            known = defaults(find_target(node[TARGET], where))
+            for key in set(known) & set(node):
+                value = node[key]
+                if isinstance(value, str) and value.startswith("${"):
+                    value = select(root, value[2:-1])
+                compared += 1
+                if as_lists(value) != as_lists(known[key]):
+                    different.setdefault(where, []).append((key, value, known[key]))
+    assert compared > 250
+    assert {where: x for where, x in different.items() if where not in EXCEPTIONS} == {}
+    assert set(EXCEPTIONS) <= set(different), "an exception that is none"
+
+
+def select(root: DictConfig, key: str) -> Any:
+    value = OmegaConf.select(root, key)
+    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+
+
+OFFERED = {"profiles", "population", "time_step", "horizon", "string", "nominal", "name", "role"}
+OFFERED |= {"observation_size", "action_size", "seed", "settings", "device"}
+# Arguments that name entries, and those that only some files choose to give.
+OPTIONAL = {"reads", "widths", "relative_to", "visible", "vehicles", "acceleration", "power"}
+
+
+def test_every_setting_of_a_constructor_is_in_its_file() -> None:
+    groups = ("controller", "filter", "scenario", "observation", "reward", "agent", "knowledge")
+    for name, content in files().items():
+        if name.split("/")[0] not in groups:
+            continue
+        for where, node in nodes(OmegaConf.to_container(content, resolve=False), name):
+            target = find_target(node[TARGET], where)
+            known = set(inspect.signature(getattr(target, "Settings", target)).parameters)
+            given = {key for key in node if key not in (TARGET, "defaults")}
+            assert given <= known, where
+            left = known - given - OFFERED - OPTIONAL
+            assert not left or where in PARTIAL, (where, left)
+
+
+PARTIAL = {
+    "agent/analytic.yaml.surrogates.hdv_energy": "weight and scale are those of the reward",
+    "controller/handover.yaml": "before and after are of its defaults list",
+}
+
+
+# What a choice needs beside it; its group's prefix and key on the command line.
+WITH = {
+    "controller": ["variant=hcfs"],
+    "gains": ["variant=cacc"],
+    "leader": ["variant=ddpg"],
+    "data/ngsim": ["data.path=x"],
+    "data/episodes": ["data.path=x"],
+    "leader/paper": ["leader.path=x"],
+    "leader/openacc": ["leader.path=x"],
+    "experiment/paper_hcfs": ["variant=ddpg"],
+}
+TYPED = {
+    "filter": "+filter",
+    "knowledge": "+knowledge",
+    "controller": "controller@scenario.controllers.automated",
+}
+CHOICES = [name.removesuffix(".yaml") for name in files() if "/" in name]
+
+
+@pytest.mark.parametrize("name", [name for name in CHOICES if name.count("/") == 1])
+def test_every_file_is_composed(name) -> None:
+    group, option = name.split("/")
+    entry = "calibrate" if group == "calibration" else "train"
+    if name == "calibration/base":
+        return  # in the defaults list of every other one
+    if group == "learning":
+        scenario, agent = option.split("_")
+        words = [f"scenario={scenario}", "variant=ddpg", f"agent={agent}"]
+    else:
+        words = [f"{TYPED.get(group, group)}={option}"]
+        words += [*WITH.get(group, ()), *WITH.get(name, ())]
+    cfg = load(entry, words)
+    own = OmegaConf.to_container(files()[f"{name}.yaml"], resolve=False)
+    target = own.get(TARGET)
+    if target is not None:
+        assert target in str(OmegaConf.to_container(cfg)), name
 
 
 @pytest.mark.parametrize(
@@ -129,9 +268,9 @@ def test_an_ablation_changes_only_its_term(override, term) -> None:
     data = [
         build_env(cfg, wavy_profiles(), POPULATION, 8, seed=1).rollout(
             20,
-            lambda td: td.set("action", td["observation"][..., :1] * 0.0 + 0.8),
+            lambda td: td.set(ACTION, td["automated", "observation"][..., :1] * 0.0 + 0.8),
             break_when_any_done=False,
-        )["next", "reward_terms"]
+        )["next", "automated", "reward_terms"]
         for cfg in (base, changed)
     ]
     for name in data[0].keys():  # noqa: SIM118
@@ -145,12 +284,12 @@ def test_a_term_can_be_removed_and_added() -> None:
     cfg = compose("alcc", "+reward.terms.comfort={_target_: test_config.Comfort, weight: 0.5}")
     env = build_env(cfg, wavy_profiles(), POPULATION, 2)
     data = env.rollout(3)["next"]
-    expected = -0.5 * data["cav", "jerk"].abs()
-    assert (data["reward_terms", "comfort"] == expected).all()
+    expected = -0.5 * data["vehicles", "jerk"][..., :1, :].abs()
+    assert (data["automated", "reward_terms", "comfort"] == expected).all()
 
 
 class Comfort(RewardTerm):
-    reads = ("cav.jerk",)
+    reads = ("self.jerk",)
 
     def reward(self, jerk):
         return -jerk.abs()
@@ -196,19 +335,19 @@ def test_impossible_agent_settings(overrides, words) -> None:
     ("overrides", "words"),
     [
         (["scenario.horizon=0"], "horizon"),
-        (["scenario.followers=0"], "followers"),
-        (["scenario.pieces.hdv.noise=1.5"], "noise"),
+        (["scenario.string='automated human*0'"], "1…10000 vehicles at character 16"),
+        (["scenario.controllers.human.noise=1.5"], "noise"),
         (["scenario.pieces.leader.start=last"], "start"),
         (["scenario.pieces.estimator.measurement_error=0"], "measurement_error"),
-        (["scenario.pieces.cav.max_acceleration=-1"], "max_acceleration"),
-        (["+scenario.pieces.cav.mass=1000"], "mass"),
+        (["scenario.controllers.automated.max_acceleration=-1"], "max_acceleration"),
+        (["+scenario.controllers.automated.mass=1000"], "mass"),
         (["reward.terms.safety.threshold=0"], "floor"),
         (["reward.terms.safety.weight=heavy"], "weight"),
         (["reward.terms.cav_energy.scale=0"], "scale"),
         (["reward.terms.safety._target_=lcc_rl.pieces.Safety"], "Safety"),
         (["observation.visible=0"], "visible"),
-        (["observation.scales.cav.gap=0"], "scale"),
-        (["scenario.pieces.collision.followers=[bus]"], "bus"),
+        (["observation.scales.self.gap=0"], "scale"),
+        (["+scenario.filters.bus={_target_: lcc_rl.pieces.CBFFilter}"], "bus"),
     ],
 )
 def test_impossible_environment_settings(overrides, words) -> None:

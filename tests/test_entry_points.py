@@ -25,7 +25,8 @@ from commands import (
 )
 from omegaconf import OmegaConf
 
-from lcc_rl import evaluate, pipeline, results, train
+from lcc_rl import results
+from lcc_rl.commands import evaluation, pipeline, training
 from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
@@ -36,7 +37,7 @@ from lcc_rl.runs.states import inspect_run
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "alcc"
-    train.run(tiny("train", "variant=alcc"), folder, quiet=True)
+    training.run(tiny("train", "variant=alcc"), folder, quiet=True)
     return folder
 
 
@@ -58,12 +59,12 @@ def test_train_leaves_everything_that_is_promised(trained) -> None:
 
 
 def test_same_command_same_rows(trained, tmp_path) -> None:
-    train.run(tiny("train", "variant=alcc"), tmp_path, quiet=True)
+    training.run(tiny("train", "variant=alcc"), tmp_path, quiet=True)
     assert_same_tables(trained, tmp_path)
 
 
 def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> None:
-    train.run(tiny("train", "variant=alcc", "training.keep_every=2"), tmp_path, quiet=True)
+    training.run(tiny("train", "variant=alcc", "training.keep_every=2"), tmp_path, quiet=True)
     one, two = (read_parquet(folder / "training.parquet") for folder in (trained, tmp_path))
     pd.testing.assert_frame_equal(one, two, check_exact=True)
     kept = tmp_path / "policies" / "000002.pt"
@@ -74,7 +75,7 @@ def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> N
     assert all(weights[name].shape == last[name].shape for name in last)
     assert any(not torch.equal(weights[name], last[name]) for name in last)
     cfg = tiny("evaluate", "variant=alcc", f"policy={kept}", agent=False)
-    rows = evaluate.run(cfg, tmp_path / "evaluation", quiet=True)
+    rows = evaluation.run(cfg, tmp_path / "evaluation", quiet=True)
     assert set(rows["strategy"]) == {"direct", "idm", "alcc"}
 
 
@@ -86,12 +87,12 @@ def test_what_is_kept_is_no_part_of_a_run_and_a_given_policy_is() -> None:
 
 def test_a_folder_with_a_training_is_not_overwritten(trained) -> None:
     with pytest.raises(ConfigError, match="already holds a training"):
-        train.run(tiny("train", "variant=alcc"), trained)
+        training.run(tiny("train", "variant=alcc"), trained)
 
 
 def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}")
-    rows = evaluate.run(cfg, tmp_path)  # not quiet: draws figures
+    rows = evaluation.run(cfg, tmp_path)  # not quiet: draws figures
     assert set(rows["strategy"]) == {"direct", "idm", "alcc"}
     # The training's own evaluation met the same episodes.
     own = read_parquet(trained / "episodes.parquet")
@@ -103,8 +104,8 @@ def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
 
 def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_path) -> None:
     words = ("variant=alcc", f"policy={trained}")
-    free = evaluate.run(tiny("evaluate", *words), tmp_path / "a", quiet=True)
-    held = evaluate.run(tiny("evaluate", *words, "+filter=barrier"), tmp_path / "b", quiet=True)
+    free = evaluation.run(tiny("evaluate", *words), tmp_path / "a", quiet=True)
+    held = evaluation.run(tiny("evaluate", *words, "+filter=cbf"), tmp_path / "b", quiet=True)
     means = [rows.groupby("strategy")["min_ttc_s"].mean() for rows in (free, held)]
     assert means[0]["idm"] == means[1]["idm"]
     assert means[0]["alcc"] != means[1]["alcc"]
@@ -112,51 +113,51 @@ def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_pat
 
 
 def test_compared_policies_get_the_filter_under_study(trained, tmp_path) -> None:
-    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "+filter=barrier")
+    cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "+filter=cbf")
     OmegaConf.update(cfg, "compare", ["pretrained/reference"])
-    rows = evaluate.run(cfg, tmp_path, quiet=True)
+    rows = evaluation.run(cfg, tmp_path, quiet=True)
     learned = rows[rows["strategy"].isin(["alcc", "reference"])]
     assert learned["strategy"].nunique() == 2
     assert (learned["share_ttc_unsafe"] == 0).all()
-    alone = tiny("evaluate", "variant=reference", "policy=pretrained", "+filter=barrier")
-    again = evaluate.run(alone, tmp_path / "alone", quiet=True)
+    alone = tiny("evaluate", "variant=reference", "policy=pretrained", "+filter=cbf")
+    again = evaluation.run(alone, tmp_path / "alone", quiet=True)
     parts = [r[r["strategy"] == "reference"].reset_index(drop=True) for r in (rows, again)]
     pd.testing.assert_frame_equal(parts[0][again.columns], parts[1], check_exact=True)
 
 
 def test_a_policy_keeps_the_filter_it_was_trained_with(tmp_path) -> None:
     folder = tmp_path / "run"
-    train.run(tiny("train", "variant=alcc", "+filter=barrier"), folder, quiet=True)
+    training.run(tiny("train", "variant=alcc", "+filter=cbf"), folder, quiet=True)
     own = read_parquet(folder / "episodes.parquet")
     ways = {"policy": (f"policy={folder}",), "compare": (f"compare=[{folder}]",)}
     for name, words in ways.items():
         cfg = tiny("evaluate", "variant=alcc", *words)
-        rows = evaluate.run(cfg, tmp_path / name, own=name == "policy", quiet=True)
+        rows = evaluation.run(cfg, tmp_path / name, own=name == "policy", quiet=True)
         again = rows[rows["strategy"] == "alcc"].reset_index(drop=True)[own.columns]
         pd.testing.assert_frame_equal(again, own, check_exact=True)
 
 
 def test_an_interrupted_evaluation_leaves_no_old_rows(trained, tmp_path, monkeypatch) -> None:
-    evaluate.run(tiny("evaluate", "variant=alcc", f"policy={trained}"), tmp_path, quiet=True)
+    evaluation.run(tiny("evaluate", "variant=alcc", f"policy={trained}"), tmp_path, quiet=True)
 
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluate, "evaluate_and_write", interrupted)
+    monkeypatch.setattr(evaluation, "evaluate_and_write", interrupted)
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "evaluation.seed=7")
     with pytest.raises(KeyboardInterrupt):
-        evaluate.run(cfg, tmp_path, quiet=True)
+        evaluation.run(cfg, tmp_path, quiet=True)
     assert load_config(tmp_path).evaluation.seed == 7
     assert not (tmp_path / "episodes.parquet").exists()
 
 
 def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
     # A quieter scenario must reach the baselines as well, without changing what they are.
-    calm = "scenario.pieces.hdv.noise=0"
+    calm = "scenario.controllers.human.noise=0"
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", calm)
-    rows = evaluate.run(cfg, tmp_path / "a", quiet=True)
+    rows = evaluation.run(cfg, tmp_path / "a", quiet=True)
     cfg = tiny("evaluate", "variant=idm", calm, agent=False)
-    alone = evaluate.run(cfg, tmp_path / "b", quiet=True)
+    alone = evaluation.run(cfg, tmp_path / "b", quiet=True)
     for name in ("idm", "direct"):
         one, two = (r[r["strategy"] == name].reset_index(drop=True) for r in (rows, alone))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
@@ -167,7 +168,7 @@ def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
     [
         (["variant=alcc"], "give policy="),
         (["variant=reference", "policy={trained}"], "trained as variant alcc"),
-        (["variant=alcc", "policy={trained}", "observation.scales.cav.gap=0.2"], "observation"),
+        (["variant=alcc", "policy={trained}", "observation.scales.self.gap=0.2"], "observation"),
         (["variant=alcc", "policy=nowhere"], "no such file"),
         (["variant=alcc", "policy={trained}/training.parquet"], "not a readable weights file"),
         (["variant=alcc", "policy={trained}/checkpoint.pt"], "not a policy"),
@@ -176,7 +177,7 @@ def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
 def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
     cfg = tiny("evaluate", *(item.format(trained=trained) for item in overrides))
     with pytest.raises(Exception, match=words) as caught:
-        evaluate.run(cfg, tmp_path)
+        evaluation.run(cfg, tmp_path)
     assert type(caught.value).__module__ == "lcc_rl.errors"
 
 
@@ -187,28 +188,28 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
         ("evaluation.drivers=0", r"evaluation\.drivers must be at least 1"),
         ("evaluation.profiles=0", r"evaluation\.profiles must be at least 1"),
         ("scenario.time_step=-0.1", r"time_step must be positive"),
-        ("~scenario.pieces.cav_ttc", r"lacks \['cav_ttc'\], which the evaluation measures"),
-        ("~scenario.pieces.hdv_predicted_power", r"reads hdv\.predicted_power, which no piece"),
-        ("~scenario.pieces.hdv", r"reads hdv\."),
+        ("~scenario.pieces.ttc", r"lacks \['ttc'\], which the evaluation measures"),
+        ("~scenario.pieces.predicted_power", r"reads human\.predicted_power, which no piece"),
+        ("~scenario.controllers.human", r"has the role 'human', but scenario\.controllers names"),
     ],
 )
 def test_what_would_fail_late_fails_before_anything_is_written(tmp_path, override, words) -> None:
     with pytest.raises(ConfigError, match=words):
-        train.run(tiny("train", override), tmp_path)
+        training.run(tiny("train", override), tmp_path)
     assert not (tmp_path / "training.parquet").exists()
 
 
 def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
-    train.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct", quiet=True)
-    cfg = tiny("evaluate", "variant=idm", "scenario.followers=3", agent=False)
-    rows = evaluate.run(cfg, tmp_path / "three")
+    training.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct", quiet=True)
+    cfg = tiny("evaluate", "variant=idm", "scenario.string='automated human*3'", agent=False)
+    rows = evaluation.run(cfg, tmp_path / "three")
     assert set(rows["strategy"]) == {"direct", "idm"}
     assert (tmp_path / "three" / "figures" / "episode_idm.png").exists()
 
 
 def test_a_policy_for_those_that_learn_nothing_is_refused(trained, tmp_path) -> None:
     with pytest.raises(ConfigError, match="learns nothing"):
-        evaluate.run(tiny("evaluate", "variant=idm", f"policy={trained}", agent=False), tmp_path)
+        evaluation.run(tiny("evaluate", "variant=idm", f"policy={trained}", agent=False), tmp_path)
 
 
 def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
@@ -242,7 +243,7 @@ def test_multirun_sweep_and_results_load(tmp_path) -> None:
 
 def test_sigkill_and_resume_equal_an_uninterrupted_run(tmp_path) -> None:
     longer = ("training.episodes=160", "variant=alcc")
-    train.run(tiny("train", *longer), tmp_path / "whole", quiet=True)
+    training.run(tiny("train", *longer), tmp_path / "whole", quiet=True)
     with start("lcc_rl.train", *TINY, *longer, "hydra.run.dir=run", cwd=tmp_path) as process:
         wait_for(tmp_path / "run" / "checkpoint.pt", process)
         process.send_signal(signal.SIGKILL)
@@ -334,12 +335,12 @@ def test_a_policy_drives_before_more_drivers_than_it_was_trained_with(tmp_path) 
     # What the reference learns does not depend on their number; nor may what it is measured with.
     runs = [tmp_path / str(followers) for followers in (1, 3)]
     for folder in runs:
-        cfg = tiny("train", "variant=reference", f"scenario.followers={folder.name}")
-        train.run(cfg, folder, quiet=True)
+        cfg = tiny("train", "variant=reference", f"scenario.string='automated human*{folder.name}'")
+        training.run(cfg, folder, quiet=True)
     energies = []
     for folder in runs:
-        cfg = tiny("evaluate", "variant=idm", "scenario.followers=3", agent=False)
+        cfg = tiny("evaluate", "variant=idm", "scenario.string='automated human*3'", agent=False)
         cfg.compare = [str(folder)]
-        rows = evaluate.run(cfg, tmp_path / f"evaluation {folder.name}", quiet=True)
+        rows = evaluation.run(cfg, tmp_path / f"evaluation {folder.name}", quiet=True)
         energies.append(rows[rows["strategy"] == "reference"]["total_energy_kj"].to_numpy())
     assert (energies[0] == energies[1]).all()

@@ -9,13 +9,17 @@ import pytest
 import torch
 from commands import AGENT, HORIZON, run_command
 from helpers import POPULATION
-from lcc_rl.agents.training import Trainer, transitions
 
-from lcc_rl import evaluate, results, train
+from lcc_rl import results
+from lcc_rl.agents.factory import build_agent
+from lcc_rl.agents.replay import LEARNED_FROM, Trainer, transitions
+from lcc_rl.commands import evaluation, training
 from lcc_rl.config import identity, load
-from lcc_rl.envs.factory import build_agent, build_env, load_inputs
+from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet
+from lcc_rl.policies import shared_policy
+from lcc_rl.policies.actor import ACTION
 from lcc_rl.results.runs import load_policy
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
@@ -31,7 +35,7 @@ def tiny(entry: str, variant: str, *overrides: str):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "hcfs"
-    train.run(tiny("train", "hcfs"), folder, quiet=True)
+    training.run(tiny("train", "hcfs"), folder, quiet=True)
     return folder
 
 
@@ -40,7 +44,7 @@ def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:
     assert {"reward_velocity", "reward_jerk", "loss_value"} <= set(rows)
     assert rows["transitions"].iloc[-1] == 24 * 40 * 6  # episodes × steps × followers
     # The same settings train the same parent, whatever drives afterwards.
-    train.run(tiny("train", "ddpg"), tmp_path / "ddpg", quiet=True)
+    training.run(tiny("train", "ddpg"), tmp_path / "ddpg", quiet=True)
     one, two = (load_policy(folder)[0] for folder in (trained, tmp_path / "ddpg"))
     assert all(torch.equal(one[key], two[key]) for key in one)
     episodes = read_parquet(trained / "episodes.parquet")
@@ -49,11 +53,21 @@ def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:
 
 
 def test_hcfs_builds_on_a_given_policy(trained, tmp_path) -> None:
-    rows = train.run(tiny("train", "hcfs", f"policy={trained}"), tmp_path, quiet=True)
+    rows = training.run(tiny("train", "hcfs", f"policy={trained}"), tmp_path, quiet=True)
     assert not (tmp_path / "training.parquet").exists()
     pd.testing.assert_frame_equal(rows, read_parquet(trained / "episodes.parquet"))
     with pytest.raises(ConfigError, match="builds on no trained policy"):
-        train.run(tiny("train", "ddpg", f"policy={trained}"), tmp_path / "b", quiet=True)
+        training.run(tiny("train", "ddpg", f"policy={trained}"), tmp_path / "b", quiet=True)
+
+
+def test_the_gradient_through_the_simulator_trains_platoons_too(tmp_path) -> None:
+    cfg = load("train", [*TINY, "variant=ddpg", "agent=analytic"])
+    rows = training.run(cfg, tmp_path, quiet=True)
+    assert set(rows["strategy"]) == {"ddpg"}
+    assert load_policy(tmp_path)[1].agent._target_.endswith("Analytic")
+    # Without the recipe its segments divide the platoon's episodes.
+    cfg = load("train", ["variant=ddpg", "agent=analytic"])
+    assert cfg.scenario.horizon % cfg.training.segment == 0
 
 
 def test_evaluate_every_variant(trained, tmp_path) -> None:
@@ -65,7 +79,8 @@ def test_evaluate_every_variant(trained, tmp_path) -> None:
     }
     for variant, names in expected.items():
         given = () if variant == "cacc" else (f"policy={trained}",)
-        rows = evaluate.run(tiny("evaluate", variant, *given), tmp_path / variant, quiet=True)
+        # Not quiet: draws figures.
+        rows = evaluation.run(tiny("evaluate", variant, *given), tmp_path / variant)
         assert set(rows["strategy"]) == names
         figures = {path.name for path in (tmp_path / variant / "figures").iterdir()}
         assert {"case_1_velocities.png", "case_3_jerk.png"} <= figures
@@ -80,14 +95,14 @@ def test_evaluate_every_variant(trained, tmp_path) -> None:
 
 def test_other_gains_stand_beside_the_named_ones(tmp_path) -> None:
     cfg = tiny("evaluate", "cacc", "gains.k4=1.1")
-    rows = evaluate.run(cfg, tmp_path, quiet=True)
+    rows = evaluation.run(cfg, tmp_path, quiet=True)
     assert {"cacc", "cacc tuned"} <= set(rows["strategy"])
 
 
 @pytest.mark.parametrize("variant", ["cacc", "ddpg", "hcfs"])
 def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
     cfg = load("evaluate", [*TINY, f"variant={variant}", "policy=pretrained"])
-    rows = evaluate.run(cfg, tmp_path, quiet=True)
+    rows = evaluation.run(cfg, tmp_path, quiet=True)
     assert not rows["collided"].any()
     reward = rows[rows["case"] == "windows"].groupby("strategy")["reward"].sum()
     if variant == "hcfs":
@@ -99,14 +114,14 @@ def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
     [
         ((), "give policy="),
         (("policy=nowhere",), "no such file"),
-        (("policy={trained}", "observation.scales.speed=0.2"), "another observation"),
-        (("policy=pretrained/reference",), "pretrained policy|not for a platoon"),
+        (("policy={trained}", "observation.scales.self.speed=0.2"), "another observation"),
+        (("policy=pretrained/reference",), "was trained as variant reference, not ddpg"),
     ],
 )
 def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
     given = [item.format(trained=trained) for item in overrides]
     with pytest.raises((ConfigError, ResultsError), match=words):
-        evaluate.run(tiny("evaluate", "ddpg", *given), tmp_path, quiet=True)
+        evaluation.run(tiny("evaluate", "ddpg", *given), tmp_path, quiet=True)
 
 
 def test_sweep_as_typed(tmp_path) -> None:
@@ -116,7 +131,7 @@ def test_sweep_as_typed(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     frame = results.load(tmp_path / "sweep")
     assert frame.groupby(["variant", "seed"]).ngroups == 6
-    assert {"agent.gamma", "gains.k3", "controller.jerk_bound"} <= set(frame)
+    assert {"agent.gamma", "gains.k3", "deployed.jerk_bound"} <= set(frame)
 
 
 # -- training --------------------------------------------------------------------------------------
@@ -138,8 +153,9 @@ def test_transitions_are_those_of_every_follower(tmp_path) -> None:
     envs, steps = batch.shape
     assert flat.shape == (envs * steps * 6,)
     row = (3 * steps + 7) * 6 + 2  # environment 3, step 7, follower 2
-    for key in ("observation", "action", ("next", "reward"), ("next", "observation")):
-        assert torch.equal(flat[key][row], batch[key][3, 7, 2]), key
+    for key, name in LEARNED_FROM.items():
+        if "terminated" not in key and "done" not in key:
+            assert torch.equal(flat[name][row], batch[key][3, 7, 2]), name
     assert torch.equal(flat["next", "done"][row], batch["next", "done"][3, 7])
 
 
@@ -150,8 +166,8 @@ def test_followers_explore_each_on_their_own(tmp_path) -> None:
         source = made._source()
         source.reset()
         batch = next(iter(source))
-        mean = made.agent.policy(batch.copy())["action"]
-    noise = (batch["action"] - mean).flatten(0, 1).squeeze(-1)
+        mean = shared_policy(made.agent.policy)(batch.copy())[ACTION]
+    noise = (batch[ACTION] - mean).flatten(0, 1).squeeze(-1)
     correlation = torch.corrcoef(noise.T)
     assert (correlation - torch.eye(6)).abs().max() < 0.35
     assert 0.2 < noise.std() < 0.4

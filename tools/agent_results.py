@@ -37,7 +37,7 @@ def table_of_agents(folder: Path) -> pd.DataFrame:
         row = {
             "run": str(path.parent.relative_to(folder)),
             "variant": first["strategy"],
-            "agent": short_name(first["agent._target_"]),
+            "agent": short_name(first.get("agent._target_", "none")),
             "seed": first["seed"],
             **{name: episodes[name].mean() for name in MEANS},
             "net_energy_kj": episodes["total_net_energy_kj"].mean(),

@@ -17,16 +17,18 @@ import sys
 from pathlib import Path
 
 import pandas as pd
-from lcc_rl.evaluation.monte_carlo import evaluate
 from rich.console import Console
 
+from lcc_rl.commands.pipeline import root_key
 from lcc_rl.config import load, require
-from lcc_rl.envs.factory import load_inputs
+from lcc_rl.envs import load_inputs
+from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluate import baseline, trained
 from lcc_rl.evaluation.clairvoyant import clairvoyant
+from lcc_rl.evaluation.episodes import evaluate
+from lcc_rl.evaluation.strategies import baseline, trained
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import write_parquet
-from lcc_rl.pipeline import root_key
 from lcc_rl.results.runs import load_policy
 from lcc_rl.results.tables import as_rich, summary
 from lcc_rl.runs.cli import main_guard, prepare_torch
@@ -45,17 +47,16 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
     prepare_torch(cfg)
     inputs, size = load_inputs(cfg), cfg.evaluation
     policy = load_policy(options.policy, cfg.variant, tuple(cfg.trust))
-    if "hdv" not in policy[1].scenario.pieces:
+    if HUMAN not in string_of(policy[1]).names:
         raise ConfigError(
             f"--policy {options.policy} was trained as variant {policy[1].variant}, which has no "
             "human drivers; expected that of a car with a human behind, such as alcc"
         )
-    learned = trained(cfg, options.policy, policy, inputs)
+    learned = trained(cfg, options.policy, policy, inputs.population)
     with ProgressReporter("clairvoyant", options.iterations, folder=options.out) as progress:
         best = clairvoyant(
             learned,
-            inputs.evaluation,
-            inputs.population,
+            inputs,
             size.drivers,
             size.seed,
             options.iterations,
@@ -64,8 +65,8 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
         )
     batch = len(inputs.evaluation) * len(inputs.population.time_gap)
     rows = [
-        evaluate(strategy, inputs.evaluation, inputs.population, size.drivers, batch, size.seed)[0]
-        for strategy in (baseline(cfg, "idm", inputs), learned, best)
+        evaluate(strategy, inputs, size.drivers, batch, size.seed)[0]
+        for strategy in (baseline(cfg, "idm"), learned, best)
     ]
     episodes = pd.concat(rows, ignore_index=True)
     write_parquet(episodes, options.out / "episodes.parquet")

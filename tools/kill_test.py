@@ -24,6 +24,7 @@ import pandas as pd
 import torch
 
 from lcc_rl import results, train
+from lcc_rl.commands.training import EPISODES
 from lcc_rl.config import load
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import LoadedEpisodes
@@ -99,7 +100,7 @@ def unreadable(sweep: Path) -> list[str]:
 def finished(sweep: Path) -> dict[str, int]:
     """Return the finished runs and when their table was written."""
     names = [state.name for state in survey(sweep) if state.state == "finished"]
-    return {name: (sweep / name / train.EPISODES).stat().st_mtime_ns for name in names}
+    return {name: (sweep / name / EPISODES).stat().st_mtime_ns for name in names}
 
 
 def tail(log: Path, lines: int = 100) -> list[str]:

@@ -1,4 +1,4 @@
-"""What every training loop does besides learning: record, checkpoint, stop and go on.
+"""What every training loop does besides learning: record, checkpoint, stop and resume.
 
 Iteration i of a training is a function of the state before it and of (seed, i) alone: every
 generator is seeded anew from these at its start. A checkpoint therefore holds tensors and a
@@ -192,7 +192,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
                 if stop.is_set():
                     self.save()
                     raise Interrupted(
-                        f"stopped after iteration {self.iteration} of {self.iterations}; go on "
+                        f"stopped after iteration {self.iteration} of {self.iterations}; resume "
                         f"with: python -m lcc_rl.train resume={self.folder}"
                     )
                 if self.iteration % self.settings.checkpoint_every == 0:

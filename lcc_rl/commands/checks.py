@@ -8,12 +8,13 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
-from lcc_rl.config import build, load, require
+from lcc_rl.config import TARGET, build, load, require
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import constant_profiles
+from lcc_rl.envs.inputs import constant_profiles, string_of
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.schemas import TrainConfig
 
@@ -77,7 +78,7 @@ def check_variant(cfg: DictConfig) -> None:
         own = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a variant of the user's own, known to this command line only
         return
-    if learns(own) and not learns(cfg) and cfg.scenario.string == own.scenario.string:
+    if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
             "driver say variant=idm"
@@ -86,6 +87,12 @@ def check_variant(cfg: DictConfig) -> None:
         raise ConfigError(
             f"variant={cfg.variant} learns nothing: remove agent=…, or choose a learned variant"
         )
+
+
+def _is_driven_as(cfg: DictConfig, own: DictConfig) -> bool:
+    """Whether there is somebody to drive, by the same kind of controller as in another one."""
+    kinds = [part.scenario.controllers.automated.get(TARGET) for part in (cfg, own)]
+    return string_of(cfg).count(AUTOMATED) > 0 and kinds[0] == kinds[1]
 
 
 def objectives(cfg: DictConfig) -> list[str]:
@@ -127,6 +134,10 @@ def check_sizes(cfg: DictConfig) -> None:
     require(
         not measured or cfg.evaluation.rows != "episodes",
         f"scenario.pieces lacks {measured}, which the evaluation measures",
+    )
+    require(
+        cfg.evaluation.rows != "vehicles" or pieces.get("communication") is not None,
+        "evaluation.rows=vehicles measures what scenario.pieces.communication writes; there is none",
     )
     step = cfg.scenario.time_step
     require(step > 0, f"scenario.time_step must be positive, got {step}")

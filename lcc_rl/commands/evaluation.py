@@ -10,7 +10,7 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import check_sizes
+from lcc_rl.commands.checks import check_sizes, check_variant
 from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, unknown_name
@@ -59,6 +59,8 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     folder = Path(folder)
     prepare_torch(cfg)
     check_sizes(cfg)
+    if own:
+        check_variant(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     strategies, inputs = _strategies(cfg, own)

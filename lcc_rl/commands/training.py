@@ -16,7 +16,8 @@ from lcc_rl.config import identity, require
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import WINDOWS
-from lcc_rl.evaluation.strategies import Strategy, check_policy, deployed, with_weights
+from lcc_rl.evaluation.fit import check_policy
+from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.runs import load_config, load_policy, save_config, save_policy
@@ -59,7 +60,7 @@ def run(
         cfg = load_config(folder, tuple(cfg.trust))
     elif (folder / CHECKPOINT).exists() and not resume:
         raise ConfigError(
-            f"{folder} already holds a training; go on with resume={folder} or choose another "
+            f"{folder} already holds a training; resume it with resume={folder} or choose another "
             "hydra.run.dir"
         )
     with working(folder):
@@ -75,7 +76,7 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     save_config(cfg, folder)
     if not learns(cfg):
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
-        strategy = Strategy(cfg.variant, deployed(cfg))
+        strategy = rule(cfg)
     elif cfg.get("policy") is not None:
         strategy = _given(cfg, inputs, folder)
     else:

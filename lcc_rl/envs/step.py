@@ -190,41 +190,28 @@ class Pieces(Compose):
         return [transform for transform in self.transforms if not isinstance(transform, Piece)]
 
 
-class _Entries(dict[Key, Tensor]):
-    """The entries of a TensorDict, read when they are asked for."""
-
-    def __init__(self, td: TensorDictBase) -> None:
-        super().__init__()
-        self.td, self.found = td, State()
-
-    def __missing__(self, key: Key) -> Tensor:
-        # Kept apart from what the pieces write.
-        if key not in self.found:
-            self.found[key] = self.td.get(key)
-        return self.found[key]
+def _read(td: TensorDictBase, place: Key = ()) -> State:
+    """Return the entries of a TensorDict by their full keys, as they are."""
+    found: State = {}
+    for name, value in td.items():
+        if isinstance(value, Tensor):
+            found[(*place, name)] = value
+        else:
+            found |= _read(value, (*place, name))
+    return found
 
 
 def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
-    """Apply pieces to two moments and add what they write to the second."""
+    """Apply pieces to two moments; return the second with what they write."""
     if not pieces:
         return next_td
-    before, reached = _Entries(td), _Entries(next_td)
+    before, reached = _read(td), _read(next_td)
     for piece in pieces:
         piece.apply(before, reached)
-    spaces: dict[str, dict[str, Any]] = {}
+    nested: dict[str, Any] = {}
     for key, value in reached.items():
-        if len(key) == 1:
-            next_td.set(key[0], value)
-        else:
-            _nest(spaces, key, value)
-    for space, values in spaces.items():
-        made = TensorDict(values, td.batch_size, device=td.device)
-        known = next_td.get(space, None)
-        next_td.set(space, made if known is None else known.update(made))
-    return next_td
-
-
-def _nest(target: dict[str, Any], key: Key, value: Tensor) -> None:
-    for name in key[:-1]:
-        target = target.setdefault(name, {})
-    target[key[-1]] = value
+        space = nested
+        for name in key[:-1]:
+            space = space.setdefault(name, {})
+        space[key[-1]] = value
+    return TensorDict(nested, next_td.batch_size, device=next_td.device)

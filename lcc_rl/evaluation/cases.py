@@ -18,9 +18,9 @@ from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
 
 WINDOWS = "windows"
 RECORDED = ("speed", "gap", "acceleration", "jerk", "speed_error", "leader_speed_error")
-REWARD = (AUTOMATED, "reward")
+INDEX, REWARD = (AUTOMATED, "index"), (AUTOMATED, "reward")
 KEYS = [("leader", "speed"), *(("vehicles", name) for name in RECORDED), REWARD]
-KEYS += [(HYBRID, name) for name in ("winner", *COUNTERS)]
+KEYS += [INDEX, *((HYBRID, name) for name in ("winner", *COUNTERS))]
 # ``[time, runs, vehicles]``; of entries that only automated vehicles have, their rows alone.
 Series = dict[str, Tensor]
 
@@ -81,14 +81,13 @@ def drive(
     ids, drivers = torch.arange(runs, device=env.device), len(inputs.population.time_gap)
     given = reset_options(env, ids, ids % drivers, seed, drivers)
     record, _ = play(env, strategy.policy, given, KEYS)
-    string = string_of(cfg)
+    index, vehicles = record.pop(INDEX, None), len(string_of(cfg))
     series = {"leader": record.pop(("leader", "speed"))}
     for (space, name), entry in record.items():
         entry = entry.squeeze(-1)
-        if space != "vehicles" and entry.shape[-1] != len(string):
-            full = torch.full((*entry.shape[:-1], len(string)), torch.nan, device=entry.device)
-            full[..., list(string.places(AUTOMATED))] = entry.to(full.dtype)
-            entry = full
+        if space != "vehicles" and index is not None and entry.shape[-1] != vehicles:
+            full = torch.full((*entry.shape[:-1], vehicles), torch.nan, device=entry.device)
+            entry = full.scatter(-1, index, entry.to(full.dtype))
         series[name] = entry
     return series
 

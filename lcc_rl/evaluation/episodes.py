@@ -143,7 +143,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
 
 
 def measure(groups: Groups, alive: Tensor, time_step: float) -> pd.DataFrame:
-    """Turn the record of a batch into one row of measures per episode."""
+    """Turn the record of a batch into one row per episode; energies add up over vehicles (A20)."""
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
         series = groups[group]

@@ -17,7 +17,7 @@ LONG_TIME_GAP = 2.5  # [s] (A13)
 def energy_measures(
     power: Tensor, speed: Tensor, alive: Tensor, time_step: float
 ) -> dict[str, Tensor]:
-    """Energy of every vehicle, raw, net of its change in kinetic energy, and its distance.
+    """Energy of every vehicle (A20), raw, net of its change in kinetic energy, and its distance.
 
     Args:
         power: motor power of each step, ``[time, *batch, n, 1]`` [W].

@@ -11,6 +11,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import hash_bits
 from lcc_rl.pieces.base import SEED, Key, State, as_key
 
@@ -34,8 +35,16 @@ def play(
     Returns:
         The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
         ``[time + 1, …]``, and whether each step belongs to a running episode, ``[time, batch, 1]``.
+
+    Raises:
+        ConfigError: if a controller takes an action and there is no policy.
     """
     pieces = pieces_of(env)
+    if policy is None and any(key == ACTION for piece in pieces for _, key in piece.sources):
+        raise ConfigError(
+            "scenario.controllers.automated takes the action of a policy, and there is none: "
+            "choose an agent, or another controller"
+        )
     known = written(pieces)
     kept = [key for key in keys if key in known]
     reads = [as_key(key) for key in getattr(policy, "in_keys", [])]

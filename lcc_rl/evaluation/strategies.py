@@ -18,11 +18,11 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import TARGET, load, plain, short_name
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import differing, flatten
 
 log = logging.getLogger("lcc_rl")
 
@@ -104,9 +104,10 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
-    if cfg.variant == name:
+    controller = baseline_controller(name)
+    if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)
-    return Strategy(name, without_filter(driven_by(cfg, baseline_controller(name))))
+    return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
 def baseline_controller(name: str) -> Any:
@@ -135,6 +136,35 @@ def without_automated(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
+def rule(cfg: DictConfig) -> Strategy:
+    """Return the strategy of a configuration that learns nothing.
+
+    Its name is that of the variant, of the controller where that is another than the variant's,
+    and ``direct`` where nobody is automated.
+    """
+    if not string_of(cfg).count(AUTOMATED):
+        return Strategy(DIRECT, cfg)
+    try:
+        own = _target(load("evaluate", [f"variant={cfg.variant}"]))
+    except ConfigError:  # a variant of the user's own, known to this command line only
+        own = _target(cfg)
+    name = cfg.variant if _target(cfg) == own else short_name(_target(cfg))
+    return Strategy(name, deployed(cfg))
+
+
+def _target(cfg: DictConfig) -> str:
+    return str(cfg.scenario.controllers.automated.get(TARGET))
+
+
+def _baseline_controllers(cfg: DictConfig) -> list[Any]:
+    """Return the nodes of the controllers of all baselines in which somebody is automated."""
+    return [
+        plain(strategy.cfg.scenario.controllers.automated)
+        for strategy in baselines(cfg)
+        if strategy.name != DIRECT
+    ]
+
+
 def studied(
     cfg: DictConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
@@ -149,11 +179,11 @@ def studied(
         ConfigError: if it needs a policy and none is given, or the policy does not fit.
     """
     if not learns(cfg):
-        nodes = [plain(s.cfg.scenario.controllers.automated) for s in baselines(cfg)]
-        known = plain(cfg.scenario.controllers.automated) in nodes
-        same = known and cfg.scenario.filters.get(AUTOMATED) is None
-        named = cfg.variant in cfg.evaluation.baselines
-        return [] if same or named else [Strategy(cfg.variant, cfg)]
+        strategy = rule(cfg)
+        known = plain(cfg.scenario.controllers.automated) in _baseline_controllers(cfg)
+        same = known and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
+        named = strategy.name in cfg.evaluation.baselines
+        return [] if same or named else [strategy]
     if policy is None:
         raise ConfigError(
             f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
@@ -170,47 +200,14 @@ def studied(
     return [strategy] if cfg.deployed is None else hybrids(strategy)
 
 
-def check_policy(cfg: DictConfig, own: DictConfig) -> None:
-    """Check that a policy was trained for the variant and the observation under study.
-
-    Raises:
-        ConfigError: naming what differs.
-    """
-    hybrid = cfg.deployed is not None or own.get("deployed") is not None
-    if own.variant != cfg.variant and not hybrid:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
-            f"say variant={own.variant}"
-        )
-    trained_with, observed = (
-        dict(flatten(plain(node))) for node in (own.observation, cfg.observation)
-    )
-    changes = [
-        f"observation.{key}: {trained_with.get(key)}, got {observed.get(key)}"
-        for key in differing(trained_with, observed)
-    ]
-    if changes:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained with another observation than this: expected "
-            f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
-        )
-    remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
-    if remembered != asked:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained with another memory than this: "
-            f"expected scenario.pieces.memory={remembered}, got {asked}"
-        )
-
-
 def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, the parents it is composed of, and its oracle."""
     cfg = strategy.cfg
     parent = driven_by(cfg, cfg.scenario.controllers.automated)
     found = [replace(strategy, name=short_name(cfg.agent[TARGET]), cfg=parent)]
-    rule = plain(cfg.deployed).get("rule")
-    known = [plain(s.cfg.scenario.controllers.automated) for s in baselines(cfg)]
-    if rule is not None and rule not in known:
-        found.insert(0, Strategy("cacc", driven_by(cfg, rule)))
+    parent_rule = plain(cfg.deployed).get("rule")
+    if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
+        found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
     if set(string_of(cfg).names) == {AUTOMATED}:
         oracle = {**plain(cfg.deployed), "lookahead": "oracle"}

@@ -1,4 +1,4 @@
-"""Cooperative adaptive cruise control and dead-beat control (HCFS H1–H11).
+"""Cooperative adaptive cruise control and dead-beat control (HCFS H1–H2, H11).
 
 Signs: an error is positive where the follower is too far behind or too slow; the signs of H1–H2 as
 printed would make the gap negative. Tensors of vehicles are ``[*batch, N, 1]``.

@@ -1,4 +1,4 @@
-"""The hybrid car-following strategy: two candidates, the better one each step (HCFS H4–H14).
+"""The hybrid car-following strategy: the better of two candidates (HCFS H4–H6, H12–H14).
 
 Tensors of vehicles are ``[*batch, N, 1]``.
 """
@@ -90,7 +90,7 @@ class Decision(NamedTuple):
     """What the hybrid strategy decides, each ``[*batch, N, 1]``.
 
     acceleration [m/s²]; winner: 0 for the rule, 1 for the learned policy; switched, clamped,
-    capped: whether the winner changed, the jerk bound cut a candidate, the safe cap the result.
+    capped: whether the winner changed, the jerk bound cut a candidate, the safe cap cut one.
     """
 
     acceleration: Tensor
@@ -103,7 +103,7 @@ class Decision(NamedTuple):
 def jerk_interval(
     last_acceleration: Tensor, jerk_bound: float, time_step: float, max_acceleration: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the accelerations between which |jerk| stays within the bound (HCFS step 1)."""
+    """Return the accelerations between which |jerk| stays within the bound J of H15–H21."""
     reach = jerk_bound * time_step
     low = (last_acceleration - reach).clamp(min=-max_acceleration)
     return low, (last_acceleration + reach).clamp(max=max_acceleration)

@@ -1,4 +1,4 @@
-"""Surrogate safety and efficiency measures: time-to-collision and time gap (A10–A13)."""
+"""Surrogate safety and efficiency measures: time-to-collision and time gap (A10, A12)."""
 
 from __future__ import annotations
 

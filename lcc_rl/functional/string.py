@@ -88,8 +88,11 @@ def blocks_of(places: Sequence[int]) -> list[slice]:
 
 def take(entry: Tensor, blocks: Sequence[slice]) -> Tensor:
     """Return the vehicles that slices select, ``[*batch, n, w]`` of ``[*batch, N, w]``."""
-    parts = [entry[..., block, :] for block in blocks]
-    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
+    if len(blocks) == 1:
+        (block,) = blocks
+        everybody = block.step == 1 and block.stop - block.start == entry.shape[-2]
+        return entry if everybody else entry[..., block, :]
+    return torch.cat([entry[..., block, :] for block in blocks], dim=-2)
 
 
 def gather(entry: Tensor, index: Tensor) -> Tensor:

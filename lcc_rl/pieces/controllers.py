@@ -41,9 +41,17 @@ def stream_name(role: str) -> str:
 class Population(Protocol):
     """What the pieces need to know of a driver population."""
 
-    desired_speed: Tensor
-    time_gap: Tensor
-    constants: IDMConstants
+    @property
+    def desired_speed(self) -> Tensor:
+        """v0 of each driver, ``[drivers]`` [m/s]."""
+
+    @property
+    def time_gap(self) -> Tensor:
+        """T of each driver, ``[drivers]`` [s]."""
+
+    @property
+    def constants(self) -> IDMConstants:
+        """The parameters that the drivers share."""
 
 
 class Controller(StepTransform):

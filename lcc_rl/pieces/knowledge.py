@@ -105,7 +105,7 @@ class ObservationMemory(StepTransform):
         self,
         time_step: float,
         sources: Sequence[str] = ("ahead.speed",),
-        seconds: Sequence[float] = (1.0, 5.0),
+        seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0),
         kind: str = "filtered",
         string: VehicleString | None = None,
     ) -> None:

@@ -20,7 +20,8 @@ class Observation(Feature):
 
     Writes ``[*batch, A, entries]``, one row per automated vehicle. Where a vehicle may have
     fewer than ``visible`` vehicles behind, their entries are zero and one more entry per vehicle
-    behind says whether it is there (1 or 0).
+    behind says whether it is there (1 or 0). HCFS observes the state H3, see
+    ``conf/observation/platoon.yaml``.
 
     Args:
         scales: constant of each entry, nested by view (:mod:`lcc_rl.pieces.views`), in the order
@@ -87,7 +88,10 @@ class Observation(Feature):
                 seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
         vehicles = max(entry.shape[-2] for entry in seen)
         # Where all see the same, such as a preview of the leader, there is one row for all.
-        rows = [entry.expand(*entry.shape[:-2], vehicles, -1) for entry in seen]
+        rows = [
+            entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
+            for entry in seen
+        ]
         return torch.cat(rows, dim=-1) * self.constants
 
 

@@ -46,11 +46,11 @@ class Sections:
         if self.string.drawn:
             return self._sum_drawn(entry, *indices)
         parts = [
-            entry[..., first:last, :].sum(-2, keepdim=True)
+            _sum(entry[..., first:last, :])
             for first, last in zip(self.first, self.last, strict=True)
         ]
         if self.wrapped:
-            parts[-1] = parts[-1] + entry[..., : self.wrapped, :].sum(-2, keepdim=True)
+            parts[-1] = parts[-1] + _sum(entry[..., : self.wrapped, :])
         if not parts:
             return entry[..., :0, :]
         return parts[0] if len(parts) == 1 else cat(parts, -2)
@@ -66,3 +66,8 @@ class Sections:
             front = sum_ranges(entry, start.new_zeros(start.shape), start)
             total = total + pad(front, (0, 0, total.shape[-2] - 1, 0))
         return total
+
+
+def _sum(entry: Tensor) -> Tensor:
+    """Return the sum over vehicles, ``[*batch, 1, 1]``."""
+    return entry if entry.shape[-2] == 1 else entry.sum(-2, keepdim=True)

@@ -50,8 +50,8 @@ class SmoothSafety(RewardTerm):
     def __init__(
         self,
         name: str = "safety",
-        weight: float = 1.0,
-        threshold: float = 4.0,
+        weight: float = 0.5,
+        threshold: float = 4.2,
         width: float = 0.1,
         margin: float = 1.0,
         gap_width: float = 0.2,
@@ -94,9 +94,9 @@ class SmoothEfficiency(RewardTerm):
     def __init__(
         self,
         name: str = "efficiency",
-        weight: float = 1.0,
-        threshold: float = 2.5,
-        width: float = 0.1,
+        weight: float = 2.0,
+        threshold: float = 2.3,
+        width: float = 0.05,
         speed_floor: float = 1.0,
         string: VehicleString | None = None,
     ) -> None:
@@ -128,7 +128,7 @@ class Smoothness(RewardTerm):
     def __init__(
         self,
         name: str = "smoothness",
-        weight: float = 1.0,
+        weight: float = 0.001,
         string: VehicleString | None = None,
     ) -> None:
         super().__init__(name, weight, string=string)

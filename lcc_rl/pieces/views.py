@@ -55,15 +55,26 @@ class Views:
         for name in self.names:
             if len(name) - (name[0] == NEXT) != 2:
                 raise ConfigError(f"expected a name such as self.gap, got {'.'.join(name)!r}")
-        self.drawn = string.drawn
+        # Only roles have places; what all vehicles see alike needs none.
+        self.drawn = string.drawn and role in string.names
         self.places = string.places(role)
         self.blocks = blocks_of(self.places)
+        # Of those ahead (-1) and behind, where their places are the same in every episode.
+        self.others = {distance: self._blocks_at(distance) for distance in range(-1, behind + 1)}
         self.first_is_ahead = 0 in self.places and not self.drawn
         self.keys: list[Key] = []
         self.plan = [self._add(name) for name in self.names]
         # Where every entry is taken as it is, nobody needs to know where the role drives.
         picks = any(kind in (SELF, AHEAD, BEHIND, PRESENT) for kind, _, _ in self.plan)
         self.index = self._place((role, "index")) if self.drawn and picks else -1
+
+    def _blocks_at(self, distance: int) -> list[slice] | None:
+        """Return where the vehicles so far behind each one are; None if not always somewhere."""
+        places = [place + distance for place in self.places]
+        if self.string.ring:
+            places = [place % len(self.string) for place in places]
+        fixed = not self.drawn and all(0 <= place < len(self.string) for place in places)
+        return blocks_of(places) if fixed else None
 
     def _place(self, key: Key) -> int:
         """Return the place of an entry among those read."""
@@ -113,14 +124,19 @@ class Views:
         return take(entry, self.blocks)
 
     def _ahead(self, entries: Sequence[Tensor], entry: Tensor, leading: Tensor | None) -> Tensor:
-        if leading is None and not self.string.ring:
-            return take(entry, blocks_of([place - 1 for place in self.places]))
+        blocks = self.others[-1]
+        if blocks is not None:
+            return take(entry, blocks)
         return self._pick(entries, entries_ahead(leading, entry))
 
     def _behind(self, entries: Sequence[Tensor], entry: Tensor) -> Tensor:
         """Return an entry of the vehicles behind, ``[*batch, n, behind · w]``, zeros for none."""
         seen = []
         for distance in range(1, self.behind + 1):
+            blocks = self.others[distance]
+            if blocks is not None:
+                seen.append(take(entry, blocks))
+                continue
             # The first vehicles come round to the end on a ring; elsewhere nobody is there.
             wrapped = entry[..., :distance, :]
             end = wrapped if self.string.ring else torch.zeros_like(wrapped)

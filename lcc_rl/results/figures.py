@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -117,19 +118,22 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     rows = _one_episode(steps, strategy)
     for vehicle, (name, hue) in VEHICLES.items():
-        left.plot(rows["time_s"], rows[f"{vehicle}_speed"], color=hue, label=name, lw=1.3)
+        if f"{vehicle}_speed" in rows:
+            left.plot(rows["time_s"], rows[f"{vehicle}_speed"], color=hue, label=name, lw=1.3)
     style(left, "time [s]", "speed [m/s]")
     left.set_title(f"One held-out episode of {strategy}", fontsize=10)
     left.legend(frameon=False, fontsize=9)
     cars = episodes[episodes["strategy"] != "direct"]
-    means = cars.groupby("strategy", sort=False)[["cav_energy_kj", "hdv_energy_kj"]].mean()
-    base = 0.0 * means["cav_energy_kj"]
-    for vehicle in ("cav", "hdv"):
+    present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_energy_kj" in cars]
+    means = cars.groupby("strategy", sort=False)[[f"{x}_energy_kj" for x in present]].mean()
+    base = pd.Series(0.0, means.index)
+    for vehicle in present:
         name, hue = VEHICLES[vehicle]
         right.bar(means.index, means[f"{vehicle}_energy_kj"], bottom=base, color=hue, label=name)
         base = base + means[f"{vehicle}_energy_kj"]
     for place, (label, total) in enumerate(base.items()):
-        saving = f" ({100 * (total / base['idm'] - 1):+.1f} %)" if label != "idm" else ""
+        known = label != "idm" and "idm" in base
+        saving = f" ({100 * (total / base['idm'] - 1):+.1f} %)" if known else ""
         right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
     right.set_ylim(top=1.2 * base.max())
     style(right, "", "energy [kJ per episode]")
@@ -143,17 +147,17 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
-    """Return the sample episode of a strategy whose leader's speed varies most."""
+    """Return the sample episode of a strategy whose leader's, or first, speed varies most."""
     rows = steps[steps["strategy"] == strategy]
     if "training_seed" in rows and rows["training_seed"].notna().any():
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]
-    episodes = rows.groupby(["profile", "driver_id"])["leader_speed"]
+    first_speed = next(name for name in rows.columns if name.endswith("_speed"))
+    episodes = rows.groupby(["profile", "driver_id"])[first_speed]
     spread = episodes.transform("std")
     first = rows.iloc[int(spread.to_numpy().argmax())]
     rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
-    # Of several followers the first is shown.
-    nearest = {name: f"hdv{name[4:]}" for name in rows.columns if name.startswith("hdv1_")}
-    return rows.rename(columns=nearest) if "hdv_speed" not in rows else rows
+    # Of several vehicles of a kind the first is shown.
+    return rows.rename(columns=lambda name: re.sub(r"^(cav|hdv)1_", r"\1_", name))
 
 
 def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:

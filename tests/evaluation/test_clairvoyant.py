@@ -15,7 +15,7 @@ from lcc_rl.envs import Inputs
 from lcc_rl.evaluation.clairvoyant import clairvoyant, misses, path_energy
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, trained
-from lcc_rl.pieces import parse_string
+from lcc_rl.functional.pattern import parse_string
 from lcc_rl.results.runs import load_policy
 
 STEPS = 60
@@ -57,15 +57,13 @@ def test_who_knows_the_profile_saves() -> None:
     assert told[-1][1] == pytest.approx(after[BOTH].sum(axis=1).mean(), rel=0.01)
 
 
-STRING = parse_string("automated human")
-
-
 def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
-    """One episode of one step, the first vehicle as given and a driver at rest behind it."""
-    own = {"gap": gap, "relative_speed": relative_speed, "speed": speed}
-    own["time_gap"] = gap / max(speed, 1.0)
-    vehicles = {key: torch.tensor([value, 0.0]).view(1, 1, 2, 1) for key, value in own.items()}
-    one = {"vehicles": vehicles}
+    """One episode of one step, the automated vehicle as given, a driver at rest far behind it."""
+    time_gap = gap / max(speed, 1.0)
+    own = {"gap": gap, "relative_speed": relative_speed, "time_gap": time_gap, "speed": speed}
+    behind = {"gap": 100.0, "relative_speed": 0.0, "time_gap": 100.0, "speed": 0.0}
+    entries = {key: torch.tensor([own[key], behind[key]]).view(1, 1, 2, 1) for key in own}
+    one = {"vehicles": entries}
     return TensorDict({**one, "next": one}, batch_size=[1, 1])
 
 
@@ -80,9 +78,8 @@ def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
     ],
 )
 def test_misses(gap, relative_speed, speed, missed) -> None:
-    assert float(misses(moment(gap, relative_speed, speed), STRING)) == pytest.approx(
-        missed, abs=1e-4
-    )
+    found = misses(moment(gap, relative_speed, speed), parse_string("automated human"))
+    assert float(found) == pytest.approx(missed, abs=1e-4)
 
 
 def test_path_energy_at_constant_speed() -> None:

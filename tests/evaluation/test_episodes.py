@@ -110,6 +110,7 @@ def test_drawn_places_are_measured_by_role() -> None:
     assert {"cav_energy_kj", "hdv_energy_kj", "total_energy_kj"} <= set(drawn)
     ratio = drawn["hdv_distance_m"] / drawn["cav_distance_m"]
     assert 1.7 < ratio.mean() < 2.3
+    assert ratio.std() < 0.5
 
 
 def test_a_string_begins_with_its_driver_and_those_of_the_next_ids_follow() -> None:

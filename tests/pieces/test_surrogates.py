@@ -17,7 +17,8 @@ def column(*values: float) -> torch.Tensor:
 
 def test_safety_is_the_literal_term_where_the_bends_are_far() -> None:
     gap, relative = column(6.0, 11.0, 4.0), column(-5.0, -4.0, -6.0)  # TTC 1, 2.5 and 0.5 s
-    smooth = SmoothSafety(width=0.001, gap_width=0.01, rate_width=0.001).reward(gap, relative)
+    bends = {"width": 0.001, "gap_width": 0.01, "rate_width": 0.001}
+    smooth = SmoothSafety(threshold=4.0, **bends).reward(gap, relative)
     assert torch.allclose(smooth, SafetyReward().reward(gap, relative), atol=2e-3)
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from lcc_rl.evaluation.platoon_cases import measure
 from matplotlib.colors import to_rgb
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.cases import measure
 from lcc_rl.results.string_figures import PARENTS, switching
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.studies.hcfs.tables import win_rates

@@ -16,7 +16,9 @@ import pytest
 from commands import DATA, HORIZON, run_command, tiny
 from omegaconf import OmegaConf
 
-from lcc_rl import results, train
+from lcc_rl import results
+from lcc_rl.agents.replay import Trainer
+from lcc_rl.commands import training
 from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.io.files import read_parquet
@@ -125,13 +127,13 @@ def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) ->
 
 def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, monkeypatch) -> None:
     cfg = tiny("train", "variant=alcc", "training.episodes=32")
-    whole = train.complete(cfg, tmp_path / "whole")
+    whole = training.complete(cfg, tmp_path / "whole")
     written = (tmp_path / "whole" / "episodes.parquet").stat().st_mtime_ns
-    again = train.complete(cfg, tmp_path / "whole")
+    again = training.complete(cfg, tmp_path / "whole")
     pd.testing.assert_frame_equal(again, whole, check_exact=True)
     assert (tmp_path / "whole" / "episodes.parquet").stat().st_mtime_ns == written
 
-    iterate = train.Trainer._iterate
+    iterate = Trainer._iterate
 
     def dies(self, collector):
         if self.iteration == 2:
@@ -139,9 +141,9 @@ def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, mon
         return iterate(self, collector)
 
     folder = tmp_path / "parts"
-    monkeypatch.setattr(train.Trainer, "_iterate", dies)
+    monkeypatch.setattr(Trainer, "_iterate", dies)
     with pytest.raises(MemoryError):
-        train.complete(cfg, folder)
+        training.complete(cfg, folder)
     assert (folder / ERROR).read_text().startswith("MemoryError")
     with pytest.raises(ResultsError, match=r"no episodes\.parquet"):
         results.load(folder)
@@ -152,8 +154,8 @@ def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, mon
         begun.append(self.iteration)
         return iterate(self, collector)
 
-    monkeypatch.setattr(train.Trainer, "_iterate", counted)
-    pd.testing.assert_frame_equal(train.complete(cfg, folder), whole, check_exact=True)
+    monkeypatch.setattr(Trainer, "_iterate", counted)
+    pd.testing.assert_frame_equal(training.complete(cfg, folder), whole, check_exact=True)
     assert begun == [2, 3]
     one, two = (read_parquet(tmp_path / f / "training.parquet") for f in ("whole", "parts"))
     pd.testing.assert_frame_equal(one, two, check_exact=True)
@@ -162,30 +164,30 @@ def test_a_run_is_skipped_where_finished_and_resumed_where_stopped(tmp_path, mon
 
 def test_a_run_that_another_process_does_is_refused(tmp_path) -> None:
     with claim(tmp_path), pytest.raises(Busy):
-        train.run(tiny("train", "variant=idm", agent=False), tmp_path)
+        training.run(tiny("train", "variant=idm", agent=False), tmp_path)
 
 
 def test_objectives_are_columns_of_the_summary(tmp_path) -> None:
     cfg = tiny("train", "variant=idm", "objective=[kj_per_km,collisions]", agent=False)
-    rows = train.run(cfg, tmp_path, quiet=True)
-    values = train.objective(cfg, rows)
+    rows = training.run(cfg, tmp_path, quiet=True)
+    values = training.objective(cfg, rows)
     assert values[1] == rows["collided"].sum()
     with pytest.raises(ConfigError, match=r"unknown objective 'kj_per_k'.*'kj_per_km'"):
-        train.run(tiny("train", "objective=kj_per_k"), tmp_path / "b")
+        training.run(tiny("train", "objective=kj_per_k"), tmp_path / "b")
 
 
 SWEEP = ("experiment=smoke", "variant=idm", *DATA, HORIZON, "sweep=mine")
 
 
 def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path) -> None:
-    words = ["lcc_rl.train", "-m", *SWEEP, "agent.time_gap=1.2,-1"]
+    words = ["lcc_rl.train", "-m", *SWEEP, "scenario.controllers.automated.time_gap=1.2,-1"]
     first = run_command(*words, cwd=tmp_path)
     assert first.returncode == 2, first.stderr
     assert "1 of 2 runs failed" in first.stderr
     assert "Traceback" not in first.stderr
-    assert "failed: agent.time_gap=-1_" in first.stdout
+    assert "failed: scenario.controllers.automated.time_gap=-1_" in first.stdout
     folder = tmp_path / "outputs" / "train" / "mine"
-    assert read_plan(folder) == Plan(2, ["agent.time_gap"])
+    assert read_plan(folder) == Plan(2, ["scenario.controllers.automated.time_gap"])
     assert results.load(folder)["run"].nunique() == 1
     second = run_command(*words, cwd=tmp_path)
     assert "finished before" in second.stdout
@@ -208,16 +210,18 @@ def on_terminal(cwd: Path, *words: str) -> str:
 
 
 def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
-    shown = on_terminal(tmp_path, *SWEEP, "agent.time_gap=1.2,1.3,-1")
+    shown = on_terminal(tmp_path, *SWEEP, "scenario.controllers.automated.time_gap=1.2,1.3,-1")
     table, _, end = shown.rpartition("┘")
     assert "waiting" in table
     assert "3 runs: 2 finished, 1 failed" in end
     assert "2 of 3 runs finished" in end
-    assert "failed: agent.time_gap=-1_" in end
+    assert "failed: scenario.controllers.automated.time_gap=-1_" in end
     # Log lines stay in the files, also Hydra's own between two runs.
     assert "[lcc_rl][INFO]" not in shown
     assert "#2 :" not in shown
-    (log,) = (tmp_path / "outputs/train/mine").glob("agent.time_gap=1.3_*/train.log")
+    (log,) = (tmp_path / "outputs/train/mine").glob(
+        "scenario.controllers.automated.time_gap=1.3_*/train.log"
+    )
     assert "synthetic stream" in log.read_text()
 
 

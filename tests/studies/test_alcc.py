@@ -8,8 +8,9 @@ import pytest
 from helpers import POPULATION, wavy_profiles
 from omegaconf import OmegaConf
 
+from lcc_rl.agents.factory import build_agent
 from lcc_rl.data.profiles import SingleProfile, Split
-from lcc_rl.envs.factory import build_agent, build_env
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
@@ -46,11 +47,11 @@ def test_followers_learn_with_the_analytic_agent_unless_another_is_asked_for(tmp
     change = followers_change(study.overrides, 5)
     cfg = followers_study(study).runs(tmp_path, change)[0].compose()
     assert cfg.agent._target_.endswith("Analytic")
-    assert cfg.scenario.followers == 5
+    assert cfg.scenario.string == "automated human*5"
     assert change.evaluation == ("evaluation.profiles=null",)
     study = alcc.Study(tmp_path, overrides=("agent=td3", "evaluation.profiles=3"))
     change = followers_change(study.overrides, 1)
-    assert change.overrides == (*PRECISE[1:], "scenario.followers=1")
+    assert change.overrides == (*PRECISE[1:], "scenario.string='automated human*1'")
     assert change.evaluation == ()
 
 
@@ -84,7 +85,7 @@ def test_a_typo_in_an_ablation_costs_no_calibration(tmp_path) -> None:
 
 def test_the_filter_is_put_on_once(tmp_path) -> None:
     with pytest.raises(ConfigError, match="not both"):
-        alcc.run(alcc.Study(tmp_path, overrides=("+filter=barrier",)))
+        alcc.run(alcc.Study(tmp_path, overrides=("+filter=cbf",)))
     assert not list(tmp_path.iterdir())
 
 

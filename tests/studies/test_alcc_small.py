@@ -15,7 +15,8 @@ import reproduce
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lcc_rl import config, evaluate, train
+from lcc_rl import config
+from lcc_rl.commands import evaluation, training
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.studies import page, runner
@@ -26,7 +27,7 @@ from lcc_rl.studies.runner import FAILED, FINISHED, FOREIGN, Outcome, Run
 pytestmark = pytest.mark.xdist_group("small_study")
 
 SPEEDS = (0, 8)  # of the filter
-MODULES = (train, evaluate, runner, alcc)
+MODULES = (training, evaluation, runner, alcc)
 TINY = (
     "data.platoons=4",
     "data.recordings=2",
@@ -61,7 +62,7 @@ def in_this_process(runs: Sequence[Run], jobs: int) -> list[Outcome]:
         if (run.folder / "checkpoint.pt").exists():
             cfg.resume = str(run.folder)
         try:
-            train.run(cfg, run.folder, quiet=True)
+            training.run(cfg, run.folder, quiet=True)
             outcomes.append(Outcome(run, FINISHED))
         except LccError as error:
             outcomes.append(Outcome(run, FAILED, str(error)))
@@ -131,7 +132,7 @@ def test_table_of_the_filter(study) -> None:
     filtered = table(study, "filter")
     assert len(filtered) == 3 + 4 * len(SPEEDS)
     with_filter = filtered[filtered["filter"] == "full_speed_0"]
-    assert set(with_filter["strategy"]) == {"alcc", "reference", "own_energy", "barrier"}
+    assert set(with_filter["strategy"]) == {"alcc", "reference", "own_energy", "cbf"}
     assert not with_filter["total_energy_kj"].isin(filtered["total_energy_kj"][:3]).any()
 
 

@@ -72,7 +72,11 @@ def check_rows(rows: pd.DataFrame, name: str) -> None:
     assert (rows["torch"] == torch.__version__).all()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    # A sweep starts processes of its own, which takes longer than all others together.
+    [pytest.param(name, marks=pytest.mark.slow if name == "sweep" else ()) for name in NAMES],
+)
 def test_quick_run_writes_sane_rows(benchmark, tmp_path, capsys, name) -> None:
     out = tmp_path / "rows.parquet"
     assert benchmark.main([name, "--quick", "--out", str(out)]) == 0

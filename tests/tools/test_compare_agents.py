@@ -11,7 +11,7 @@ import pytest
 from agent_results import course
 from helpers import compose
 
-from lcc_rl import train
+from lcc_rl.commands import training
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
@@ -57,7 +57,7 @@ def test_policies_kept_on_the_way_are_evaluated_once(tmp_path) -> None:
     data = ("data.platoons=4", "data.recordings=2", "scenario.horizon=40", "experiment=smoke")
     small = ("agent.batch_size=64", "agent.hidden=[16,16]", "training.keep_every=1")
     folder = tmp_path / "ddpg" / "alcc" / "seed_0"
-    train.run(load("train", [*data, *small]), folder, quiet=True)
+    training.run(load("train", [*data, *small]), folder, quiet=True)
     options = argparse.Namespace(out=tmp_path, overrides=[*data, *small])
     tool.evaluate_kept(options)
     kept = read_parquet(folder / "kept.parquet")
@@ -90,7 +90,7 @@ def test_policies_are_put_behind_the_filter_once(tmp_path, monkeypatch) -> None:
     data = ["data.platoons=4", "data.recordings=2", "scenario.horizon=40", "experiment=smoke"]
     small = ["agent.batch_size=64", "agent.hidden=[16,16]"]
     folder = tmp_path / "none" / "seed_0"
-    train.run(load("train", [*data, *small]), folder, quiet=True)
+    training.run(load("train", [*data, *small]), folder, quiet=True)
     fabricate(tmp_path / "idm", "idm", 120.0)
     options = argparse.Namespace(out=tmp_path, overrides=[*data, *small])
     tool.evaluate_filtered(options)
@@ -133,7 +133,7 @@ def test_only_a_human_is_finished(tmp_path) -> None:
 
 
 def test_settings_of_filter_and_knowledge_are_not_those_of_a_human() -> None:
-    given = ["+filter=barrier", "scenario.pieces.barrier.rate=2", "scenario.horizon=40", "~x.y"]
+    given = ["+filter=cbf", "scenario.filters.automated.rate=2", "scenario.horizon=40", "~x.y"]
     assert tool.data_overrides(given) == ["scenario.horizon=40"]
 
 

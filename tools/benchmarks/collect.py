@@ -16,17 +16,20 @@ from benchmarks.harness import Row, Run, alternate, endings, installed, rows_of
 from benchmarks.plain import PlainLoop, alcc
 from benchmarks.scalar import check_scalar, gymnasium_env
 from lcc_rl.agents import DDPG
-from lcc_rl.agents.training import LEARNED_FROM, REPORTED
-from lcc_rl.envs.stepping import Segments
+from lcc_rl.agents.loop import REPORTED
+from lcc_rl.agents.replay import LEARNED_FROM
+from lcc_rl.envs import StringCollector
+from lcc_rl.policies import shared_policy
 
 OTHER = "stable-baselines3"
+OWN = "StringCollector"
 SIDE_BY_SIDE = 8  # environments of stable-baselines3's DummyVecEnv
 
 
 def collect(options: Namespace) -> list[Row]:
     """Transitions per second, collected by the actor without exploration, kept for learning.
 
-    "Segments" is the training's own way, "Collector" TorchRL's, which keeps every entry. The
+    "StringCollector" is the training's own, "Collector" TorchRL's, which keeps every entry. The
     plain loop runs the same network and stacks what a learner needs. stable-baselines3 calls
     ``predict`` and steps a DummyVecEnv of 8 plain Gymnasium environments; its network has the
     same layers.
@@ -38,7 +41,7 @@ def collect(options: Namespace) -> list[Row]:
     for ending in endings(options):
         env = alcc(options, batch, 30)
         runs[f"plain loop{ending}"] = loop(env, policy.module, steps, bool(ending))
-        runs[f"Segments{ending}"] = collector(env, policy, steps, bool(ending))
+        runs[f"{OWN}{ending}"] = collector(env, policy, steps, bool(ending))
     runs["Collector"] = torchrl_collector(alcc(options, batch, 30), policy, steps)
     counts, other = dict.fromkeys(runs, batch * steps), stable_baselines(options)
     if other is not None:
@@ -49,7 +52,7 @@ def collect(options: Namespace) -> list[Row]:
     rows: list[Row] = []
     for ending in endings(options):
         plain = f"plain loop{ending}"
-        pair = {name: rates[name] for name in (f"Segments{ending}", plain)}
+        pair = {name: rates[name] for name in (f"{OWN}{ending}", plain)}
         rows += rows_of("collect", pair, "steps/s", plain, batch)
     if other is not None:
         rates = {name: rate for name, rate in rates.items() if not name.startswith("plain")}
@@ -59,15 +62,22 @@ def collect(options: Namespace) -> list[Row]:
 
 def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
     """The training's collection; one call collects so many steps of every environment."""
-    segments = Segments(env, policy, steps, (*LEARNED_FROM, *REPORTED), compiled)
-    return lambda: next(segments)
+    return StringCollector(
+        env,
+        shared_policy(policy),
+        frames_per_batch=env.batch_size.numel() * steps,
+        keys=(*LEARNED_FROM, *REPORTED),
+        compiled=compiled,
+    ).collect
 
 
 def torchrl_collector(env: TransformedEnv, policy: Any, steps: int) -> Run:
     """TorchRL's collector, which keeps every entry."""
     count = env.batch_size.numel() * steps
     how = {"track_traj_ids": False, "auto_register_policy_transforms": False}
-    batches = iter(Collector(env, policy, frames_per_batch=count, total_frames=-1, **how))
+    batches = iter(
+        Collector(env, shared_policy(policy), frames_per_batch=count, total_frames=-1, **how)
+    )
     return lambda: next(batches)
 
 
@@ -76,7 +86,7 @@ def loop(
 ) -> Run:
     """The same as a plain loop over tensors."""
     plain, start = PlainLoop(env), env.reset()
-    first, state = start["observation"], plain.start(start)
+    first, state = start["automated", "observation"].squeeze(-2), plain.start(start)
 
     def act(seen: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor], Any]:
         action = network(seen)

@@ -9,13 +9,14 @@ import torch
 
 from benchmarks.harness import Row, alternate, endings, rows_of
 from benchmarks.plain import PlainLoop, alcc, check_physics
+from lcc_rl.envs.rollout import ACTION
 
 
 def env(options: Namespace) -> list[Row]:
     """Steps per second of the ALCC environment with zero actions, beside the plain loop.
 
     "step" is what a collector calls (``step_and_maybe_reset``) and keeps nothing, like the plain
-    loop; "rollout" stacks every entry of every moment. The cars start 30 s apart, so that no
+    loop; "rollout" stacks every entry of every moment. The vehicles start 30 s apart, so that no
     episode ends within a run and nobody resets. Both are first checked to be the same physics.
     """
     check_physics(options, 20 if options.quick else 250)
@@ -30,7 +31,7 @@ def env(options: Namespace) -> list[Row]:
 def env_rates(options: Namespace, batch: int, ending: str) -> dict[str, np.ndarray]:
     """Steps per second of every way to step, all eager or, with an ending, all compiled."""
     steps, env = 10 if options.quick else 100, alcc(options, batch, 30)
-    zero = torch.zeros(batch, 1, device=options.device)
+    zero = torch.zeros(batch, 1, 1, device=options.device)
     plain, start = PlainLoop(env), env.reset()
     advance = plain.step
     if ending:
@@ -42,17 +43,17 @@ def env_rates(options: Namespace, batch: int, ending: str) -> dict[str, np.ndarr
 
     def rollout() -> None:
         begin = {"auto_reset": False, "tensordict": start.copy(), "break_when_any_done": False}
-        env.rollout(steps, lambda td: td.set("action", zero), **begin)
+        env.rollout(steps, lambda td: td.set(ACTION, zero), **begin)
 
     def step() -> None:
         td = start.copy()
         for _ in range(steps):
-            _, td = env.step_and_maybe_reset(td.set("action", zero))
+            _, td = env.step_and_maybe_reset(td.set(ACTION, zero))
 
     def loop() -> None:
-        state = plain.start(start)
+        state, action = plain.start(start), zero.squeeze(-2)
         for _ in range(steps):
-            state, _ = advance(state, zero)
+            state, _ = advance(state, action)
 
     runs = {f"rollout{ending}": rollout, f"step{ending}": step, f"plain loop{ending}": loop}
     with torch.no_grad():

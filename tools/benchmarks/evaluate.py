@@ -9,24 +9,24 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.harness import Row, alternate, rows_of
 from benchmarks.plain import study
-from lcc_rl.envs.factory import build_agent
-from lcc_rl.evaluation.monte_carlo import Strategy
-from lcc_rl.evaluation.monte_carlo import evaluate as play
+from lcc_rl.agents.factory import build_agent
+from lcc_rl.evaluation.episodes import evaluate as play
+from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import write_parquet
+from lcc_rl.policies import shared_policy
 
 
 def evaluate(options: Namespace) -> list[Row]:
     """Seconds of a Monte Carlo evaluation of an untrained actor, its results written."""
     cfg, inputs = study(options.quick)
-    strategy = Strategy(
-        "untrained", cfg, build_agent(cfg, inputs.population, options.device).policy
-    )
+    agent = build_agent(cfg, inputs.population, options.device)
+    strategy = Strategy("untrained", cfg, shared_policy(agent.policy))
     settings, drivers = cfg.evaluation, 2 if options.quick else cfg.evaluation.drivers
     how = (drivers, settings.batch_size, settings.seed, settings.sample_episodes, options.device)
     count = len(inputs.evaluation) * (drivers or len(inputs.population.time_gap))
 
     def run(folder: str) -> None:
-        episodes, steps = play(strategy, inputs.evaluation, inputs.population, *how)
+        episodes, steps = play(strategy, inputs, *how)
         write_parquet(episodes, Path(folder, "episodes.parquet"))
         write_parquet(steps, Path(folder, "steps.parquet"))
 

@@ -14,7 +14,8 @@ from torchrl.envs.utils import step_mdp
 
 from benchmarks.harness import TOLERANCE, stream
 from lcc_rl.config import load
-from lcc_rl.envs.factory import Inputs, build_env, load_inputs
+from lcc_rl.envs import Inputs, build_env, load_inputs
+from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.estimation import Belief, predict_and_update
 from lcc_rl.functional.idm import idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
@@ -34,12 +35,12 @@ def study(quick: bool) -> tuple[DictConfig, Inputs]:
 def alcc(
     options: Namespace, batch: int, initial_time_gap: float = 1.5, followers: int = 1
 ) -> TransformedEnv:
-    """Build the ALCC environment; the car starts with the given time gap [s]."""
+    """Build the ALCC environment; the automated vehicle starts with the given time gap [s]."""
     cfg, inputs = study(options.quick)
     cfg = cfg.copy()
-    cfg.scenario.pieces.cav.initial_time_gap = initial_time_gap
-    cfg.scenario.pieces.cav.initial_gap_range = [1.0, 1.0]
-    cfg.scenario.followers = followers
+    cfg.scenario.start.automated.time_gap = initial_time_gap
+    cfg.scenario.start.automated.gap_range = [1.0, 1.0]
+    cfg.scenario.string = f"automated human*{followers}"
     return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 
 
@@ -53,8 +54,9 @@ class PlainLoop:
     def __init__(self, env: TransformedEnv) -> None:
         pieces = {type(piece).__name__: piece for piece in env.transform}
         terms = {piece.name: piece for piece in env.transform if hasattr(piece, "weight")}
-        self.leader, self.cav = pieces["NGSIMLeader"], pieces["CAVMotion"]
-        self.human, self.estimator = pieces["IDMFollower"], pieces["DriverEstimator"]
+        self.leader, self.motion = pieces["NGSIMLeader"], pieces["StringMotion"]
+        self.max_acceleration = pieces["Action"].max_acceleration
+        self.human, self.estimator = pieces["IDM"], pieces["DriverEstimator"]
         self.scales, self.penalty = pieces["Observation"].constants, terms["collision"].weight
         self.safety, self.efficiency = terms["safety"], terms["efficiency"]
         energies = (terms["cav_energy"], terms["hdv_energy"])
@@ -62,22 +64,25 @@ class PlainLoop:
 
     def start(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Begin where a reset of the environment begins; all entries are ``[batch, width]``."""
-        keys = ("speed", "gap", "estimate", "covariance", "desired_speed", "desired_time_gap")
+        (cav, speed), (cav_gap, gap) = (td["vehicles", key].unbind(-2) for key in ("speed", "gap"))
+        keys = ("estimate", "covariance", "desired_speed", "desired_time_gap")
         return {
             "seed": td[SEED],
             "step": td[STEP],
             "place": self.leader.offsets[td["leader", "profile"]] + td["leader", "start"],
             "leader": td["leader", "speed"],
-            "cav": td["cav", "speed"],
-            "cav_gap": td["cav", "gap"],
-            **{key: td["hdv", key].squeeze(-2) for key in keys},
+            "cav": cav,
+            "cav_gap": cav_gap,
+            "speed": speed,
+            "gap": gap,
+            **{key: td["human", key].squeeze(-2) for key in keys},
         }
 
     def step(self, now: dict[str, Tensor], action: Tensor) -> tuple[dict[str, Tensor], ...]:
         """Return the next state and what the environment writes beside it."""
-        dt, drivers = self.cav.time_step, self.human.drivers
+        dt, drivers = self.motion.time_step, self.human.drivers
         leader = self.leader.speeds[now["place"] + now["step"] + 1]
-        cav, cav_acceleration = advance_speed(now["cav"], action * self.cav.max_acceleration, dt)
+        cav, cav_acceleration = advance_speed(now["cav"], action * self.max_acceleration, dt)
         cav_gap = advance_gap(now["cav_gap"], now["leader"], now["cav"], leader, cav, dt)
         motion = (now["speed"], now["gap"], now["speed"] - now["cav"])
         wish = idm_acceleration(*motion, now["desired_speed"], now["desired_time_gap"], drivers)
@@ -117,10 +122,10 @@ def check_physics(options: Namespace, steps: int) -> None:
     state = plain.start(td)
     for step in range(steps):
         action = torch.rand(64, 1, generator=generator).to(env.device or "cpu") * 2.0 - 1.0
-        td = env.step(td.set("action", action))
+        td = env.step(td.set(ACTION, action.unsqueeze(-2)))
         state, written = plain.step(state, action)
         for name in ("observation", "reward"):
-            off = float((td["next", name] - written[name]).abs().max())
+            off = float((td["next", "automated", name].squeeze(-2) - written[name]).abs().max())
             if not off <= TOLERANCE:
                 raise RuntimeError(f"step {step}: {name} of the plain loop is off by {off:g}")
         td = step_mdp(td)

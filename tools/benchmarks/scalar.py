@@ -16,6 +16,7 @@ from torchrl.envs.utils import step_mdp
 
 from benchmarks.harness import TOLERANCE
 from benchmarks.plain import PlainLoop
+from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.functional.random import STEP as COUNT
 from lcc_rl.functional.random import STREAM, hash_bits
@@ -36,16 +37,17 @@ class ScalarLoop:
     """One episode of the ALCC environment, with the settings and data of a :class:`PlainLoop`."""
 
     def __init__(self, plain: PlainLoop) -> None:
-        cav, human, estimator = plain.cav, plain.human, plain.estimator
-        self.dt, self.max_acceleration = cav.time_step, cav.max_acceleration
-        self.standstill_gap, self.initial_time_gap = cav.standstill_gap, cav.initial_time_gap
+        motion, human, estimator = plain.motion, plain.human, plain.estimator
+        self.dt, self.max_acceleration = motion.time_step, plain.max_acceleration
+        first, second = motion.start["automated"], motion.start["human"]
+        self.standstill_gap, self.initial_time_gap = first.standstill_gap, first.time_gap
         self.speeds: list[float] = plain.leader.speeds.tolist()
         self.offsets: list[int] = plain.leader.offsets.tolist()
         self.lengths: list[int] = plain.leader.starts.tolist()
         drivers = (human.desired_speeds.tolist(), human.time_gaps.tolist())
         self.drivers: list[tuple[float, float]] = list(zip(*drivers, strict=True))
         self.noise, self.stream = human.noise, human.noise_stream + int(human.index[0])
-        self.cap, self.known = human.cap_time_gap, human.drivers
+        self.cap, self.known = second.cap_time_gap, human.drivers
         self.root = 2.0 * (self.known.acceleration * self.known.deceleration) ** 0.5
         self.learning, self.variance = estimator.learning_steps, estimator.measurement_error**2
         self.prior = (estimator.prior_estimate.tolist(), estimator.prior_covariance.tolist())
@@ -56,11 +58,11 @@ class ScalarLoop:
         self.prices, self.penalty = (plain.cav_price, plain.hdv_price), plain.penalty
         self.scales: list[float] = plain.scales.tolist()
 
-    def begin(self, profile: int, start: int, driver: int, factor: float = 1.0) -> list[float]:
+    def begin(self, profile: int, start: int, driver: int) -> list[float]:
         """Start an episode; return the observation."""
         self.place, self.step_count = self.offsets[profile] + start, 0
         self.leader = self.cav = self.hdv = self.speeds[self.place]
-        self.cav_gap = factor * (self.standstill_gap + self.initial_time_gap * self.cav)
+        self.cav_gap = self.standstill_gap + self.initial_time_gap * self.cav
         self.v0, self.headway = self.drivers[driver]
         known, free = self.known, (self.hdv / self.v0) ** 4
         gap = (known.min_gap + self.hdv * self.headway) / math.sqrt(max(1.0 - free, 1e-6))
@@ -174,9 +176,8 @@ def check_scalar(env: TransformedEnv, plain: PlainLoop, steps: int) -> None:
     """Hold the plain Python numbers against the environment, over one episode."""
     loop, td = ScalarLoop(plain), env.reset()
     seed = int(td[SEED][0])
-    factor = float(td["cav", "gap_factor"][0])
     profile, start = int(td["leader", "profile"][0]), int(td["leader", "start"][0])
-    loop.begin(profile, start, int(td["hdv", "driver"][0]), factor)
+    loop.begin(profile, start, int(td["human", "driver"][0]))
     generator = torch.Generator().manual_seed(0)
 
     def draw(step: int) -> float:
@@ -185,7 +186,7 @@ def check_scalar(env: TransformedEnv, plain: PlainLoop, steps: int) -> None:
 
     for step in range(steps):
         action = float(torch.rand((), generator=generator) - 0.5)
-        td = env.step(td.set("action", torch.full((1, 1), action, device=env.device)))
+        td = env.step(td.set(ACTION, torch.full((1, 1, 1), action, device=env.device)))
         seen, reward, _ = loop.step(action, draw)
         check_step(td, seen, reward, step)
         td = step_mdp(td)
@@ -193,7 +194,8 @@ def check_scalar(env: TransformedEnv, plain: PlainLoop, steps: int) -> None:
 
 def check_step(td: TensorDictBase, seen: list[float], reward: float, step: int) -> None:
     """Compare one step; single precision against double, hence ten times the tolerance."""
-    theirs = [*td["next", "observation"][0].tolist(), float(td["next", "reward"][0])]
+    own = td["next", "automated"]
+    theirs = [*own["observation"][0, 0].tolist(), float(own["reward"][0, 0])]
     off = max(abs(a - b) for a, b in zip([*seen, reward], theirs, strict=True))
     if not off <= 10 * TOLERANCE:
         raise RuntimeError(f"step {step}: the plain Python loop is off by {off:g}")

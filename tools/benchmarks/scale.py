@@ -1,4 +1,4 @@
-"""Benchmark of scale: cost against the size of the batch and the length of the platoon."""
+"""Benchmark of scale: cost against the size of the batch and the length of the string."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from torchrl.envs import TransformedEnv
 
 from benchmarks.harness import Row, Run, alternate, endings, rows_of
 from benchmarks.plain import alcc
+from lcc_rl.envs.rollout import ACTION
 
 
 def scale(options: Namespace) -> list[Row]:
     """Nanoseconds per transition by batch, and microseconds per step by number of followers.
 
     A ratio of 1 to the smallest batch says that cost grows exactly in proportion; below 1, that
-    it grows less. Followers: batch 1,024, cost beside one tenth of the longest string's.
+    it grows less. Followers: batch 1,024, cost beside that of the shortest string. Vehicles: the
+    same cost, uncompiled, per vehicle.
     """
     rows: list[Row] = []
     batches = (16, 32) if options.quick else (1024, 4096, 8192, 32768)
@@ -30,11 +32,11 @@ def scale(options: Namespace) -> list[Row]:
         sizes = zip(spent, batches, strict=True)
         costs = {name: 1e9 * spent[name] / (batch * steps) for name, batch in sizes}
         rows += rows_of("scale", costs, "ns/transition", f"batch {batches[0]}{ending}")
-        rows += platoons(options, ending)
-    return rows
+        rows += followers(options, ending)
+    return rows + vehicles(options)
 
 
-def platoons(options: Namespace, ending: str) -> list[Row]:
+def followers(options: Namespace, ending: str) -> list[Row]:
     """Microseconds per step and follower at several lengths of the string."""
     batch, counts, steps = (16, (1, 3), 5) if options.quick else (1024, (1, 10, 100), 20)
     runs = {
@@ -48,10 +50,21 @@ def platoons(options: Namespace, ending: str) -> list[Row]:
     return rows_of("scale", costs, "µs/(step·follower)", f"{counts[0]} followers{ending}", batch)
 
 
-def stepping(options: Namespace, batch: int, followers: int, steps: int, compiled: bool) -> Run:
+def vehicles(options: Namespace) -> list[Row]:
+    """Microseconds per step and vehicle of the shortest string and of a long one."""
+    batch, counts, steps = (16, (1, 9), 5) if options.quick else (1024, (1, 99), 20)
+    names = {f"automated human*{n}" if n > 1 else "automated human": n for n in counts}
+    runs = {name: stepping(options, batch, n, steps, False) for name, n in names.items()}
+    with torch.no_grad():
+        spent = alternate(runs, options.repeats)
+    costs = {name: 1e6 * spent[name] / (steps * (n + 1)) for name, n in names.items()}
+    return rows_of("scale", costs, "µs/(step·vehicle)", "automated human", batch)
+
+
+def stepping(options: Namespace, batch: int, behind: int, steps: int, compiled: bool) -> Run:
     """So many steps of an environment with zero actions, from its first moment."""
-    env = alcc(options, batch, 30, followers)
-    start, zero = env.reset(), torch.zeros(batch, 1, device=options.device)
+    env = alcc(options, batch, 30, behind)
+    start, zero = env.reset(), torch.zeros(batch, 1, 1, device=options.device)
     if compiled:
         # One graph per size; each environment is an object of its own, so none is tried in vain.
         torch._dynamo.config.recompile_limit = 64
@@ -63,4 +76,4 @@ def advance(env: TransformedEnv, start: TensorDictBase, action: torch.Tensor, st
     """Step and keep nothing."""
     td = start.copy()
     for _ in range(steps):
-        _, td = env.step_and_maybe_reset(td.set("action", action))
+        _, td = env.step_and_maybe_reset(td.set(ACTION, action))

@@ -17,7 +17,8 @@ from benchmarks.collect import OTHER, stable_baselines_model
 from benchmarks.harness import Row, Run, alternate, installed, rows_of, times
 from benchmarks.plain import alcc
 from lcc_rl.agents import DDPG
-from lcc_rl.agents.training import LEARNED_FROM
+from lcc_rl.agents.ddpg import DDPGSettings
+from lcc_rl.agents.replay import LEARNED_FROM, transitions
 
 PRODUCTS = "matrix products"
 
@@ -30,12 +31,11 @@ def update(options: Namespace) -> list[Row]:
     which also writes its two losses to its logger, once per call of many updates.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # the buffer announces its storage
-    played = alcc(options, 1000).rollout(20, break_when_any_done=False)
-    played = played.select(*LEARNED_FROM).reshape(-1)
+    played = transitions(alcc(options, 1000).rollout(20, break_when_any_done=False))
     rows: list[Row] = []
     for batch, count in ((16, 2), (32, 2)) if options.quick else ((64, 60), (256, 40), (1024, 20)):
-        agent = DDPG(7, 1, seed=0, batch_size=batch, device=options.device)
-        storage = LazyTensorStorage(agent.buffer_size, device=options.device)
+        agent = DDPG(7, 1, 0, DDPGSettings(batch_size=batch), options.device)
+        storage = LazyTensorStorage(agent.settings.buffer_size, device=options.device)
         buffer = ReplayBuffer(storage=storage, batch_size=batch)
         buffer.extend(played)
         runs: dict[str, Run] = {
@@ -63,7 +63,7 @@ def stable_baselines(options: Namespace, batch: int, played: TensorDictBase) -> 
 
     _, model = stable_baselines_model(options, 1, batch_size=batch, buffer_size=20000)
     model.set_logger(configure(None, []))
-    columns = [played[key].cpu().numpy() for key in LEARNED_FROM[:5]]
+    columns = [played[key].cpu().numpy() for key in list(LEARNED_FROM.values())[:5]]
     for seen, action, after, reward, done in zip(*columns, strict=True):
         model.replay_buffer.add(seen, after, action, reward, done, [{}])
     return model

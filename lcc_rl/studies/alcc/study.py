@@ -111,8 +111,8 @@ def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
 def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
     """Put the filter on the policies of the main part, with several settings."""
     outcomes, usable = _trained(study)
-    # The variant cbf, the filter without a policy, is evaluated too; it has no agent.
-    kept = [item for item in study.overrides if root_key(item) != "agent"]
+    # The variant cbf, the filter without a policy, is evaluated too; it learns nothing.
+    kept = [item for item in study.overrides if root_key(item) not in ("agent", "training")]
     alone = replace(study, overrides=tuple(kept))
     for speed in FILTERS:
         own = f"scenario.filters.automated.full_speed={speed}"

@@ -14,10 +14,10 @@ from lcc_rl.commands.evaluation import evaluate_and_write
 from lcc_rl.commands.pipeline import known_settings
 from lcc_rl.config import load, plain
 from lcc_rl.envs import Inputs, load_inputs
+from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
     Strategy,
     baselines,
-    check_policy,
     driven_by,
     with_weights,
 )

@@ -1,0 +1,58 @@
+"""The design card's sentences: each piece is a TensorDict transform that composes into envs."""
+
+from __future__ import annotations
+
+import pandas as pd
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose, Transform
+
+from lcc_rl.drivers.population import fixed
+from lcc_rl.envs import Clock
+from lcc_rl.pieces import CACC, IDM, NGSIMLeader, Places, StringMotion, VehicleString
+from lcc_rl.pieces.start import EquilibriumStart
+from lcc_rl.policies import ControllerPolicy
+from lcc_rl.synthetic.stream import StreamSource
+
+
+def test_an_ngsim_file_is_a_transform_in_one_line(tmp_path) -> None:
+    path = tmp_path / "trajectories.csv"
+    StreamSource(recordings=1, platoons=2, vehicles=3, keep=str(path)).load()
+    leader = NGSIMLeader.from_file(path, horizon=100)
+    assert isinstance(leader, Transform)
+    env = TransformedEnv(Clock(100, 4), Compose(leader))
+    speed = env.rollout(100)["next", "leader", "speed"]
+    assert speed.shape == (4, 100, 1)
+    recorded = pd.read_csv(path)["v_Vel"].max() * 0.3048
+    assert 0.0 <= float(speed.min()) < float(speed.max()) <= recorded + 0.1
+
+
+def test_transforms_of_vehicles_compose_by_hand(tmp_path) -> None:
+    path = tmp_path / "trajectories.csv"
+    StreamSource(recordings=1, platoons=2, vehicles=3, keep=str(path)).load()
+    string, drivers = VehicleString(("human",) * 3), fixed(25.0, 1.2)
+    pieces = [
+        NGSIMLeader.from_file(path, horizon=50),
+        Places(string),
+        IDM(drivers, 0.1, string=string),
+        StringMotion(string, 0.1, {"human": EquilibriumStart(drivers)}),
+    ]
+    gap = TransformedEnv(Clock(50, 2), Compose(*pieces)).rollout(50)["next", "vehicles", "gap"]
+    assert gap.shape == (2, 50, 3, 1)
+    assert float(gap.min()) > 0.0
+
+
+def test_the_cacc_policy_is_a_transform_and_a_policy() -> None:
+    rule = CACC(0.2)
+    assert isinstance(rule, Transform)
+    errors = {f"{name}_error": torch.tensor([[[0.5]]]) for name in ("gap", "speed")}
+    errors |= {f"leader_{name}": value for name, value in errors.items()}
+    td = TensorDict({"vehicles": errors}, [1])
+    policy = TensorDictSequential(ControllerPolicy(rule))
+    command = rule(td.copy())["next", "command", "automated"]
+    action = policy(td)["automated", "action"]
+    torch.testing.assert_close(action, (command / 3.0).clamp(-1.0, 1.0))
+    wanted = (0.04 * 0.5 + 0.12 * 0.5 + 1.4 * 0.5 + 1.3 * 0.5) / 0.2
+    torch.testing.assert_close(command, torch.full((1, 1, 1), min(wanted, 3.0)))

@@ -1,0 +1,75 @@
+"""The page of entries and equations: complete, and up to date."""
+
+from __future__ import annotations
+
+from pkgutil import resolve_name
+
+import entries as tool
+import pytest
+from equations import EQUATIONS, LAST, numbers_in
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.envs.step import Pieces
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.pieces.base import Feature
+from lcc_rl.pieces.entries import ENTRIES
+
+
+@pytest.fixture(scope="module")
+def environments():
+    return list(tool.environments())
+
+
+def test_every_entry_is_listed_and_every_listed_entry_is_written(environments) -> None:
+    rows = tool.collect(environments)
+    assert set(rows) == set(ENTRIES)
+    assert all(len(row) > 1 for row in rows.values()), "an entry that no class writes"
+
+
+def test_page_is_up_to_date(environments, monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.setattr(tool, "environments", lambda: environments)
+    assert tool.main(["--check"]) == 0
+    monkeypatch.setattr(tool, "PAGE", tmp_path / "entries.md")
+    assert tool.main(["--check"]) == 1
+    assert "python tools/entries.py" in capsys.readouterr().err
+    assert tool.main([]) == 0
+    assert tool.main(["--check"]) == 0
+
+
+class Colour(Feature):
+    def __init__(self, vehicles: int) -> None:
+        super().__init__([("vehicles", "gap")], [("vehicles", "colour")], (vehicles, 1))
+
+    def compute(self, gap):
+        return gap
+
+
+def test_unknown_entry_is_refused(environments) -> None:
+    env, string = environments[0]
+    env = TransformedEnv(env, Pieces(Colour(len(string))))
+    with pytest.raises(ConfigError, match=r"vehicles\.colour"):
+        tool.collect([(env, string)])
+
+
+def test_two_shapes_of_an_entry_are_refused(environments) -> None:
+    env, string = environments[0]
+    with pytest.raises(ConfigError, match="two shapes"):
+        tool.collect([(env, string), (env, VehicleString((*string.roles, "human")))])
+
+
+def test_every_equation_is_listed_once() -> None:
+    listed = [number for row in EQUATIONS for number in numbers_in(row.number)]
+    wanted = {f"{paper}{i + 1}" for paper, last in LAST.items() for i in range(last)}
+    assert len(listed) == len(set(listed))
+    assert set(listed) == wanted
+
+
+@pytest.mark.parametrize("row", [row for row in EQUATIONS if row.functions], ids=lambda x: x.number)
+def test_docstrings_name_their_equations(row) -> None:
+    numbers, named = numbers_in(row.number), set()
+    for path in row.functions:
+        own = numbers_in(resolve_name(f"lcc_rl.{path}").__doc__) & numbers
+        assert own, f"the docstring of {path} does not name {row.number}"
+        named |= own
+    assert named == numbers

@@ -1,0 +1,160 @@
+"""Write docs/entries.md: the entries of the environments and the equations of the papers."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import torch
+from equations import EQUATIONS, PAPERS
+from omegaconf import DictConfig
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.config import load
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.envs.inputs import constant_profiles, string_of
+from lcc_rl.envs.single import group_key
+from lcc_rl.envs.step import pieces_of, tick, written
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.pieces import Handover
+from lcc_rl.pieces.base import Key, as_key
+from lcc_rl.pieces.entries import ENTRIES, NAME, ROLE, entry_key
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "entries.md"
+SPECS = ("observation", "action", "reward", "done")
+WIDEST = 3  # the width of wider entries depends on settings
+CLOCK = set(tick(torch.zeros(1), torch.zeros(1), 1))
+SIZES = "scenario.string=automated*3 human*5"
+HEAD = """# Entries and equations
+
+## Entries (written by `python tools/entries.py`; do not edit)
+
+Keys of the environments' TensorDicts, at the root after a reset and under `"next"` after a step.
+`role` stands for a role of the string, such as `"human"`; `name` for a term of the reward.
+Shapes: `*B` batch of episodes, `N` vehicles of the string from front to back, `A` automated
+vehicles, `n` vehicles of the role, `k` a width that depends on settings; float32 unless said
+otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`.
+"""
+
+
+def configurations() -> Iterator[DictConfig]:
+    """Yield configurations that together write every entry, with sizes that differ."""
+    for path in sorted((ROOT / "conf" / "variant").glob("*.yaml")):
+        string = "scenario.string=human*5" if path.stem == "direct" else SIZES
+        cfg = load("train", [f"variant={path.stem}", string])
+        yield cfg
+        if cfg.deployed is not None:
+            cfg.scenario.controllers.automated = cfg.deployed
+            yield cfg
+    knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
+    cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", *knowledge])
+    yield cfg
+    for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
+        cfg.scenario.string = drawn_or_single
+        yield cfg
+    handover = "controller@scenario.controllers.automated=handover"
+    yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
+
+
+def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:
+    """Yield an environment of every configuration, and its string."""
+    population = bootstrap()
+    for cfg in configurations():
+        string = string_of(cfg)
+        scenario = cfg.scenario
+        profiles = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
+        env = build_env(cfg, profiles, population, batch_size=7)
+        single = string.count(AUTOMATED) == 1
+        yield env.append_transform(SingleAgent()) if single else env, string
+
+
+def symbols(key: Key, shape: Iterable[int], string: VehicleString) -> str:
+    """Return a shape in symbols, such as ``[*B, N, 1]``."""
+    _, *sizes = shape
+    counts = {string.count(AUTOMATED): "A", len(string): "N"}
+    listed = entry_key(key, string.names)
+    if ROLE in listed:
+        counts = {string.count(key[listed.index(ROLE)]): "n"}
+    names = ["k" if size > WIDEST else str(size) for size in sizes]
+    # The last number is the width of an entry; an index has none.
+    for place in range(len(sizes) - (key[-1] != "index")):
+        names[place] = counts.get(sizes[place], names[place])
+    return f"[{', '.join(['*B', *names])}]"
+
+
+def writers(env: TransformedEnv, key: Key) -> list[str]:
+    """Return the names of the classes that write an entry."""
+    if key[-1] == "action":
+        return ["the policy"]
+    if group_key(key) != key:
+        return [SingleAgent.__name__]
+    pieces = []
+    for piece in pieces_of(env):
+        pieces += [piece.before, piece.after] if isinstance(piece, Handover) else []
+        pieces.append(piece)
+    return ["Clock"] * (key in CLOCK) + [type(x).__name__ for x in pieces if key in written([x])]
+
+
+def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Key, list[str]]:
+    """Return the shape and then the writers of every entry, in the order of the dictionary.
+
+    Raises:
+        ConfigError: if an entry is not in the dictionary, or has two shapes.
+    """
+    rows: dict[Key, list[str]] = {}
+    for env, string in found_in:
+        parts = [getattr(env, f"full_{x}_spec") for x in SPECS]
+        specs = {as_key(key): spec for part in parts for key, spec in part.items(True, True)}
+        for key, spec in specs.items():
+            if ("observation",) in specs and group_key(key) == key:
+                continue  # of the single-agent view only what it shows at the root
+            kind = "" if spec.dtype == torch.float32 else f" {str(spec.dtype).split('.')[1]}"
+            shape = symbols(key, spec.shape, string) + kind
+            row = rows.setdefault(entry_key(key, string.names), [shape])
+            if row[0] != shape:
+                raise ConfigError(f"{'.'.join(key)} has two shapes, {row[0]} and {shape}")
+            row += [name for name in writers(env, key) if name not in row]
+    return {key: rows[key] for key in ENTRIES if key in rows}
+
+
+def table(*rows: Iterable[str]) -> str:
+    """Return a Markdown table, the first row its head."""
+    lines = ["| " + " | ".join(x.replace("|", r"\|") for x in row) + " |" for row in rows]
+    return "\n".join([lines[0], "|---" * lines[0].count(" | ") + "|---|", *lines[1:]]) + "\n"
+
+
+def page(rows: dict[Key, list[str]]) -> str:
+    """Return the page."""
+    entries = [("key", "shape", "unit", "meaning", "written by")]
+    for key, (shape, *names) in rows.items():
+        shown = ", ".join(part if part in (ROLE, NAME) else f'"{part}"' for part in key)
+        entries.append((f"`{shown}`", f"`{shape}`", *ENTRIES[key], ", ".join(names)))
+    equations = [("equation", "formula", "symbols and units", "implemented by", "deviation")]
+    for number, formula, symbols, functions, deviation in EQUATIONS:
+        paths = ", ".join(f"`{path}`" for path in functions) or "–"
+        shown = f"`{formula}`" if functions else formula
+        equations.append((number, shown, symbols.replace("*", r"\*"), paths, deviation))
+    return "\n".join([HEAD, table(*entries), "## Equations\n", PAPERS + "\n", table(*equations)])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if stale")
+    check = parser.parse_args(arguments).check
+    text = page(collect(environments()))
+    if not check:
+        PAGE.write_text(text, encoding="utf-8")
+    elif not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text:
+        print("docs/entries.md differs from the code: python tools/entries.py", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
