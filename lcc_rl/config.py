@@ -18,7 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_checks import check_ignored, renamed_option
@@ -75,6 +75,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
         raise ConfigError(str(explained(error, entry, overrides))) from error
     check_keys(cfg)
     check_ignored(cfg, overrides)
+    leave_out_foreign(cfg, overrides)
     return cfg
 
 
@@ -83,6 +84,31 @@ def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictC
         return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
     with initialize_config_module(CONF, version_base="1.3"):
         return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+
+
+def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Leave out settings of a class that was replaced on the command line by another one.
+
+    After ``scenario.controllers.automated._target_=mine.Rule`` the settings that the file gives
+    for its own class stay where the new one has them, too; what was typed always stays.
+    """
+    typed = {item.lstrip("+~").partition("=")[0] for item in overrides}
+    for place in (key.removesuffix(f".{TARGET}") for key in typed if key.endswith(f".{TARGET}")):
+        node = OmegaConf.select(cfg, place)
+        if not isinstance(node, DictConfig) or TARGET not in node:
+            continue
+        try:
+            target = find_target(str(node[TARGET]), place)
+        except ConfigError:  # said where it is built
+            continue
+        known = inspect.signature(getattr(target, "Settings", target)).parameters.values()
+        if any(parameter.kind is parameter.VAR_KEYWORD for parameter in known):
+            continue
+        names = {parameter.name for parameter in known}
+        for key in [str(key) for key in node if not str(key).startswith("_")]:
+            if key not in names and f"{place}.{key}" not in typed:
+                with open_dict(node):
+                    node.pop(key)
 
 
 def is_sweep() -> bool:

@@ -183,7 +183,6 @@ def test_an_option_of_a_former_release_names_todays_in_one_line(item, new) -> No
         (["scenario=ring", "agent=none", "split=vehicle"], "a ring road has no leader"),
         (["scenario.circumference=200"], "belongs to scenario.road=ring"),
         (["variant=idm", "training.episodes=20"], "variant idm learns nothing"),
-        (["variant=idm", "agent.gamma=0.5"], "variant idm learns nothing|learns nothing"),
         (["variant=direct", f"{AUTO}.max_acceleration=2"], "no vehicle of the string is automated"),
         (["variant=cacc", "scenario.controllers.human.noise=0"], "no vehicle of the string is"),
         (["evaluation.full_length=true"], "unused with evaluation.rows=episodes"),

@@ -25,8 +25,6 @@ from lcc_rl.policies import shared_policy
 from lcc_rl.policies.actor import ACTION
 
 CONF = Path(lcc_rl.conf.__file__).parent
-
-
 LEARNED = ("alcc", "reference", "own_energy", "ddpg", "hcfs")
 
 

@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config import explained, is_sweep
+from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
@@ -47,7 +47,9 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
         def checked(config: DictConfig) -> Any:
             check_keys(config)
-            check_ignored(config, HydraConfig.get().overrides.task, is_sweep())
+            typed = list(HydraConfig.get().overrides.task)
+            check_ignored(config, typed, is_sweep())
+            leave_out_foreign(config, typed)
             return function(config)
 
         @wraps(function)
