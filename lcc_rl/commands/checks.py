@@ -137,7 +137,7 @@ def check_sizes(cfg: DictConfig) -> None:
     )
     require(
         cfg.evaluation.rows != "vehicles" or pieces.get("communication") is not None,
-        "evaluation.rows=vehicles measures what scenario.pieces.communication writes; there is none",
+        "evaluation.rows=vehicles measures what scenario.pieces.communication writes",
     )
     step = cfg.scenario.time_step
     require(step > 0, f"scenario.time_step must be positive, got {step}")

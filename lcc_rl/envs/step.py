@@ -208,10 +208,24 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
     before, reached = _read(td), _read(next_td)
     for piece in pieces:
         piece.apply(before, reached)
-    nested: dict[str, Any] = {}
+    batch, device = next_td.batch_size, next_td.device
+    spaces: dict[str, Any] = {}
     for key, value in reached.items():
-        space = nested
+        space = spaces
         for name in key[:-1]:
             space = space.setdefault(name, {})
         space[key[-1]] = value
-    return TensorDict(nested, next_td.batch_size, device=next_td.device)
+    return _tensordict(spaces, batch, device)
+
+
+def _tensordict(entries: dict[str, Any], batch: BatchSize, device: device | None) -> TensorDict:
+    """Return nested entries as a TensorDict.
+
+    TensorDict's own check of every shape costs as much as the physics; the shapes were checked
+    when the environment was built (:mod:`lcc_rl.envs.checks`).
+    """
+    made = {
+        name: _tensordict(value, batch, device) if isinstance(value, dict) else value
+        for name, value in entries.items()
+    }
+    return TensorDict._new_unsafe(made, batch_size=batch, device=device)

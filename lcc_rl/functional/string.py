@@ -5,7 +5,8 @@ Entries of vehicles are ``[*batch, N, w]``, front to back; those of the leader `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -76,7 +77,7 @@ def blocks_of(places: Sequence[int]) -> list[slice]:
     steps = {b - a for a, b in pairwise(places)}
     if len(steps) <= 1 and all(step > 0 for step in steps):
         step = steps.pop() if steps else 1
-        return [slice(places[0], places[-1] + 1, step)] if places else [slice(0, 0)]
+        return [slice(places[0], places[-1] + 1, step)] if places else [slice(0, 0, 1)]
     found: list[slice] = []
     for place in places:
         if found and found[-1].stop == place:
@@ -86,13 +87,28 @@ def blocks_of(places: Sequence[int]) -> list[slice]:
     return found
 
 
-def take(entry: Tensor, blocks: Sequence[slice]) -> Tensor:
-    """Return the vehicles that slices select, ``[*batch, n, w]`` of ``[*batch, N, w]``."""
-    if len(blocks) == 1:
-        (block,) = blocks
-        everybody = block.step == 1 and block.stop - block.start == entry.shape[-2]
-        return entry if everybody else entry[..., block, :]
-    return torch.cat([entry[..., block, :] for block in blocks], dim=-2)
+def selector(places: Sequence[int], size: int) -> Callable[[Tensor], Tensor]:
+    """Return a function that picks vehicles of a string, ``[*batch, n, w]`` of ``[*batch, N, w]``.
+
+    Args:
+        places: those picked, in order.
+        size: number N of vehicles.
+    """
+    blocks = blocks_of(places)
+    if blocks == [slice(0, size, 1)]:
+        return _whole
+    if len(blocks) == 1 and blocks[0].step == 1:
+        return partial(torch.narrow, dim=-2, start=blocks[0].start, length=len(places))
+    return partial(_picked, blocks=tuple(blocks))
+
+
+def _whole(entry: Tensor) -> Tensor:
+    return entry
+
+
+def _picked(entry: Tensor, blocks: Sequence[slice]) -> Tensor:
+    parts = [entry[..., block, :] for block in blocks]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
 
 
 def gather(entry: Tensor, index: Tensor) -> Tensor:

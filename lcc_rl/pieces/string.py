@@ -13,7 +13,7 @@ from torchrl.data import Unbounded
 from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.random import stream_id, uniform
-from lcc_rl.functional.string import Motion, advance_string, blocks_of, entries_ahead, take
+from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
 from lcc_rl.pieces.base import SEED, Key, StepTransform, next_key
 from lcc_rl.pieces.views import LEADER, VEHICLES
 
@@ -124,7 +124,7 @@ class StringMotion(StepTransform):
         elif missing := [role for role in string.names if role not in start]:
             raise ConfigError(f"scenario.start lacks {', '.join(missing)}: how do they start?")
         order = [place for role in string.names for place in string.places(role)]
-        self.blocks = blocks_of([order.index(place) for place in range(len(order))])
+        self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
 
     def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
         """Return the motion at the moment reached, and the commands that led there."""
@@ -141,7 +141,7 @@ class StringMotion(StepTransform):
         if indices:
             order = torch.cat(indices, -1).unsqueeze(-1)
             return torch.zeros_like(joined).scatter(-2, order.expand_as(joined), joined)
-        return take(joined, self.blocks)
+        return self.arrange(joined)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         shape = (*start.batch_size, len(self.string), 1)

@@ -16,19 +16,23 @@ With ``next.`` before a name the moment reached is meant. Whatever the name, wha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.functional.string import blocks_of, entries_ahead, gather, take
+from lcc_rl.functional.string import entries_ahead, gather, selector
 from lcc_rl.pieces.base import NEXT, Key, as_key
 
 VEHICLES, LEADER, EPISODE = "vehicles", "leader", "episode"
 SELF, AHEAD, BEHIND = "self", "ahead", "behind"
 PRESENT = "present"
+
+
+Resolver = Callable[[Sequence[Tensor]], Tensor]
 
 
 class Views:
@@ -57,24 +61,14 @@ class Views:
                 raise ConfigError(f"expected a name such as self.gap, got {'.'.join(name)!r}")
         # Only roles have places; what all vehicles see alike needs none.
         self.drawn = string.drawn and role in string.names
-        self.places = string.places(role)
-        self.blocks = blocks_of(self.places)
-        # Of those ahead (-1) and behind, where their places are the same in every episode.
-        self.others = {distance: self._blocks_at(distance) for distance in range(-1, behind + 1)}
-        self.first_is_ahead = 0 in self.places and not self.drawn
+        self.places, self.role = string.places(role), role
         self.keys: list[Key] = []
-        self.plan = [self._add(name) for name in self.names]
-        # Where every entry is taken as it is, nobody needs to know where the role drives.
-        picks = any(kind in (SELF, AHEAD, BEHIND, PRESENT) for kind, _, _ in self.plan)
-        self.index = self._place((role, "index")) if self.drawn and picks else -1
+        # Everything that depends on the string alone is settled here, not at every step.
+        self.plan = [self._resolver(name) for name in self.names]
 
-    def _blocks_at(self, distance: int) -> list[slice] | None:
-        """Return where the vehicles so far behind each one are; None if not always somewhere."""
-        places = [place + distance for place in self.places]
-        if self.string.ring:
-            places = [place % len(self.string) for place in places]
-        fixed = not self.drawn and all(0 <= place < len(self.string) for place in places)
-        return blocks_of(places) if fixed else None
+    def __call__(self, *entries: Tensor) -> list[Tensor]:
+        """Return what is seen, one tensor per name."""
+        return [resolve(entries) for resolve in self.plan]
 
     def _place(self, key: Key) -> int:
         """Return the place of an entry among those read."""
@@ -82,67 +76,55 @@ class Views:
             self.keys.append(key)
         return self.keys.index(key)
 
-    def _add(self, name: Key) -> tuple[str, int, int]:
-        """Return the kind of a name, and the places of the entries it is made from."""
+    def _resolver(self, name: Key) -> Resolver:
+        """Return the function from the entries read to what a name means."""
         prefix, (space, entry) = name[:-2], name[-2:]
-        own, leading = (*prefix, VEHICLES, entry), (*prefix, LEADER, entry)
-        if space == SELF:
-            return SELF, self._place(own), -1
-        if space == AHEAD:
-            follows = (self.first_is_ahead or self.drawn) and not self.string.ring
-            alone = self.places == (0,) and not self.drawn and not self.string.ring
-            return AHEAD, -1 if alone else self._place(own), self._place(leading) if follows else -1
+        if space in (SELF, AHEAD):
+            return self._at((*prefix, VEHICLES, entry), -1 if space == AHEAD else 0)
         if space == BEHIND:
             # Any entry of the vehicles tells the shape of the batch.
-            known = own if entry != PRESENT else (*prefix, VEHICLES, "speed")
-            return (PRESENT if entry == PRESENT else BEHIND), self._place(known), -1
-        kind = LEADER if space in (LEADER, EPISODE) else ""
-        return kind, self._place(name), -1
+            present = entry == PRESENT
+            key = (*prefix, VEHICLES, "speed" if present else entry)
+            distances = range(1, self.behind + 1)
+            return partial(_joined, [self._at(key, distance, present) for distance in distances])
+        return partial(_row if space in (LEADER, EPISODE) else _as_it_is, self._place(name))
 
-    def __call__(self, *entries: Tensor) -> list[Tensor]:
-        """Return what is seen, one tensor per name."""
-        return [self._resolve(kind, entries, own, lead) for kind, own, lead in self.plan]
+    def _at(self, key: Key, distance: int, present: bool = False) -> Resolver:
+        """Return what finds an entry of the vehicles so far behind (−1: ahead of) the role's."""
+        size = len(self.string)
+        places = [place + distance for place in self.places]
+        if self.string.ring:
+            places = [place % size for place in places]
+        if not self.drawn and all(0 <= place < size for place in places):
+            return partial(_selected, self._place(key), selector(places, size), present)
+        follows = distance == -1 and not self.string.ring
+        lead = self._place((*key[:-2], LEADER, key[-1])) if follows else -1
+        if follows and self.places == (0,) and not self.drawn:
+            return partial(_row, lead)
+        index = self._place((self.role, "index")) if self.drawn else -1
+        return partial(self._found, self._place(key), lead, index, distance, present)
 
-    def _resolve(self, kind: str, entries: Sequence[Tensor], own: int, lead: int) -> Tensor:
-        if kind == SELF:
-            return self._pick(entries, entries[own])
-        if kind == AHEAD:
-            leading = entries[lead] if lead >= 0 else None
-            if own < 0:
-                assert leading is not None
-                return leading.unsqueeze(-2)
-            return self._ahead(entries, entries[own], leading)
-        if kind == BEHIND:
-            return self._behind(entries, entries[own])
-        if kind == PRESENT:
-            return self._behind(entries, torch.ones_like(entries[own]))
-        return entries[own].unsqueeze(-2) if kind == LEADER else entries[own]
-
-    def _pick(self, entries: Sequence[Tensor], entry: Tensor) -> Tensor:
-        if self.drawn:
-            return gather(entry, entries[self.index])
-        return take(entry, self.blocks)
-
-    def _ahead(self, entries: Sequence[Tensor], entry: Tensor, leading: Tensor | None) -> Tensor:
-        blocks = self.others[-1]
-        if blocks is not None:
-            return take(entry, blocks)
-        return self._pick(entries, entries_ahead(leading, entry))
-
-    def _behind(self, entries: Sequence[Tensor], entry: Tensor) -> Tensor:
-        """Return an entry of the vehicles behind, ``[*batch, n, behind · w]``, zeros for none."""
-        seen = []
-        for distance in range(1, self.behind + 1):
-            blocks = self.others[distance]
-            if blocks is not None:
-                seen.append(take(entry, blocks))
-                continue
+    def _found(
+        self,
+        own: int,
+        lead: int,
+        index: int,
+        distance: int,
+        present: bool,
+        entries: Sequence[Tensor],
+    ) -> Tensor:
+        """Return an entry at a distance that some vehicles, or some episodes, do not have."""
+        entry = torch.ones_like(entries[own]) if present else entries[own]
+        if distance < 0:
+            entry = entries_ahead(entries[lead] if lead >= 0 else None, entry)
+        elif distance > 0:
             # The first vehicles come round to the end on a ring; elsewhere nobody is there.
             wrapped = entry[..., :distance, :]
             end = wrapped if self.string.ring else torch.zeros_like(wrapped)
-            shifted = torch.cat([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
-            seen.append(self._pick(entries, shifted))
-        return seen[0] if len(seen) == 1 else torch.cat(seen, -1)
+            entry = torch.cat([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
+        if index >= 0:
+            return gather(entry, entries[index])
+        return selector(self.places, len(self.string))(entry)
 
     def sees_all_behind(self) -> bool:
         """Whether every vehicle of the role always has as many vehicles behind as it sees."""
@@ -151,3 +133,23 @@ class Views:
         if self.drawn:
             return False
         return all(place + self.behind < len(self.string) for place in self.places)
+
+
+def _selected(
+    place: int, select: Callable[[Tensor], Tensor], present: bool, entries: Sequence[Tensor]
+) -> Tensor:
+    found = select(entries[place])
+    return torch.ones_like(found) if present else found
+
+
+def _row(place: int, entries: Sequence[Tensor]) -> Tensor:
+    return entries[place].unsqueeze(-2)
+
+
+def _as_it_is(place: int, entries: Sequence[Tensor]) -> Tensor:
+    return entries[place]
+
+
+def _joined(parts: Sequence[Resolver], entries: Sequence[Tensor]) -> Tensor:
+    found = [part(entries) for part in parts]
+    return found[0] if len(found) == 1 else torch.cat(found, -1)
