@@ -15,7 +15,7 @@ from lcc_rl.evaluation.strategies import driven_by
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.rules import follower_stopper_speed
-from lcc_rl.functional.string import advance_string, blocks_of, take
+from lcc_rl.functional.string import advance_string, selector
 from lcc_rl.pieces import (
     FollowerStopper,
     Observation,
@@ -122,7 +122,7 @@ def test_a_name_has_a_view_and_an_entry(name) -> None:
 )
 def test_blocks_select_the_places_in_order(places) -> None:
     entry = torch.arange(10.0).view(1, 10, 1)
-    assert take(entry, blocks_of(places)).flatten().tolist() == list(map(float, places))
+    assert selector(places, entry.shape[-2])(entry).flatten().tolist() == list(map(float, places))
 
 
 # -- drawn places ----------------------------------------------------------------------------------
