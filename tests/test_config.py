@@ -16,6 +16,7 @@ import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import DictConfig, OmegaConf
 
+import lcc_rl
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import TARGET, build, config_hash, find_target, load
 from lcc_rl.envs import build_env
@@ -365,7 +366,7 @@ def test_hash_ignores_order_and_sees_values() -> None:
     assert config_hash({"a": 1}) != config_hash({"a": 2})
 
 
-ROOMS = sorted(path.parent.name for path in CONF.parent.glob("*/__init__.py"))
+ROOMS = sorted(path.parent.name for path in Path(lcc_rl.__file__).parent.glob("*/__init__.py"))
 FRESH = """
 import sys, traceback
 from importlib import import_module

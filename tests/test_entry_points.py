@@ -264,6 +264,7 @@ def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
     assert "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
     words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
     with start("lcc_rl.pipeline", *words, cwd=tmp_path) as process:

@@ -121,6 +121,7 @@ def test_a_reward_term_and_an_entry_of_the_observation() -> None:
     assert ((seen - kinetic).abs() < 1e-6).any(-1).all()
 
 
+@pytest.mark.slow
 def test_the_command_finds_a_module_on_the_path(tmp_path) -> None:
     words = ["experiment=smoke", "data.platoons=2", "data.recordings=2", "scenario.horizon=40"]
     words += ["variant=idm", OWN, POWER, HUMAN, "hydra.run.dir=run"]

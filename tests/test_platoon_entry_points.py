@@ -124,6 +124,7 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
         evaluation.run(tiny("evaluate", "ddpg", *given), tmp_path, quiet=True)
 
 
+@pytest.mark.slow
 def test_sweep_as_typed(tmp_path) -> None:
     words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "training.episodes=8"]
     words.append("hydra.sweep.dir=sweep")
@@ -195,6 +196,7 @@ def test_resuming_equals_never_having_stopped(tmp_path) -> None:
 # -- the study -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_study_from_cycles_to_page_and_on_from_where_it_stopped(tmp_path) -> None:
     overrides = (HORIZON, "evaluation.profiles=3", *AGENT)
     study = hcfs.Study(tmp_path, recipe="smoke", seeds=1, overrides=overrides, jobs=1)

@@ -188,6 +188,7 @@ def test_statistics_leave_out_what_follows_a_collision(tmp_path) -> None:
     assert row["episode_reward"] == pytest.approx(sum(terms), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_learns_to_keep_going(tmp_path) -> None:
     # Behaviour, not numbers: after a few hundred updates the car earns more than at the start.
     trainer = make(

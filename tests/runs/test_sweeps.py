@@ -209,6 +209,7 @@ def on_terminal(cwd: Path, *words: str) -> str:
     return shown.decode()
 
 
+@pytest.mark.slow
 def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
     shown = on_terminal(tmp_path, *SWEEP, "scenario.controllers.automated.time_gap=1.2,1.3,-1")
     table, _, end = shown.rpartition("┘")
@@ -235,6 +236,7 @@ def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, capsys) -
     assert capsys.readouterr().out.count("those of serial") == 2
 
 
+@pytest.mark.slow
 def test_random_kills_lose_nothing() -> None:
     """Thirty kills, or what fits in the time; by hand: python tools/kill_test.py --kills 200."""
     words = [sys.executable, str(ROOT / "tools" / "kill_test.py"), "--kills=30", "--seconds=30"]

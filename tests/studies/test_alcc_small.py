@@ -24,7 +24,7 @@ from lcc_rl.studies.alcc import report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.runner import FAILED, FINISHED, FOREIGN, Outcome, Run
 
-pytestmark = pytest.mark.xdist_group("small_study")
+pytestmark = [pytest.mark.xdist_group("small_study"), pytest.mark.slow]
 
 SPEEDS = (0, 8)  # of the filter
 MODULES = (training, evaluation, runner, alcc)

@@ -127,6 +127,7 @@ def test_a_wrong_plain_python_loop_is_not_timed(benchmark, monkeypatch) -> None:
         benchmark.collect(options)
 
 
+@pytest.mark.slow
 def test_without_the_extra_it_says_what_is_left_out(benchmark, monkeypatch, tmp_path, capsys):
     for module in ("benchmark", *(f"benchmarks.{x}" for x in ("collect", "update", "calibrate"))):
         monkeypatch.setattr(f"{module}.installed", lambda *names: False)

@@ -53,6 +53,7 @@ def test_table_of_agents(tmp_path) -> None:
     assert (tmp_path / "agents.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_policies_kept_on_the_way_are_evaluated_once(tmp_path) -> None:
     data = ("data.platoons=4", "data.recordings=2", "scenario.horizon=40", "experiment=smoke")
     small = ("agent.batch_size=64", "agent.hidden=[16,16]", "training.keep_every=1")
@@ -86,6 +87,7 @@ def test_what_knowledge_is_worth(tmp_path) -> None:
     assert (tmp_path / "knowledge.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_policies_are_put_behind_the_filter_once(tmp_path, monkeypatch) -> None:
     data = ["data.platoons=4", "data.recordings=2", "scenario.horizon=40", "experiment=smoke"]
     small = ["agent.batch_size=64", "agent.hidden=[16,16]"]
