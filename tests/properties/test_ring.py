@@ -30,8 +30,6 @@ SPEED = ("vehicles", "speed")
 HANDOVER = (
     string("automated human*21"),
     "controller@scenario.controllers.automated=handover",
-    "scenario.controllers.automated.before.noise=0",
-    "scenario.controllers.automated.before.wiener=${scenario.controllers.human.wiener}",
 )
 
 
