@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import inspect
 import json
+import re
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -92,7 +93,11 @@ def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
     After ``scenario.controllers.automated._target_=mine.Rule`` the settings that the file gives
     for its own class stay where the new one has them, too; what was typed always stays.
     """
-    typed = {item.lstrip("+~").partition("=")[0] for item in overrides}
+    typed = set()
+    for item in overrides:
+        key, _, value = item.lstrip("+~").partition("=")
+        inside = re.findall(r"(\w+)\s*:", value) if value.startswith("{") else []
+        typed |= {key, *(f"{key}.{name}" for name in inside)}
     for place in (key.removesuffix(f".{TARGET}") for key in typed if key.endswith(f".{TARGET}")):
         node = OmegaConf.select(cfg, place)
         if not isinstance(node, DictConfig) or TARGET not in node:
@@ -172,7 +177,7 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
     signature = inspect.signature(target).parameters
     for key in given:
         if key not in signature:
-            own = set(signature) - set(resources)
+            own = set(signature) - set(resources) - INTERNAL
             raise unknown_name(f"setting of {where} ({target.__name__})", key, own)
         if given[key] == "???":
             raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
@@ -209,6 +214,8 @@ def short_name(target: object) -> str:
     return str(target).rpartition(".")[2].lower()
 
 
+# Arguments of the pieces' base classes, which no configuration sets.
+INTERNAL = {"reads", "writes", "constants", "reset_options"}
 SIMPLE: dict[Any, tuple[type, ...]] = {float: (float, int), int: (int,), bool: (bool,), str: (str,)}
 
 

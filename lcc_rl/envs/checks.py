@@ -74,8 +74,8 @@ def _compare(piece: Piece, found: Mapping[Key, torch.Tensor], when: str) -> None
         if value.shape != spec.shape or value.dtype != spec.dtype:
             raise ConfigError(
                 f"{type(piece).__name__} writes {'.'.join(key)} as {list(value.shape[1:])} "
-                f"{value.dtype} {when}, but its spec says {list(spec.shape[1:])} {spec.dtype}; "
-                "expected one row per vehicle"
+                f"{value.dtype} {when}; expected {list(spec.shape[1:])} {spec.dtype}, one row per "
+                "vehicle"
             )
 
 

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import RandomPolicy
 
 from lcc_rl.envs.single import SingleAgent, group_key
 from lcc_rl.envs.step import DONE, Compiled, Step, closure, entries, leaves, pieces_of
@@ -30,7 +31,7 @@ class StringCollector(BaseCollector):
     Args:
         create_env_fn: the environment, ``[batch]`` episodes side by side, or a function that
             makes it.
-        policy: writes the action into a TensorDict with its ``in_keys``.
+        policy: writes the action into a TensorDict with its ``in_keys``; None for random actions.
         frames_per_batch: frames of one batch: steps times episodes side by side.
         total_frames: frames after which iteration ends; −1: never.
         keys: the entries of a batch, those of the moment reached under ``"next"``; a key of
@@ -46,7 +47,7 @@ class StringCollector(BaseCollector):
     def __init__(
         self,
         create_env_fn: Any,
-        policy: TensorDictModuleBase,
+        policy: TensorDictModuleBase | None,
         *,
         frames_per_batch: int,
         total_frames: int = -1,
@@ -55,7 +56,8 @@ class StringCollector(BaseCollector):
     ) -> None:
         super().__init__()
         env = create_env_fn if isinstance(create_env_fn, TransformedEnv) else create_env_fn()
-        self.env, self.policy = env, policy
+        self.env: TransformedEnv = env
+        self.policy: Any = RandomPolicy(env.full_action_spec) if policy is None else policy
         self.requested_frames_per_batch, self.total_frames = frames_per_batch, total_frames
         self._frames, self._iter, self._iterator = 0, -1, None
         self.trajs_per_batch = None
@@ -68,7 +70,9 @@ class StringCollector(BaseCollector):
         self.steps = frames_per_batch // episodes
         self.single = _is_single(env)
         self.action: Key = as_key(next(iter(env.full_action_spec.keys(True, True))))
-        self.reads = [as_key(key) for key in policy.in_keys if as_key(key) != self.action]
+        self.reads = [
+            as_key(key) for key in getattr(policy, "in_keys", []) if as_key(key) != self.action
+        ]
         self.reset()
         rewards = env.full_reward_spec.keys(True, True)
         moment = [*self.state, *(as_key(key) for key in rewards)]

@@ -88,16 +88,28 @@ def build_pieces(
     pieces = _leader(scenario, named.pop("leader", None), resources)
     pieces += [Places(string), *_drivers(scenario, string, resources)]
     pieces.append(_motion(scenario, string, resources))
-    pieces += [build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
+    pieces += [_build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
     if not string.count(AUTOMATED):
         return pieces
-    pieces.append(build(cfg.observation, "observation", **resources))
+    pieces.append(_build(cfg.observation, "observation", **resources))
     pieces += [
-        build(node, f"reward.terms.{name}", name=name, **resources)
+        _build(node, f"reward.terms.{name}", name=name, **resources)
         for name, node in cfg.reward.terms.items()
     ]
     # The sum stays last, before collisions of the next step.
     return [*pieces, TotalReward(list(cfg.reward.terms), string)]
+
+
+def _build(node: Any, where: str, **resources: Any) -> Any:
+    """Build a piece.
+
+    Raises:
+        ConfigError: if the node describes something else.
+    """
+    piece = build(node, where, **resources)
+    if not isinstance(piece, Piece):
+        raise ConfigError(f"{where}: expected a piece, {type(piece).__name__} is none")
+    return piece
 
 
 def _leader(scenario: Any, node: Any, resources: dict[str, Any]) -> list[Piece]:
@@ -107,7 +119,7 @@ def _leader(scenario: Any, node: Any, resources: dict[str, Any]) -> list[Piece]:
             "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
             f"scenario.road={scenario.road} and leader={node}"
         )
-    return [] if node is None else [build(node, "scenario.pieces.leader", **resources)]
+    return [] if node is None else [_build(node, "scenario.pieces.leader", **resources)]
 
 
 def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> list[Piece]:
@@ -118,7 +130,7 @@ def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) ->
         for role in string.names:
             if nodes.get(role) is not None:
                 where = f"scenario.{group}.{role}"
-                pieces.append(build(nodes[role], where, role=role, **resources))
+                pieces.append(_build(nodes[role], where, role=role, **resources))
             elif needed:
                 known = ", ".join(name for name in nodes if nodes[name] is not None)
                 raise ConfigError(

@@ -19,6 +19,7 @@ from torch._inductor.exc import InductorError
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
 from lcc_rl.pieces.rewards import RewardTerm, TotalReward
 
@@ -143,11 +144,17 @@ class Pieces(Compose):
         if not isinstance(transform, RewardTerm) or not places:
             super().append(transform)
             return
-        total: Any = self.transforms[places[-1]]
+        place = places[-1]
+        total: Any = self.transforms[place]
+        if transform.event_shape != total.event_shape or transform.string != total.string:
+            raise ConfigError(
+                f"{type(transform).__name__} was made for another string of vehicles; give it "
+                f"string=parse_string(…) of this environment: {' '.join(total.string.roles)}"
+            )
         renewed = TotalReward([*total.terms, transform.name], total.string)
-        self.pop(places[-1])
-        super().append(transform)
-        super().append(renewed.to(self.parent.device) if self.parent is not None else renewed)
+        self.pop(place)
+        self.insert(place, transform)
+        self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         waiting: list[Piece] = []

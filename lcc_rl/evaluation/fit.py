@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModule
 
 from lcc_rl.config import plain
 from lcc_rl.errors import ConfigError
@@ -39,3 +43,20 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
             f"policy={cfg.policy} was trained with another memory than this: "
             f"expected scenario.pieces.memory={remembered}, got {asked}"
         )
+
+
+def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str) -> None:
+    """Check that a trained network observes as many entries as one of this string.
+
+    Raises:
+        ConfigError: naming both numbers.
+    """
+    first = "module.0.0.weight"
+    trained_with, observed = (state.get(first) for state in (weights, policy.state_dict()))
+    if trained_with is None or observed is None or trained_with.shape[1] == observed.shape[1]:
+        return
+    raise ConfigError(
+        f"policy={path} was trained with {trained_with.shape[1]} observed entries, in this "
+        f"scenario.string an automated vehicle has {observed.shape[1]}: where one may have nobody "
+        "behind it, one entry more per vehicle seen says so"
+    )

@@ -18,7 +18,7 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import TARGET, load, plain, short_name
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.evaluation.fit import check_policy
+from lcc_rl.evaluation.fit import check_policy, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.controllers import Population
@@ -257,6 +257,7 @@ def with_weights(
         ResultsError: if the weights do not fit the network.
     """
     agent = build_agent(cfg, population, cfg.device)
+    check_width(agent.policy, weights, path)
     try:
         agent.policy.load_state_dict(dict(weights))
     except RuntimeError as error:

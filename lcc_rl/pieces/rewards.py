@@ -58,6 +58,7 @@ class RewardTerm(RewardPiece):
             raise ConfigError(f"reward.terms.{name}.weight must be finite, got {weight}")
         string = VehicleString() if string is None else string
         self.views = Views(string, AUTOMATED, self.reads if reads is None else reads)
+        self.string = string
         super().__init__(self.views.keys, [(*TERMS, name)], (string.count(AUTOMATED), 1))
         self.name, self.weight = name, weight
 

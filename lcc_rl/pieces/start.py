@@ -78,8 +78,14 @@ class EquilibriumStart:
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
         desired_speed, time_gap = (
-            start.get((role, name)) for name in ("desired_speed", "desired_time_gap")
+            start.get((role, name), None) for name in ("desired_speed", "desired_time_gap")
         )
+        if desired_speed is None or time_gap is None:
+            raise ConfigError(
+                f"scenario.start.{role}: EquilibriumStart needs {role}.desired_speed and "
+                f"{role}.desired_time_gap, which only IDM drivers have; say for example "
+                f"'scenario.start.{role}=${{scenario.start.automated}}'"
+            )
         gap = equilibrium_gap(speed, desired_speed, time_gap, self.drivers, self.cap_time_gap)
         return speed, gap
 

@@ -55,6 +55,8 @@ class Views:
         self, string: VehicleString, role: str, names: Sequence[str], behind: int = 1
     ) -> None:
         self.string, self.behind = string, behind
+        if isinstance(names, str):
+            raise ConfigError(f"reads must be a tuple of names such as self.gap, got {names!r}")
         self.names = [as_key(name) for name in names]
         for name in self.names:
             if len(name) - (name[0] == NEXT) != 2:

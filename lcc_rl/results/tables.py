@@ -26,6 +26,7 @@ CAR_COLUMNS = (
     "share_time_gap_long",
     "rms_jerk_mps3",
 )
+HUMAN_COLUMNS = ("hdv_energy_kj", "hdv_net_energy_kj", "hdv_distance_m")
 
 
 def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
@@ -73,9 +74,9 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         baselines ``idm`` and ``reference`` as shares, positive where energy is saved, share of
         drivers worse off, and the safety measures; missing where a strategy has none.
     """
-    # A string without a controlled car has no energies of one.
-    cars = [column for column in CAR_COLUMNS if column not in episodes]
-    episodes = episodes.assign(**dict.fromkeys(cars, float("nan")))
+    # A string without automated vehicles, or without others, has no energies of them.
+    lacking = [column for column in (*CAR_COLUMNS, *HUMAN_COLUMNS) if column not in episodes]
+    episodes = episodes.assign(**dict.fromkeys(lacking, float("nan")))
     total, net = paired(episodes, "total_energy_kj"), paired(episodes, "total_net_energy_kj")
     rows = []
     for strategy, group in episodes.groupby("strategy", sort=False):
@@ -84,7 +85,7 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = group[f"{vehicle}_{kind}"].mean()
         row[LOST] = group[LOST].mean()
-        kilometres = (group["cav_distance_m"].fillna(0) + group["hdv_distance_m"]).sum() / 1e3
+        kilometres = group[["cav_distance_m", "hdv_distance_m"]].sum().sum() / 1e3
         energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
         row["kj_per_km"] = energy.sum() / kilometres
         for baseline in BASELINES:
