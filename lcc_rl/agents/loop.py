@@ -30,12 +30,7 @@ from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.schemas import TrainingConfig
 
 # What the record of an iteration is made from.
-REPORTED = (
-    ("next", *REWARD),
-    ("next", *TERMS),
-    ("next", "done"),
-    ("next", "terminated"),
-)
+REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 
 def derived_seed(*parts: object) -> int:

@@ -100,18 +100,24 @@ def clairvoyant(
         data = source.assemble(record)
         energy = path_energy(data, strategy.cfg.scenario.time_step)
         missed = misses(data, string)
-        optimizer.zero_grad(set_to_none=True)
-        (energy + min(1.0, 0.1 + 1.8 * share) * missed).sum().backward()
-        assert shifts.grad is not None
-        # Every episode is a problem of its own, whatever its scale.
-        shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
-        fall = 0.5 * (1.0 + math.cos(math.pi * share))
-        optimizer.param_groups[0]["lr"] = SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall
-        optimizer.step()
+        _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
     planned = Planned(strategy.policy, shifts.detach())
     return replace(strategy, name="clairvoyant", policy=planned, seed=None)
+
+
+def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> None:
+    """Take a step along the gradient of every episode's price, smaller towards the end."""
+    (group,) = optimizer.param_groups
+    (shifts,) = group["params"]
+    optimizer.zero_grad(set_to_none=True)
+    price.sum().backward()
+    # Every episode is a problem of its own, whatever its scale.
+    shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
+    fall = 0.5 * (1.0 + math.cos(math.pi * share))
+    group["lr"] = SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall
+    optimizer.step()
 
 
 def path_energy(data: TensorDictBase, time_step: float) -> Tensor:

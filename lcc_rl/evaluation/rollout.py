@@ -13,7 +13,7 @@ from lcc_rl.envs.rollout import ACTION
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import hash_bits
-from lcc_rl.pieces.base import SEED, Key, State, as_key
+from lcc_rl.pieces.base import SEED, Key, Piece, State, as_key
 
 # Reads and writes a TensorDict; None where a rule drives.
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -40,11 +40,7 @@ def play(
         ConfigError: if a controller takes an action and there is no policy.
     """
     pieces = pieces_of(env)
-    if policy is None and any(key == ACTION for piece in pieces for _, key in piece.sources):
-        raise ConfigError(
-            "scenario.controllers.automated takes the action of a policy, and there is none: "
-            "choose an agent, or another controller"
-        )
+    _check_driven(policy, pieces)
     known = written(pieces)
     kept = [key for key in keys if key in known]
     reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
@@ -64,6 +60,14 @@ def play(
             running = running & ~reached[TERMINATED]
             state = {key: reached.get(key, value) for key, value in state.items()}
     return {key: torch.stack(values) for key, values in record.items()}, torch.stack(alive)
+
+
+def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
+    if policy is None and any(key == ACTION for piece in pieces for _, key in piece.sources):
+        raise ConfigError(
+            "scenario.controllers.automated takes the action of a policy, and there is none: "
+            "choose an agent, or another controller"
+        )
 
 
 def _action(

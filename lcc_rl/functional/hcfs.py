@@ -135,7 +135,7 @@ def hybrid_decision(
         rule, learned: the candidates [m/s²].
         speed: v_i [m/s].
         last_acceleration: a_{k−1} as executed [m/s²].
-        last_winner: winner of the frame before, negative where there was none; None likewise.
+        last_winner: winner of the frame before; negative or None where there was none.
         leader_next: the predicted speed of each vehicle's leader [m/s].
         interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
         cap: see :func:`safe_acceleration`; None leaves it out.

@@ -198,7 +198,7 @@ def test_what_fits_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("piece", "words"),
     [
-        (Wide, r"Wide writes vehicles\.wide as \[4, 4, 1\] .* spec says \[4, 1\]"),
+        (Wide, r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
         (Broken, "Broken does not fit the string of vehicles"),
         (
             lambda: StringMotion(STRING, 0.1, START),
@@ -206,7 +206,7 @@ def test_what_fits_is_accepted() -> None:
         ),
         (
             lambda: TimeToCollision(parse_string("automated*3")),
-            r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* says \[3, 1\]",
+            r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* expected \[3, 1\]",
         ),
         (
             lambda: Action(string=parse_string("automated*4"), role="other"),
