@@ -126,16 +126,19 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
     cars = episodes[episodes["strategy"] != "direct"]
     present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_energy_kj" in cars]
     means = cars.groupby("strategy", sort=False)[[f"{x}_energy_kj" for x in present]].mean()
-    base = pd.Series(0.0, means.index)
+    # What recuperates more than it draws is stacked below zero.
+    up, down = pd.Series(0.0, means.index), pd.Series(0.0, means.index)
     for vehicle in present:
         name, hue = VEHICLES[vehicle]
-        right.bar(means.index, means[f"{vehicle}_energy_kj"], bottom=base, color=hue, label=name)
-        base = base + means[f"{vehicle}_energy_kj"]
-    for place, (label, total) in enumerate(base.items()):
-        known = label != "idm" and "idm" in base
-        saving = f" ({100 * (total / base['idm'] - 1):+.1f} %)" if known else ""
-        right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
-    right.set_ylim(top=1.2 * base.max())
+        value = means[f"{vehicle}_energy_kj"]
+        right.bar(value.index, value, bottom=up.where(value >= 0, down), color=hue, label=name)
+        up, down = up + value.clip(lower=0.0), down + value.clip(upper=0.0)
+    totals = up + down
+    for place, (label, total) in enumerate(totals.items()):
+        known = label != "idm" and "idm" in totals
+        saving = f" ({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
+        right.annotate(f"{total:.0f}{saving}", (place, up.iloc[place]), ha="center", va="bottom")
+    right.set_ylim(1.2 * down.min(), 1.2 * up.max())
     style(right, "", "energy [kJ per episode]")
     right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
     right.set_title(
