@@ -145,7 +145,7 @@ def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) ->
 
 def _motion(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> StringMotion:
     start = {
-        role: build(node, f"scenario.start.{role}", **resources)
+        role: build(node, f"scenario.start.{role}", role=role, **resources)
         for role, node in scenario.start.items()
         if role in string.names and node is not None and not string.ring
     }

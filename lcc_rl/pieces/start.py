@@ -10,15 +10,18 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.functional.idm import equilibrium_gap
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.controllers import Population, stream_name
 
+GAP, SPEED = stream_id("platoon.gap"), stream_id("platoon.speed")
 
-def draw(start: TensorDictBase, name: str, like: Tensor) -> Tensor:
+
+def draw(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
     """Draw from U[0, 1) for every vehicle of a role, by the seed of its episode."""
     index = torch.arange(like.shape[-2], device=like.device).unsqueeze(-1)
-    return uniform(start.get(SEED).unsqueeze(-2), 0, stream_id(name) + index)
+    return uniform(start.get(SEED).unsqueeze(-2), 0, stream + index)
 
 
 class TimeGapStart:
@@ -30,6 +33,7 @@ class TimeGapStart:
         gap_range: the gap is that times a factor drawn evenly from this range by the episode's
             seed, so that training meets what good driving never does; evaluation takes 1.
         nominal: take the factor 1, as an evaluation does.
+        role: whose vehicles start, by which random numbers are drawn.
 
     Raises:
         ConfigError: if ``standstill_gap`` or the range is not positive, or the time gap negative.
@@ -41,6 +45,7 @@ class TimeGapStart:
         time_gap: float = 1.5,
         gap_range: Sequence[float] = (0.1, 1.5),
         nominal: bool = False,
+        role: str = AUTOMATED,
     ) -> None:
         require_positive("scenario.start", standstill_gap=standstill_gap)
         if time_gap < 0:
@@ -51,11 +56,12 @@ class TimeGapStart:
                 f"{list(gap_range)}"
             )
         self.standstill_gap, self.time_gap = standstill_gap, time_gap
+        self.stream = stream_id(f"{stream_name(role)}.gap_factor")
         self.lowest, self.highest = (1.0, 1.0) if nominal else map(float, gap_range)
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
-        uniformly = draw(start, f"{stream_name(role)}.gap_factor", speed)
+        uniformly = draw(start, self.stream, speed)
         factor = self.lowest + (self.highest - self.lowest) * uniformly
         return speed, factor * (self.standstill_gap + self.time_gap * speed)
 
@@ -121,7 +127,7 @@ class HeadwayStart:
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
-        shift = 2.0 * draw(start, "platoon.gap", speed) - 1.0
+        shift = 2.0 * draw(start, GAP, speed) - 1.0
         gap = self.headway + self.gap_spread * shift
-        shift = 2.0 * draw(start, "platoon.speed", speed) - 1.0
+        shift = 2.0 * draw(start, SPEED, speed) - 1.0
         return (speed + self.speed_spread * shift).clamp(min=0.0), gap
