@@ -82,7 +82,7 @@ def check_ignored(cfg: DictConfig, overrides: Sequence[str], sweep: bool = False
 def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     """Yield options that have no effect on a configuration, and why."""
     scenario = cfg.scenario
-    string = _string(scenario)
+    string = string_of_scenario(scenario)
     ring = scenario.road == RING
     if ring:
         for key in ("data", "split", "leader"):
@@ -108,7 +108,12 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
         yield f"evaluation.{name}", f"it is unused with evaluation.rows={cfg.evaluation.rows}"
 
 
-def _string(scenario: Any) -> VehicleString:
+def string_of_scenario(scenario: Any) -> VehicleString:
+    """Return the string of vehicles that a scenario's node describes.
+
+    Raises:
+        ConfigError: pointing at the place in the pattern where it cannot be read.
+    """
     pattern = scenario.string
     if isinstance(pattern, DictConfig):
         pattern = OmegaConf.to_container(pattern)

@@ -13,11 +13,12 @@ import torch
 from omegaconf import DictConfig
 
 from lcc_rl.config import build, is_sweep, plain
+from lcc_rl.config_checks import string_of_scenario
 from lcc_rl.data.cycles import Case
 from lcc_rl.data.profiles import Profiles, from_records, leader_profiles
 from lcc_rl.data.sources import LoadedEpisodes, find_files
 from lcc_rl.errors import DataError
-from lcc_rl.functional.pattern import RING, VehicleString, parse_string
+from lcc_rl.functional.pattern import RING, VehicleString
 from lcc_rl.pieces.controllers import Population
 
 
@@ -48,9 +49,7 @@ def string_of(cfg: DictConfig) -> VehicleString:
     Raises:
         ConfigError: pointing at the place in the pattern where it cannot be read.
     """
-    string = cfg.scenario.string
-    pattern = plain(string) if isinstance(string, DictConfig) else string
-    return parse_string(pattern, cfg.scenario.road)
+    return string_of_scenario(cfg.scenario)
 
 
 def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:

@@ -10,6 +10,7 @@ import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -110,6 +111,7 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
+@cache  # composed once: an evaluation asks for each several times
 def baseline_controller(name: str) -> Any:
     """Return the node of a baseline's controller.
 

@@ -1,1 +1,1 @@
-"""Function room: all mathematics as pure, differentiable, compilable functions of tensors."""
+"""All mathematics as pure, differentiable, compilable functions of tensors."""

@@ -64,6 +64,7 @@ class Views:
         # Only roles have places; what all vehicles see alike needs none.
         self.drawn = string.drawn and role in string.names
         self.places, self.role = string.places(role), role
+        self.select = selector(self.places, len(string))
         self.keys: list[Key] = []
         # Everything that depends on the string alone is settled here, not at every step.
         self.plan = [self._resolver(name) for name in self.names]
@@ -126,7 +127,7 @@ class Views:
             entry = torch.cat([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
         if index >= 0:
             return gather(entry, entries[index])
-        return selector(self.places, len(self.string))(entry)
+        return self.select(entry)
 
     def sees_all_behind(self) -> bool:
         """Whether every vehicle of the role always has as many vehicles behind as it sees."""
