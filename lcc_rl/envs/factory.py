@@ -19,7 +19,7 @@ from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
-from lcc_rl.pieces import Piece, Places, StringMotion, TotalReward
+from lcc_rl.pieces import CBFFilter, Piece, Places, StringMotion, TotalReward
 from lcc_rl.pieces.controllers import Population
 
 ACTION = (AUTOMATED, "action")
@@ -86,8 +86,9 @@ def build_pieces(
     }
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), resources)
-    pieces += [Places(string), *_drivers(scenario, string, resources)]
-    pieces.append(_motion(scenario, string, resources))
+    drivers = _drivers(scenario, string, resources)
+    pieces += [Places(string), *drivers, _motion(scenario, string, resources)]
+    pieces += [piece.watch() for piece in drivers if isinstance(piece, CBFFilter)]
     pieces += [_build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
     if not string.count(AUTOMATED):
         return pieces

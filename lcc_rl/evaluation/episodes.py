@@ -38,7 +38,7 @@ SAMPLED = (
 )
 KEYS = [("leader", name) for name in ("speed", "acceleration")]
 KEYS += [("vehicles", name) for name in RECORDED]
-INDEX = (AUTOMATED, "index")
+INDEX, PROMISED = (AUTOMATED, "index"), (AUTOMATED, "promised")
 # The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
 Groups = dict[str, dict[str, Tensor]]
 
@@ -94,7 +94,7 @@ def evaluate(
         who = profile[start : start + batch_size], driver[start : start + batch_size]
         env = build_env(cfg, profiles, inputs.population, len(who[0]), 0, device, True)
         given = reset_options(env, *who, seed, count)
-        record, alive = play(env, strategy.policy, given, [*KEYS, INDEX])
+        record, alive = play(env, strategy.policy, given, [*KEYS, INDEX, PROMISED])
         groups = grouped(record, string_of(cfg))
         described = describe(strategy, profiles, inputs.population, *who)
         table = pd.concat([described, measure(groups, alive, time_step)], axis=1)
@@ -124,7 +124,9 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     own = list(string.places(AUTOMATED))
     others = [place for place in range(len(string)) if place not in own]
     for (space, name), entry in record.items():
-        if space == "leader":
+        if (space, name) == PROMISED:
+            groups["cav"][name] = entry
+        elif space == "leader":
             groups["leader"][name] = entry.unsqueeze(-2)
         elif space == "vehicles" and not string.drawn:
             for group, places in (("cav", own), ("hdv", others)):

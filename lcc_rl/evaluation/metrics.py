@@ -57,7 +57,8 @@ def safety_measures(
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
-            each ``[time, *batch, A, 1]``.
+            each ``[time, *batch, A, 1]``; behind a safety filter, for which steps it answers,
+            ``promised``.
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
@@ -77,12 +78,16 @@ def safety_measures(
     def highest(entry: Tensor) -> Tensor:
         return torch.where(alive, entry, -torch.inf).amax(0).amax(-2)
 
-    return {
+    unsafe = series["ttc"] < UNSAFE_TTC
+    found = {
         "min_gap_m": lowest(series["gap"]),
         "min_ttc_s": lowest(series["ttc"]),
         "max_time_gap_s": highest(series["time_gap"]),
-        "share_ttc_unsafe": average(series["ttc"] < UNSAFE_TTC),
+        "share_ttc_unsafe": average(unsafe),
         "share_time_gap_long": average(series["time_gap"] > LONG_TIME_GAP),
         "rms_jerk_mps3": average(series["jerk"] ** 2).sqrt(),
         "duration_s": alive.sum(0).squeeze(-2) * time_step,
     }
+    if "promised" in series:
+        found["share_ttc_unpromised"] = average(unsafe & (series["promised"] == 0.0))
+    return found

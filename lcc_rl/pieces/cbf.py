@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.functional.braking import Braking, least_room, safe_acceleration
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.base import StepTransform
 from lcc_rl.pieces.views import Views
 
+ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
 
 
@@ -25,6 +27,13 @@ class CBFFilter(StepTransform):
     cruise control", CDC 2014), whose solution for one number is a clamp. The vehicle ahead is
     expected to keep its last measured acceleration.
 
+    Comfort rests on that expectation, safety does not: a third bound keeps the vehicle where full
+    braking maintains the first limit even if the vehicle ahead brakes by ``braking_ahead`` until
+    it stands (:mod:`lcc_rl.functional.braking`). A vehicle that starts there has no TTC below τ at
+    any sample as long as the vehicle ahead brakes no harder; which steps that covers, the
+    :class:`Promised` of :meth:`watch` writes. Where a measurement or the command is no number, the
+    filter brakes fully.
+
     Behind a leader at standstill both limits are about the same number, gap / speed, so who comes
     from afar must break one. With a ``full_speed``, ``longest(v)`` is ``time_gap·v`` from there on
     and falls with the square of the speed below: the vehicle is near before its leader stands, and
@@ -38,6 +47,7 @@ class CBFFilter(StepTransform):
         time_to_collision: shortest allowed [s].
         rate: how fast that limit may be approached [1/s].
         margin: gap that counts as contact [m].
+        braking_ahead: hardest braking of the vehicle ahead that is reckoned with [m/s²].
         time_gap: longest allowed [s]; None: no limit.
         time_gap_rate: how fast that limit may be approached [1/s].
         full_speed: speed below which the longest time gap falls in proportion; 0: it does not
@@ -57,6 +67,7 @@ class CBFFilter(StepTransform):
         time_to_collision: float = 4.0,
         rate: float = 3.0,
         margin: float = 0.2,
+        braking_ahead: float = 2.6,
         time_gap: float | None = 2.45,
         time_gap_rate: float = 0.2,
         full_speed: float = 0.0,
@@ -65,8 +76,9 @@ class CBFFilter(StepTransform):
         role: str = AUTOMATED,
     ) -> None:
         where = f"scenario.filters.{role}"
-        limits = {"time_to_collision": time_to_collision, "rate": rate}
+        limits = {"time_to_collision": time_to_collision, "rate": rate, "margin": margin}
         limits |= {"time_gap_rate": time_gap_rate, "max_acceleration": max_acceleration}
+        limits |= {"braking_ahead": braking_ahead}
         require_positive(where, **limits)
         if time_gap is not None:
             require_positive(where, time_gap=time_gap)
@@ -77,9 +89,15 @@ class CBFFilter(StepTransform):
         self.views = Views(string, role, [f"next.command.{role}", *seen])
         super().__init__(self.views.keys, [("command", role)], event_shape=(string.count(role), 1))
         self.time_step, self.max_acceleration = time_step, max_acceleration
-        self.shortest, self.rate, self.margin = time_to_collision, rate, margin
+        self.rate, self.margin = rate, margin
+        self.braking = Braking(max_acceleration, braking_ahead, time_to_collision)
+        self.string, self.role = string, role
         self.longest, self.time_gap_rate = time_gap, time_gap_rate
         self.full_speed, self.least_gap = max(full_speed, SLOWEST), least_gap
+
+    def watch(self) -> Promised:
+        """Return the piece that says for which steps the filter answers."""
+        return Promised(self.braking, self.margin, self.string, self.role)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
@@ -89,15 +107,21 @@ class CBFFilter(StepTransform):
         self, wanted: Tensor, speed: Tensor, gap: Tensor, ahead: Tensor, ahead_acceleration: Tensor
     ) -> Tensor:
         """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²]."""
-        closing = speed - ahead
+        closing, shortest = speed - ahead, self.braking.time_to_collision
+        command = wanted
         if self.longest is not None:
             allowed, slope = self._longest_gap(speed, self.longest)
             least = (-closing - self.time_gap_rate * (allowed - gap)) / slope
-            wanted = torch.maximum(wanted, least)
-        room = gap - self.margin - self.shortest * closing
-        slower = (self.rate * room - closing) / (self.shortest + 0.5 * self.time_step)
-        wanted = torch.minimum(wanted, ahead_acceleration + slower)
-        return wanted.clamp(-self.max_acceleration, self.max_acceleration)
+            command = torch.maximum(command, least)
+        free = gap - self.margin
+        slower = self.rate * (free - shortest * closing) - closing
+        expected = ahead_acceleration + slower / (shortest + 0.5 * self.time_step)
+        safe = safe_acceleration(speed, free, ahead, self.braking, self.time_step)
+        command = torch.minimum(command, torch.minimum(expected, safe))
+        command = command.clamp(-self.max_acceleration, self.max_acceleration)
+        # Any of them that is no number, or infinite, shows in the sum.
+        known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
+        return torch.where(known, command, -self.max_acceleration)
 
     def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
         """Return the longest gap at a speed, and how it grows with the speed."""
@@ -105,3 +129,29 @@ class CBFFilter(StepTransform):
         share = (moving / self.full_speed).clamp(max=1.0)
         slope = time_gap * torch.where(share < 1.0, 2.0 * share, share)
         return (time_gap * share * moving).clamp(min=self.least_gap), slope
+
+
+class Promised(StepTransform):
+    """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
+
+    1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
+    is reckoned with: time-to-collision at its end is then above the filter's limit; else 0.
+
+    Args:
+        braking: what the filter reckons with.
+        margin: gap that counts as contact [m].
+        string: the string of vehicles.
+        role: whose commands are filtered.
+    """
+
+    def __init__(self, braking: Braking, margin: float, string: VehicleString, role: str) -> None:
+        seen = ("self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration")
+        self.views = Views(string, role, seen)
+        super().__init__(self.views.keys, [(role, "promised")], event_shape=(string.count(role), 1))
+        self.braking, self.margin = braking, margin
+
+    def compute(self, *entries: Tensor) -> Tensor:
+        """Return 1 for the steps that are covered."""
+        speed, gap, ahead, acceleration = self.views(*entries)
+        safe = least_room(speed, gap - self.margin, ahead, self.braking) >= -ROUNDING
+        return (safe & (acceleration >= -self.braking.ahead - ROUNDING)).to(speed.dtype)

@@ -25,8 +25,10 @@ def driven(action: float | None, *overrides: str, places: tuple[int, ...] = (0,)
         return td.set(ACTION, drawn if action is None else torch.full(shape, action))
 
     keys = [("vehicles", name) for name in ("ttc", "time_gap", "gap")]
-    record, _ = play(env, policy, None, keys)
-    return {name: entry[..., list(places), :] for (_, name), entry in record.items()}
+    record, _ = play(env, policy, None, [*keys, ("automated", "promised")])
+    promised = record.pop(("automated", "promised"), None)
+    found = {name: entry[..., list(places), :] for (_, name), entry in record.items()}
+    return found if promised is None else {**found, "promised": promised}
 
 
 @pytest.mark.parametrize("action", [1.0, 0.0, -1.0, None])
@@ -48,14 +50,32 @@ def test_specs(variant) -> None:
 def test_every_automated_vehicle_of_a_string_is_filtered() -> None:
     mixed = "scenario.string='human automated human automated*2 human'"
     data = driven(1.0, "+filter=cbf", mixed, places=(1, 3, 4))
-    # Behind a human driver, whose acceleration the filter knows from the step before, an approach
-    # may be a little quicker than it expected.
-    assert data["ttc"].min() >= 3.9
+    assert data["ttc"].min() >= 4.0
+    assert data["promised"].shape == data["ttc"].shape
+    assert data["promised"].mean() > 0.95
     assert data["gap"].min() > 0.1
 
 
 def column(*values: float) -> torch.Tensor:
     return torch.tensor(values).view(-1, 1, 1)
+
+
+@pytest.mark.parametrize("expected", [0.3, 1.0, 2.6])
+def test_the_limit_holds_wherever_it_is_promised(expected) -> None:
+    data = driven(1.0, "+filter=cbf", f"scenario.filters.automated.braking_ahead={expected}")
+    promised = data["promised"] == 1.0
+    assert (data["ttc"][promised] >= 4.0).all()
+    assert promised.all() == (expected == 2.6)  # these leaders brake by up to 1.5 m/s²
+
+
+@pytest.mark.parametrize("place", range(5))
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_the_filter_brakes_when_it_cannot_know(place, value) -> None:
+    given = [column(x, x) for x in (0.5, 8.0, 20.0, 8.0, 0.0)]
+    given[place][0] = value
+    command = CBFFilter(0.1).filtered(*given)
+    assert command[0] == -3.0
+    assert command[1] == 0.5
 
 
 def test_between_the_limits_the_controller_decides() -> None:
@@ -74,7 +94,7 @@ def test_safety_wins() -> None:
 
 def test_a_limit_leaves_the_state_a_gradient() -> None:
     piece = CBFFilter(0.1, rate=1.0)
-    gap = column(5.5).requires_grad_()
+    gap = column(9.0).requires_grad_()
     speed, ahead = column(6.0), column(5.0)
     piece.filtered(column(3.0), speed, gap, ahead, column(0.0)).sum().backward()
     assert gap.grad is not None

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+UNEXPECTED = "scenario.filters.automated.braking_ahead=0.01"
 OPTIONS = {
-    "variant=barrier": "variant=cbf",
-    "+filter=barrier": "+filter=cbf",
+    # The filter reckoned with no braking of the vehicle ahead beyond that measured.
+    "variant=barrier": f"variant=cbf,{UNEXPECTED}",
+    "+filter=barrier": f"+filter=cbf,{UNEXPECTED}",
     "scenario.followers=5": "scenario.string='automated human*5'",
     "scenario.pieces.memory.sources=[leader.speed,cav.gap]": (
         "scenario.pieces.memory.sources=[ahead.speed,self.gap]"
@@ -30,5 +32,5 @@ def renamed(overrides: Sequence[str]) -> list[str]:
         if records and item.startswith("data."):
             continue
         new = OPTIONS.get(item, item)
-        found += new.split(",") if new.count("scenario.controllers") > 1 else [new]
+        found += new.split(",") if ",scenario." in new else [new]
     return found

@@ -1,0 +1,123 @@
+"""How hard a vehicle may accelerate and still keep its distance by braking, whatever comes.
+
+A vehicle is *safe* where full braking keeps ``gap − τ·(v − v_ahead)`` from becoming negative at
+all times to come, while the vehicle ahead brakes as hard as is expected of it until it stands. No
+other behaviour of the vehicle ahead within that bound is worse: its speed and its position are at
+least those of constant braking. Braking fully leads from a safe state to safe states only, so that
+a controller that never leaves them is always able to stay (the backup strategy of control barrier
+functions; the safe distance of Shalev-Shwartz, Shammah and Shashua, "On a formal model of safe and
+scalable self-driving cars", arXiv 1708.06374, without reaction time and for time-to-collision
+instead of contact).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Braking:
+    """Who can brake how hard, and what is to be kept.
+
+    Args:
+        own: largest braking of the vehicle itself, positive [m/s²].
+        ahead: largest braking expected of the vehicle ahead, positive [m/s²].
+        time_to_collision: the shortest allowed τ [s].
+    """
+
+    own: float
+    ahead: float
+    time_to_collision: float
+
+
+def least_room(speed: Tensor, gap: Tensor, speed_ahead: Tensor, braking: Braking) -> Tensor:
+    """Return the least ``gap − τ·(v − v_ahead)`` to come while both vehicles brake fully.
+
+    Args:
+        speed: v, any shape [m/s].
+        gap: gap, less what counts as contact [m].
+        speed_ahead: speed of the vehicle ahead [m/s].
+        braking: how hard both brake, and τ.
+
+    Returns:
+        The room [m]; the state is safe where it is not negative. In continuous time: a vehicle
+        that stops within a step of T comes at most ``own·T²/8`` nearer.
+    """
+    tau, difference = braking.time_to_collision, braking.own - braking.ahead
+    closing = speed - speed_ahead
+    room = gap - tau * closing
+    standing = speed_ahead / braking.ahead  # when the vehicle ahead stands [s]
+    least = torch.minimum(room, _room_at(standing, speed, gap, speed_ahead, braking))
+    if difference > 0.0:  # while both drive, room is convex in time: its least may lie before
+        when = (closing / difference - tau).clamp(min=0.0)
+        before = torch.minimum(least, room - 0.5 * difference * when**2)
+        least = torch.where(when < standing, before, least)
+    return least
+
+
+def _room_at(
+    time: Tensor, speed: Tensor, gap: Tensor, speed_ahead: Tensor, braking: Braking
+) -> Tensor:
+    """Return the least room from the moment on at which the vehicle ahead stands."""
+    tau, own = braking.time_to_collision, braking.own
+    # Who stands before opens the gap again; its room was least before.
+    reached = (speed - own * time).clamp(min=0.0)
+    moving = torch.minimum(time, speed / own)
+    gap = gap + 0.5 * speed_ahead * time - 0.5 * (speed + reached) * moving
+    over = (reached - tau * own).clamp(min=0.0)
+    return gap - tau * reached - 0.5 * over**2 / own
+
+
+def safe_acceleration(
+    speed: Tensor, gap: Tensor, speed_ahead: Tensor, braking: Braking, time_step: float
+) -> Tensor:
+    """Return the largest acceleration of one step after which the vehicle is safe.
+
+    The step is the simulator's (A18): the acceleration is held for T, gaps follow the trapezoidal
+    rule. During the step, too, the vehicle ahead brakes as hard as is expected of it. Full braking
+    is safe in every safe state, so that what comes out is at least ``−own`` there.
+
+    Args:
+        speed: v, any shape [m/s].
+        gap: gap, less what counts as contact [m].
+        speed_ahead: speed of the vehicle ahead [m/s].
+        braking: how hard both brake, and τ.
+        time_step: T [s].
+
+    Returns:
+        The acceleration, not bounded [m/s²].
+    """
+    tau, difference = braking.time_to_collision, braking.own - braking.ahead
+    slowest = (speed_ahead - braking.ahead * time_step).clamp(min=0.0)
+    # After the step with acceleration a: closing + a·T, room − slope·T·a.
+    closing, slope = speed - slowest, tau + 0.5 * time_step
+    gap = gap + time_step * (0.5 * (speed_ahead + slowest) - speed)
+    room = gap - tau * closing
+    # And once the vehicle ahead stands, likewise: then closing is the speed itself.
+    standing = slowest / braking.ahead
+    left = speed - braking.own * standing
+    gap = gap + standing * (0.5 * slowest - 0.5 * (speed + left))
+    end = _largest(gap - tau * left, left, slope + standing, braking.own, tau)
+    bound = torch.minimum(room / slope, end)
+    if difference > 0.0:
+        before = _largest(room, closing, slope, difference, tau)
+        early = closing + bound < difference * (tau + standing)
+        bound = torch.where(early, torch.minimum(bound, before), bound)
+    return bound / time_step
+
+
+def _largest(
+    room: Tensor, closing: Tensor, slope: Tensor | float, rate: float, tau: float
+) -> Tensor:
+    """Return the largest change x of speed for which the room never becomes negative.
+
+    With x the room is ``room − slope·x``. While closing falls at ``rate`` it falls by a further
+    ``(closing + x − τ·rate)²/(2·rate)``, where that bracket is positive.
+    """
+    over = closing - tau * rate
+    total = room + slope * over
+    root = torch.sqrt(slope**2 + 2.0 * total.clamp(min=0.0) / rate)
+    return 2.0 * total / (slope + root) - over
