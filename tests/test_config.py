@@ -221,6 +221,7 @@ PARTIAL = {
 WITH = {
     "controller": ["variant=hcfs"],
     "gains": ["variant=cacc"],
+    "plausible": ["data=ngsim", "data.path=x"],
     "leader": ["variant=ddpg"],
     "data/ngsim": ["data.path=x"],
     "data/episodes": ["data.path=x"],
@@ -231,6 +232,7 @@ WITH = {
 TYPED = {
     "filter": "+filter",
     "knowledge": "+knowledge",
+    "plausible": "plausible@data.plausible",
     "controller": "controller@scenario.controllers.automated",
 }
 CHOICES = [name.removesuffix(".yaml") for name in files() if "/" in name]

@@ -61,7 +61,10 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     with atomic_path(folder / OVERRIDES) as temporary:
         temporary.write_text(json.dumps(overrides))
     drivers = calibrate_once(cfg, folder)
-    inputs = {"data": _episodes(folder), "drivers": {"_target_": BOOTSTRAP, "path": str(drivers)}}
+    inputs = {
+        "data": _episodes(cfg, folder),
+        "drivers": {"_target_": BOOTSTRAP, "path": str(drivers)},
+    }
     for part in (*parts.values(), final):
         OmegaConf.set_struct(part, False)
         part.update(inputs)
@@ -76,9 +79,10 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     return episodes
 
 
-def _episodes(folder: Path) -> dict[str, str]:
+def _episodes(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Return the node of the trajectories that a job keeps in its folder."""
-    return {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
+    node = {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
+    return node | {key: plain(cfg.data[key]) for key in ("plausible",) if cfg.data.get(key)}
 
 
 def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
@@ -92,7 +96,7 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
     if not drivers.exists():
         own = OmegaConf.create(plain(cfg))
         assert isinstance(own, DictConfig)
-        own.data = _episodes(folder)
+        own.data = _episodes(cfg, folder)
         calibration.run(own, drivers.parent)
     return drivers
 

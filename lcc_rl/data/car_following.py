@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.data.episodes import PLAUSIBLE_SPEED
 from lcc_rl.data.places import find_leaders
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
@@ -239,10 +238,8 @@ def _criteria(
                 "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
                 "there is nothing to filter on and every vehicle stays"
             )
-    speed = samples["speed_mps"].to_numpy()
-    plausible = (speed >= 0) & (speed <= PLAUSIBLE_SPEED)
-    name = f"speeds of 0 to {PLAUSIBLE_SPEED:g} m/s"
-    yield name, pairs.always(plausible[pairs.follower] & plausible[pairs.leader])
+    forward = samples["speed_mps"].to_numpy() >= 0
+    yield "speeds of at least 0", pairs.always(forward[pairs.follower] & forward[pairs.leader])
     if criteria.min_gap_m is not None:
         yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.always(pairs.gap >= criteria.min_gap_m)
     if criteria.max_gap_m is not None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, Split, at_step, from_records, leader_profiles
 from lcc_rl.data.speed_records import read_speed_record, resample
 from lcc_rl.errors import ConfigError, DataError, unknown_name
@@ -58,6 +59,7 @@ def stretch(
     from_s: float | None = None,
     to_s: float | None = None,
     name: str | None = None,
+    plausible: Plausible | None = None,
 ) -> Profiles:
     """Cut a stretch out of a record, as one profile.
 
@@ -68,6 +70,7 @@ def stretch(
         from_s: beginning within the record, by its own time [s]; None for its start.
         to_s: end [s]; None for its end.
         name: of the profile; None makes one from the path and the times.
+        plausible: see :func:`read_speed_record`.
 
     Raises:
         DataError: if the record cannot be read or does not cover the stretch.
@@ -75,7 +78,7 @@ def stretch(
     """
     if not scale > 0:
         raise ConfigError(f"leader: scale of {path} must be positive, got {scale}")
-    time, speed = read_speed_record(path)
+    time, speed = read_speed_record(path, plausible)
     begin = time[0] if from_s is None else float(from_s)
     end = time[-1] if to_s is None else float(to_s)
     if not begin < end:
@@ -117,6 +120,7 @@ class RecordLeaders:
         least_variation: evaluation windows whose total speed change is below this are left out
             [m/s].
         path: default path of the stretches.
+        plausible: thresholds of every sample, before scaling; None for the defaults.
     """
 
     training: Mapping[str, Any]
@@ -125,6 +129,7 @@ class RecordLeaders:
     full_length: Mapping[str, Any] | None = None
     least_variation: float = 2.0
     path: str | None = None
+    plausible: Plausible | None = None
 
     def load(self, time_step: float, horizon: int, followers: int) -> Leaders:
         """Read everything.
@@ -178,7 +183,7 @@ class RecordLeaders:
         path = settings.get("path") or self.path
         if path is None:
             raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
-        return {**settings, "path": path}
+        return {**settings, "path": path, "plausible": self.plausible}
 
 
 @dataclass(frozen=True)

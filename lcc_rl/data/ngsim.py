@@ -15,11 +15,14 @@ from lcc_rl.data.ngsim_blocks import read_blocks
 from lcc_rl.data.ngsim_columns import CollectedRows
 from lcc_rl.data.ngsim_table import sorted_table
 from lcc_rl.data.trajectories import ReadReport, Trajectories
+from lcc_rl.data.units import check_units, factor
 from lcc_rl.errors import DataError
 
 
 def read_ngsim(
-    path: str | Path | Sequence[str | Path], location: str | None = None
+    path: str | Path | Sequence[str | Path],
+    location: str | None = None,
+    units: str = "feet",
 ) -> Trajectories:
     """Read one or several NGSIM files, of any published layout, into SI.
 
@@ -37,15 +40,19 @@ def read_ngsim(
     Args:
         path: file or files, plain or gzipped.
         location: keep only rows of this Location (such as ``i-80``), whatever its letter case.
+        units: what the files are in: ``feet``, as published, or ``metres``.
 
     Raises:
         DataError: if a file is missing, damaged, of no known layout, or a needed cell is blank or
-            not a valid number; it names the file, the line and the column.
+            not a valid number; it names the file, the line and the column. Or if the vehicles
+            are too short or long for these units.
+        ConfigError: if the units are unknown.
     """
     paths = [path] if isinstance(path, (str, Path)) else list(path)
     if not paths:
         raise DataError("no NGSIM file was named; expected at least one path")
-    rows = CollectedRows(ReadReport(files=[str(name) for name in paths]))
+    factor(units)
+    rows = CollectedRows(ReadReport(files=[str(name) for name in paths]), units)
     wanted = None if location is None else location.strip().lower()
     for name in paths:
         for block in read_blocks(name):
@@ -56,4 +63,6 @@ def read_ngsim(
             f"{', '.join(rows.report.files)}: no row has Location {location!r}; "
             f"the locations found are {found}"
         )
-    return Trajectories(sorted_table(rows), rows.report)
+    samples = sorted_table(rows)
+    check_units(samples, units, rows.report.files)
+    return Trajectories(samples, rows.report)

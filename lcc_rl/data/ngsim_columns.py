@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lcc_rl.data.ngsim_blocks import Block
 from lcc_rl.data.ngsim_recordings import Group
 from lcc_rl.data.trajectories import ReadReport
-from lcc_rl.data.units import FOOT
+from lcc_rl.data.units import factor
 from lcc_rl.errors import DataError
 
 LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
@@ -35,6 +35,7 @@ class CollectedRows:
 
     Args:
         report: counts, updated with every block.
+        units: what lengths, speeds and accelerations are in: ``feet`` or ``metres``.
         chunks: the columns of each block; ``group`` is an index into ``groups``.
         groups: index of every (file, location, time of frame 0).
         rows_of: rows of each group.
@@ -44,6 +45,7 @@ class CollectedRows:
     """
 
     report: ReadReport
+    units: str = "feet"
     chunks: list[Columns] = field(default_factory=list)
     groups: dict[Group, int] = field(default_factory=dict)
     rows_of: list[int] = field(default_factory=list)
@@ -91,17 +93,17 @@ class CollectedRows:
         self.blank_classes += int((kinds < 0).sum())
         headway = np.zeros(len(block), dtype=np.float32)
         if block.has("Space_Headway"):
-            headway = _metres(block, "Space_Headway", "feet", blank=0.0)
+            headway = self._metres(block, "Space_Headway", blank=0.0)
         columns: Columns = {
             "group": self._groups(block, frame, names, places),
             "vehicle": vehicle,
             "frame": frame.astype(np.int32),
-            "position_m": _metres(block, "Local_Y", "feet"),
+            "position_m": self._metres(block, "Local_Y"),
             "lane": block.integers("Lane_ID", -INT16, INT16).astype(np.int16),
-            "length_m": _metres(block, "v_Length", "feet"),
+            "length_m": self._metres(block, "v_Length"),
             "vehicle_class": np.maximum(kinds, 0).astype(np.int8),
-            "speed_mps": _metres(block, "v_Vel", "ft/s"),
-            "acceleration_mps2": _metres(block, "v_Acc", "ft/s²"),
+            "speed_mps": self._metres(block, "v_Vel", "/s"),
+            "acceleration_mps2": self._metres(block, "v_Acc", "/s²"),
             "preceding": preceding,
             "space_headway_m": headway,
         }
@@ -129,17 +131,19 @@ class CollectedRows:
             self.rows_of[codes[-1]] += int(rows)
         return np.array(codes, dtype=np.int32)[inverse]
 
+    def _metres(
+        self, block: Block, name: str, per: str = "", blank: float | None = None
+    ) -> NDArray[np.float32]:
+        """A column in SI; numbers too large to be real would overflow to infinity."""
+        unit = f"{self.units}{per}"
+        values = block.numbers(name, unit, blank)
+        large = np.abs(values) > 1e9
+        if large.any():
+            block.fail(int(np.argmax(large)), name, f"{unit}, at most 1e9 in size")
+        return (values * factor(self.units)).astype(np.float32)
+
     def _note_filled(self, name: str, values: NDArray) -> None:
         self.filled[name] = self.filled.get(name, False) or bool(values.any())
-
-
-def _metres(block: Block, name: str, unit: str, blank: float | None = None) -> NDArray[np.float32]:
-    """A column in SI; numbers too large to be real would overflow to infinity."""
-    values = block.numbers(name, unit, blank)
-    large = np.abs(values) > 1e9
-    if large.any():
-        block.fail(int(np.argmax(large)), name, f"{unit}, at most 1e9 in size")
-    return (values * FOOT).astype(np.float32)
 
 
 def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int64]) -> NDArray[np.int64]:

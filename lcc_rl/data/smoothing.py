@@ -3,6 +3,11 @@
 Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Per stretch without a
 missing frame the positions are smoothed, speed and acceleration are their derivatives, and space
 headways are derived again. Smoothing is off unless a configuration names one of these classes.
+
+At the ends of a stretch a window is one-sided or short: measured on noisy positions of known
+motion, the error of the speed is there 3 times that of the interior with Savitzky–Golay and 16
+times with the exponential average, that of the acceleration 6 and 21 times. Rows whose window is
+not whole are therefore left out, 0.7 s (1.7 s) at each end by default; shorter stretches entirely.
 """
 
 from __future__ import annotations
@@ -12,12 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 from scipy.signal import savgol_filter
 
 from lcc_rl.data.places import find_leaders
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
 
@@ -28,18 +34,29 @@ class Smoothing(ABC):
     def __call__(self, trajectories: Trajectories) -> Trajectories:
         """Return smoothed trajectories; the given ones are not changed.
 
-        Negative smoothed speeds, as at standstill, become zero. Stretches too short to smooth keep
-        their published values. Both are counted in the report's notes.
+        Rows within ``margin`` of an end of a stretch are left out. Negative smoothed speeds, as at
+        standstill, become zero. Both are counted in the report.
+
+        Raises:
+            DataError: if no stretch is long enough.
         """
-        samples = trajectories.samples.copy(deep=False)
+        samples = trajectories.samples
         starts, lengths = stretches(samples["segment"].to_numpy())
-        long = np.repeat(lengths >= self.shortest, lengths)
-        kinematics = self.smooth(samples["position_m"].to_numpy(dtype=float), starts, lengths)
-        backward = long & (kinematics[1] < 0.0)
-        kinematics[1][backward] = 0.0
+        position = samples["position_m"].to_numpy(dtype=float)
+        kinematics = self.smooth(position)
+        place = np.arange(len(samples)) - np.repeat(starts, lengths)
+        inner = np.minimum(place, np.repeat(lengths, lengths) - 1 - place) >= self.margin
+        if not inner.any():
+            raise DataError(
+                f"{', '.join(trajectories.report.files)}: no stretch is long enough for {self}: "
+                f"the longest has {lengths.max()} frames, {2 * self.margin + 1} are needed"
+            )
+        samples = samples[inner].reset_index(drop=True)
         names = ("position_m", "speed_mps", "acceleration_mps2")
         for name, smoothed in zip(names, kinematics, strict=True):
-            samples[name] = np.where(long, smoothed, samples[name]).astype(np.float32)
+            samples[name] = smoothed[inner].astype(np.float32)
+        backward = samples["speed_mps"] < 0.0
+        samples.loc[backward, "speed_mps"] = 0.0
         leader = find_leaders(
             samples["recording"].cat.codes.to_numpy(),
             samples["vehicle"].to_numpy(),
@@ -50,30 +67,28 @@ class Smoothing(ABC):
         headway = np.where(leader >= 0, position[leader] - position, samples["space_headway_m"])
         samples["space_headway_m"] = headway.astype(np.float32)
         note = (
-            f"smoothed with {self}: {int(backward.sum()):,} speeds below zero became zero; "
-            f"{int((lengths < self.shortest).sum()):,} stretches were too short and stay as is"
+            f"smoothed with {self}: {int(backward.sum()):,} speeds below zero became zero; left "
+            f"out {int((~inner).sum()):,} rows within {self.margin * FRAME:.1f} s of the end of a "
+            f"stretch, {int((lengths <= 2 * self.margin).sum()):,} stretches entirely"
         )
         report = replace(trajectories.report, notes=[*trajectories.report.notes, note])
         return Trajectories(samples, report)
 
     @property
     @abstractmethod
-    def shortest(self) -> int:
-        """Fewest samples of a stretch that can be smoothed."""
+    def margin(self) -> int:
+        """Rows at each end of a stretch whose window is not whole."""
 
     @abstractmethod
-    def smooth(
-        self, position: Array, starts: NDArray[np.intp], lengths: NDArray[np.intp]
-    ) -> tuple[Array, Array, Array]:
-        """Smooth stretches that lie one after another.
+    def smooth(self, position: Array) -> tuple[Array, Array, Array]:
+        """Smooth stretches that lie one after another, as if they were one.
 
         Args:
             position: positions ``[rows]`` [m].
-            starts, lengths: first row and number of rows of each stretch.
 
         Returns:
-            Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; values in
-            stretches shorter than ``shortest`` are not used.
+            Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; values within
+            ``margin`` rows of an end are not used.
         """
 
 
@@ -83,7 +98,6 @@ class SavitzkyGolay(Smoothing):
 
     Args:
         window_s: length of the window [s]; an odd number of frames is taken, at least this long.
-            A shorter stretch is fitted within its own length.
         order: order of the polynomial, at least 2 for an acceleration.
 
     Raises:
@@ -103,32 +117,27 @@ class SavitzkyGolay(Smoothing):
             )
 
     @property
-    def shortest(self) -> int:
-        return odd(self.order + 1)
+    def window(self) -> int:
+        """Frames of the window."""
+        return round(self.window_s / FRAME) | 1
 
-    def smooth(
-        self, position: Array, starts: NDArray[np.intp], lengths: NDArray[np.intp]
-    ) -> tuple[Array, Array, Array]:
-        window = odd(round(self.window_s / FRAME))
-        result = (position.copy(), np.zeros_like(position), np.zeros_like(position))
-        for start, length in zip(starts, lengths, strict=True):
-            if length < self.shortest:
-                continue
-            part = slice(start, start + length)
-            inside = min(window, odd(length - 1))  # of a short stretch, its largest odd part
-            for order, values in enumerate(result):
-                values[part] = savgol_filter(
-                    position[part], inside, self.order, deriv=order, delta=FRAME
-                )
-        return result
+    @property
+    def margin(self) -> int:
+        return self.window // 2
+
+    def smooth(self, position: Array) -> tuple[Array, Array, Array]:
+        settings = {"polyorder": self.order, "delta": FRAME, "mode": "nearest"}
+        smoothed, speed, acceleration = (
+            savgol_filter(position, self.window, deriv=order, **settings) for order in range(3)
+        )
+        return smoothed, speed, acceleration
 
 
 @dataclass(frozen=True)
 class ExponentialAverage(Smoothing):
     """Symmetric exponential moving average of Thiemann, Treiber and Kesting (2008).
 
-    A sample k frames away weighs exp(−k·0.1 s/width), up to three widths away; towards the ends of
-    a stretch the window shrinks on both sides alike, so that it stays symmetric. Speed and
+    A sample k frames away weighs exp(−k·0.1 s/width), up to three widths away. Speed and
     acceleration are central differences of the smoothed positions and of these speeds.
 
     Args:
@@ -145,39 +154,23 @@ class ExponentialAverage(Smoothing):
             raise ConfigError(f"smoothing: 'width_s' must be 0 to 100 s, got {self.width_s}")
 
     @property
-    def shortest(self) -> int:
-        return 3
+    def reach(self) -> int:
+        """Frames of the kernel on each side."""
+        return round(3.0 * self.width_s / FRAME)
 
-    def smooth(
-        self, position: Array, starts: NDArray[np.intp], lengths: NDArray[np.intp]
-    ) -> tuple[Array, Array, Array]:
-        place = np.arange(len(position)) - np.repeat(starts, lengths)
-        reach = np.minimum(place, np.repeat(lengths, lengths) - 1 - place)
-        total, weights = position.copy(), np.ones_like(position)
-        for away in range(1, round(3.0 * self.width_s / FRAME) + 1):
-            rows = np.flatnonzero(reach >= away)  # never leaves the stretch
-            weight = np.exp(-away * FRAME / self.width_s)
-            total[rows] += weight * (position[rows - away] + position[rows + away])
-            weights[rows] += 2.0 * weight
-        smoothed = total / weights
-        speed = derivative(smoothed, starts, lengths)
-        return smoothed, speed, derivative(speed, starts, lengths)
+    @property
+    def margin(self) -> int:
+        return self.reach + 2  # one more for each difference
 
-
-def derivative(values: Array, starts: NDArray[np.intp], lengths: NDArray[np.intp]) -> Array:
-    """Central differences within stretches, one-sided at their ends; 0 in one of a single row."""
-    row = np.arange(len(values))
-    before = np.maximum(row - 1, np.repeat(starts, lengths))
-    after = np.minimum(row + 1, np.repeat(starts + lengths - 1, lengths))
-    return (values[after] - values[before]) / (FRAME * np.maximum(after - before, 1))
+    def smooth(self, position: Array) -> tuple[Array, Array, Array]:
+        kernel = np.exp(-np.abs(np.arange(-self.reach, self.reach + 1)) * FRAME / self.width_s)
+        smoothed = correlate1d(position, kernel / kernel.sum(), mode="nearest")
+        central = np.array([-0.5, 0.0, 0.5]) / FRAME
+        speed = correlate1d(smoothed, central, mode="nearest")
+        return smoothed, speed, correlate1d(speed, central, mode="nearest")
 
 
 def stretches(segment: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First row and number of rows of each stretch of equal values."""
     starts = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))
     return starts, np.diff(np.append(starts, len(segment)))
-
-
-def odd(count: int) -> int:
-    """The smallest odd number that is not below ``count``."""
-    return int(count) | 1

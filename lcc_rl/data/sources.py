@@ -12,6 +12,7 @@ import pandas as pd
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import ConfigError, DataError
 
@@ -38,32 +39,40 @@ class NgsimSource:
         location: keep only this Location (``i-80``, ``us-101`` …) of a file that has several.
         smoothing: applied to the trajectories, see :mod:`lcc_rl.data.smoothing`; None for none.
         criteria: what counts as an episode; None for the defaults.
+        units: what the files are in, ``feet`` or ``metres``.
+        plausible: thresholds of what is left out; None for the defaults.
     """
 
     path: str | Path | Sequence[str]
     location: str | None = None
     smoothing: Callable[[Trajectories], Trajectories] | None = None
     criteria: Criteria | None = None
+    units: str = "feet"
+    plausible: Plausible | None = None
 
     def load(self) -> LoadedEpisodes:
         """Read, smooth where asked, and extract.
 
         Raises:
-            DataError: if a file is missing or not what was expected, or no episode is left.
+            DataError: if a file is missing or not what was expected, no episode is left, or more
+                are implausible than ``plausible`` allows.
         """
         if self.smoothing is not None and not callable(self.smoothing):
             raise ConfigError(
                 f"data.smoothing must be null or a node with _target_, got {self.smoothing!r}"
             )
         files = find_files(self.path)
-        trajectories = read_ngsim(files, self.location)
+        trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
+        source = ", ".join(files)
         try:
             episodes, report = extract(trajectories, self.criteria or Criteria())
         except DataError as error:
-            raise DataError(f"{', '.join(files)}: {error}") from error
-        return LoadedEpisodes(episodes, [*trajectories.report.lines(), *report.lines()])
+            raise DataError(f"{source}: {error}") from error
+        remedy = "" if self.smoothing else f", smooth it ({SMOOTHING}),"
+        lines = [*trajectories.report.lines(), *report.lines()]
+        return _plausible(self.plausible, episodes, source, lines, remedy)
 
 
 @dataclass(frozen=True)
@@ -72,22 +81,37 @@ class EpisodesSource:
 
     Args:
         path: see :func:`lcc_rl.data.episodes.read_episodes`.
+        plausible: thresholds of what is left out; None for the defaults.
     """
 
     path: str
+    plausible: Plausible | None = None
 
     def load(self) -> LoadedEpisodes:
         """Read and validate.
 
         Raises:
-            DataError: if the file is missing or not a valid episode table.
+            DataError: if the file is missing or not a valid episode table, or more episodes are
+                implausible than ``plausible`` allows.
         """
         path = Path(self.path).expanduser()
         episodes = read_episodes(path)
         count = episodes["episode"].nunique()
-        return LoadedEpisodes(
-            episodes, [f"read {count:,} episodes, {len(episodes):,} rows, {path}"]
-        )
+        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}"]
+        return _plausible(self.plausible, episodes, str(path), lines)
+
+
+def _plausible(
+    limits: Plausible | None,
+    episodes: pd.DataFrame,
+    source: str,
+    lines: list[str],
+    remedy: str = "",
+) -> LoadedEpisodes:
+    """Leave out implausible episodes, and say so."""
+    place = pair_place(episodes)
+    kept, said = (limits or Plausible()).select(episodes, source, place, remedy=remedy)
+    return LoadedEpisodes(kept, [*lines, *said])
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:

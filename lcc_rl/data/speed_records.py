@@ -11,10 +11,12 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 import lcc_rl.assets
+from lcc_rl.data.plausible import Plausible
 from lcc_rl.errors import DataError
 
 CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
 TIME, SPEED = "time_s", "speed_mps"
+LEADER = "leader.plausible"  # where a configuration has the thresholds of speed records
 
 
 def shipped_cycles() -> list[str]:
@@ -22,18 +24,22 @@ def shipped_cycles() -> list[str]:
     return sorted(path.stem for path in CYCLES.glob("*.csv"))
 
 
-def read_speed_record(path: str) -> tuple[np.ndarray, np.ndarray]:
+def read_speed_record(
+    path: str, plausible: Plausible | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Read a speed record of any sampling rate.
 
     Args:
         path: name of a shipped cycle (``udds``, ``us06``, ``wltc_3b``, ``hwfet``), or a .csv or
             .parquet file with the columns ``time_s`` [s] and ``speed_mps`` [m/s].
+        plausible: thresholds that every sample must keep; None for the defaults.
 
     Returns:
         Time [s], increasing, and speed [m/s], both ``[samples]``, float64.
 
     Raises:
-        DataError: naming the file and the row or column at fault.
+        DataError: naming the file and the row or column at fault, also where a number is not
+            malformed but implausible.
     """
     file = Path(path).expanduser()
     if not file.suffix and path in shipped_cycles():
@@ -46,7 +52,11 @@ def read_speed_record(path: str) -> tuple[np.ndarray, np.ndarray]:
         frame = pd.read_parquet(file) if file.suffix == ".parquet" else pd.read_csv(file)
     except (ValueError, OSError) as error:
         raise DataError(f"{file}: not a readable table: {error}") from error
-    return _checked(frame, str(file))
+    time, speed = _checked(frame, str(file))
+    record = pd.DataFrame({"episode": 0, TIME: time, SPEED: speed})
+    limits = plausible or Plausible()
+    limits.select(record, str(file), lambda row, name: f"data row {row + 1}, {name}", LEADER)
+    return time, speed
 
 
 def _checked(frame: pd.DataFrame, file: str) -> tuple[np.ndarray, np.ndarray]:

@@ -89,10 +89,6 @@ WRONG: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "large episode": (change(1, "episode", 2.0**40), "row 1, column 'episode'"),
     "blank recording": (change(1, "recording", None), "row 1, column 'recording' is blank"),
     "negative speed": (change(7, "leader_speed_mps", -0.1), "row 7, .*'leader_speed_mps' is negat"),
-    "km/h": (
-        lambda frame: frame.assign(follower_speed_mps=frame["follower_speed_mps"] * 3.6),
-        r"row 0, column 'follower_speed_mps' holds 72 m/s; .*km/h or ft/s",
-    ),
     "negative length": (change(0, "leader_length_m", -5.0), "row 0, column 'leader_length_m'"),
     "backwards": (change(2, "time_s", 0.05), "row 2, column 'time_s' is -0.05 s after"),
     "gap in time": (change(7, "time_s", 51.7), "row 7, column 'time_s' is .* expected a constant"),

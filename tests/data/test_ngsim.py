@@ -314,7 +314,7 @@ MALFORMED: dict[str, tuple[str | bytes, str]] = {
     ),
     "renamed column": (renamed("v_Vel", "v_Velo"), "no column 'v_Vel'; the nearest is 'v_Velo'"),
     "column twice": (renamed("v_Width", "V LENGTH"), "has column 'v_Length' twice"),
-    "not a number": (changed(v_Vel="abc"), r"line 4, column 'v_Vel' holds 'abc'; expected ft/s"),
+    "not a number": (changed(v_Vel="abc"), r"line 4, column 'v_Vel' holds 'abc'; expected feet/s"),
     "NaN": (changed(Local_Y="NaN"), r"line 4, column 'Local_Y' is blank or NaN; expected feet"),
     "infinite": (changed(v_Acc="inf"), r"line 4, column 'v_Acc' holds 'inf'"),
     "huge": (changed(Local_Y="1e30"), r"line 4, column 'Local_Y' holds '1e30'"),

@@ -138,7 +138,11 @@ class Study(BaseStudy):
         given = {root_key(item) for item in self.overrides}
         data = f"data.path={quoted(self.folder / TRAJECTORIES)}"
         drivers = f"drivers.path={quoted(self.folder / DRIVERS)}"
-        shared = [item for item in self.overrides if root_key(item) not in OF_CALIBRATION]
+        shared = [
+            item
+            for item in self.overrides
+            if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
+        ]
         return [
             f"experiment=[{','.join([*filter(None, [self.recipe]), *recipes])}]",
             f"variant={variant}",
