@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import http.client
 import io
 import json
@@ -21,7 +22,7 @@ import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 BASE_URL = "https://data.transportation.gov"
@@ -44,12 +45,14 @@ class State:
         total: rows that the portal counts.
         rows: rows in the partial file.
         size: bytes of the partial file up to the last whole page.
+        firsts: checksums of the first row of every page.
     """
 
     query: str
     total: int
     rows: int = 0
     size: int = 0
+    firsts: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -151,9 +154,11 @@ def fetch(portal: Portal, output: Path, page_rows: int = PAGE_ROWS) -> int:
         file.seek(state.size)
         while state.rows < total:
             page = portal.page(state.rows, min(page_rows, total - state.rows))
-            rows, text = _rows_of(page, header=state.rows == 0, source=portal.query)
+            rows, header, text = _rows_of(page, f"{portal.query}, from row {state.rows:,}")
             if rows == 0:
                 break
+            _check_new(text, state, portal)
+            text = text if state.rows else header + text
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
@@ -186,8 +191,19 @@ def _save(state: State, path: Path) -> None:
     os.replace(temporary, path)
 
 
-def _rows_of(page: bytes, header: bool, source: str) -> tuple[int, bytes]:
-    """Number of rows of a page and its text, with or without the header line."""
+def _check_new(text: bytes, state: State, portal: Portal) -> None:
+    """Check that a page does not begin as an earlier one does, and remember its first row."""
+    first = hashlib.sha256(text.partition(b"\n")[0]).hexdigest()[:16]
+    if first in state.firsts:
+        raise FetchError(
+            f"{portal.query}: the page from row {state.rows:,} begins like page "
+            f"{state.firsts.index(first) + 1}: the server ignores $offset or repeats rows"
+        )
+    state.firsts.append(first)
+
+
+def _rows_of(page: bytes, source: str) -> tuple[int, bytes, bytes]:
+    """Number of rows of a page, its header line and its rows."""
     text = page.removeprefix(b"\xef\xbb\xbf")
     first, _, body = text.partition(b"\n")
     names = first.decode("utf-8", "replace").lower().replace('"', "")
@@ -195,8 +211,11 @@ def _rows_of(page: bytes, header: bool, source: str) -> tuple[int, bytes]:
         raise FetchError(f"{source}: the answer is not the NGSIM table; it begins {text[:200]!r}")
     if body and not body.endswith(b"\n"):
         body += b"\n"
-    rows = sum(1 for row in csv.reader(io.StringIO(body.decode("utf-8"))) if row)
-    return rows, (first + b"\n" + body) if header else body
+    try:
+        rows = sum(1 for row in csv.reader(io.StringIO(body.decode("utf-8"))) if row)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FetchError(f"{source}: the answer is not a CSV table: {error}") from error
+    return rows, first + b"\n", body
 
 
 def _progress(state: State, fetched: int, seconds: float) -> str:

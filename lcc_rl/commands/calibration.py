@@ -59,7 +59,7 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
     seconds = perf_counter() - start
     save_config(cfg, folder)
     _say(console, result.report)
-    _write(result, cfg, folder)
+    _write(result, dataset.report, cfg, folder)
     console.print(_summary(result.drivers))
     _say(console, [f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
@@ -82,12 +82,12 @@ def _calibrate(
         return calibrator(episodes, seed=seed, device=device, progress=show)
 
 
-def _write(result: Calibration, cfg: DictConfig, folder: Path) -> None:
+def _write(result: Calibration, read: list[str], cfg: DictConfig, folder: Path) -> None:
     settings = OmegaConf.masked_copy(cfg, ["data", "calibration", "seed"])
     metadata = {
         "config": json.dumps(plain(settings), default=str),
         "config_hash": config_hash(settings),
-        "report": "\n".join(result.report),
+        "report": "\n".join([*read, *result.report]),
     }
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
     save(calibration_figure(result.drivers), folder / "calibration.png")

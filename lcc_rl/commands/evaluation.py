@@ -29,7 +29,7 @@ from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
 from lcc_rl.results.string_figures import write_platoon_figures
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
-from lcc_rl.results.tables import as_rich, show, summary
+from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
 from lcc_rl.runs.cli import prepare_torch
 
 log = logging.getLogger("lcc_rl")
@@ -112,6 +112,8 @@ def evaluate_and_write(
     write_parquet(steps, folder / STEPS, metadata)
     # Last: who finds it finds a finished run.
     write_parquet(rows, folder / EPISODES, metadata)
+    for line in leader_too_fast(rows):
+        log.warning(line)
     if not quiet:
         _show(rows, cfg, inputs)
     return rows

@@ -18,6 +18,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
+from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.runs import load_config, load_policy, save_config, save_policy
@@ -133,5 +134,8 @@ def objective(cfg: DictConfig, rows: pd.DataFrame) -> float | list[float]:
     """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
     # By its rows: a resumed run is not of the variant that the command line composed.
     table = case_table(rows, WINDOWS) if "follower" in rows else summary(rows)
-    values = [float(table.iloc[-1][name]) for name in objectives(cfg)]
+    found = table.iloc[-1].to_dict()
+    if pd.isna(found.get("min_ttc_s")):
+        found["min_ttc_s"] = NEVER  # no gap ever closed; a sweeper needs a number
+    values = [float(found[name]) for name in objectives(cfg)]
     return values[0] if isinstance(cfg.objective, str) else values

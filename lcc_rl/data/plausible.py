@@ -101,7 +101,7 @@ class Plausible:
             row = int(np.argmax(fault.wrong & np.repeat(bad, np.diff([*starts, len(table)]))))
             limit = f"{setting}.{fault.setting}={getattr(self, fault.setting):g}"
             said = f"{place(row, fault.column)} {fault.words.format(fault.values[row])}, {limit}"
-            lines.append(f"left out {int(bad.sum()):,} implausible records, the first: {said}")
+            lines.append(f"left out {int(bad.sum()):,} implausible record(s), the first: {said}")
             rough = remedy if fault.setting == "max_acceleration" else ""
             told = told or f"{said}; mend the file{rough} or raise that threshold"
             keep &= ~bad

@@ -24,6 +24,14 @@ DEFAULT_BOUNDS = {
     "deceleration": (0.3, 5.0),
     "min_gap": (0.5, 5.0),
 }
+# What no driver has: beyond these a table is in other units, or not one of drivers.
+PLAUSIBLE = {
+    "desired_speed": (1.0, 100.0),
+    "time_gap": (0.05, 20.0),
+    "acceleration": (0.05, 20.0),
+    "deceleration": (0.05, 20.0),
+    "min_gap": (0.05, 50.0),
+}
 MODES = {"local": ("desired_speed", "time_gap"), "global": tuple(COLUMNS)}
 SHARED = ("acceleration", "deceleration", "min_gap")
 # A parameter this close to a bound, as a share of the range, counts as being on it.
@@ -37,14 +45,18 @@ def checked_bounds(bounds: Bounds | None) -> Limits:
     """Fill in default bounds and check the given ones.
 
     Raises:
-        ConfigError: if a parameter is unknown or its bounds are not 0 < lower < upper.
+        ConfigError: if a parameter is unknown, its bounds are not lower < upper, or no driver has
+            such values.
     """
     limits = dict(DEFAULT_BOUNDS)
     for name, pair in (bounds or {}).items():
         if name not in COLUMNS:
             raise unknown_name("IDM parameter", name, COLUMNS)
-        if len(pair) != 2 or not 0.0 < pair[0] < pair[1] < np.inf:
-            raise ConfigError(f"bounds of {name!r} must be 0 < lower < upper, got {list(pair)}")
+        low, high = PLAUSIBLE[name]
+        if len(pair) != 2 or not low <= pair[0] < pair[1] <= high:
+            raise ConfigError(
+                f"bounds of {name!r} must be {low:g} <= lower < upper <= {high:g}, got {list(pair)}"
+            )
         limits[name] = (float(pair[0]), float(pair[1]))
     return limits
 

@@ -16,6 +16,7 @@ from lcc_rl.drivers.parameters import (
     COLUMNS,
     DEFAULT_BOUNDS,
     MODES,
+    PLAUSIBLE,
     SHARED,
     Bounds,
     at_bound,
@@ -26,6 +27,7 @@ from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.io.files import read_parquet
 
 SHIPPED = "i80_drivers.parquet"
+IDENTITY = ("recording", "follower_id", "leader_id")
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class DriverPopulation:
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
 
     Raises:
-        ConfigError: if there is no driver, or a parameter is not positive and finite.
+        ConfigError: if there is no driver, or a parameter is not one that a driver can have.
     """
 
     desired_speed: Tensor
@@ -54,8 +56,13 @@ class DriverPopulation:
         if not self.ids:
             raise ConfigError("driver population: holds no drivers")
         for name, values in self.parameters().items():
-            if not bool((torch.isfinite(values) & (values > 0.0)).all()):
-                raise ConfigError(f"driver population: {name!r} must be positive and finite")
+            low, high = PLAUSIBLE[name]
+            wrong = ~((values >= low) & (values <= high))
+            if bool(wrong.any()):
+                found = float(values[wrong][0])
+                raise ConfigError(
+                    f"driver population: {name!r} must be {low:g} to {high:g}, got {found:g}"
+                )
 
     def __len__(self) -> int:
         """Number of drivers."""
@@ -151,17 +158,32 @@ def _check(frame: pd.DataFrame, name: str) -> None:
     missing = [column for column in COLUMNS.values() if column not in frame.columns]
     if missing:
         raise DataError(f"{name}: missing column(s) {', '.join(missing)}")
-    for column in COLUMNS.values():
+    for parameter, column in COLUMNS.items():
         if not pd.api.types.is_numeric_dtype(frame[column]):
             raise DataError(f"{name}: column {column!r} is not numeric")
-        values = frame[column].to_numpy(np.float32)
-        bad = ~(np.isfinite(values) & (values > 0.0))
+        values = frame[column].to_numpy(np.float64, na_value=np.nan)
+        low, high = PLAUSIBLE[parameter]
+        bad = ~((values >= low) & (values <= high))
         if bad.any():
             row = int(bad.argmax())
             raise DataError(
-                f"{name}: row {row}, column {column!r}: must be a positive number, "
+                f"{name}: row {row}, column {column!r}: must be {low:g} to {high:g}, "
                 f"got {frame[column].iloc[row]}"
             )
+    _check_identities(frame, name)
+
+
+def _check_identities(frame: pd.DataFrame, name: str) -> None:
+    """Raise a DataError where a driver appears twice."""
+    if not set(IDENTITY) <= set(frame.columns):
+        return
+    # A pair that was cut by a lane change is two drivers: its episodes tell them apart.
+    columns = [column for column in ("mode", "episode", *IDENTITY) if column in frame.columns]
+    twice = frame.duplicated(columns).to_numpy()
+    if twice.any():
+        row = int(twice.argmax())
+        shown = ", ".join(f"{column} {frame[column].iloc[row]}" for column in columns)
+        raise DataError(f"{name}: row {row}: a driver appears twice ({shown}); expected it once")
 
 
 def bootstrap(path: str | Path | None = None, mode: str | None = None) -> DriverPopulation:
@@ -205,10 +227,9 @@ def _tensor(values: np.ndarray) -> Tensor:
 
 def _identities(table: pd.DataFrame) -> tuple[str, ...]:
     """``recording/follower/leader`` where known, else the row's number."""
-    columns = ["recording", "follower_id", "leader_id"]
-    if not set(columns) <= set(table.columns):
+    if not set(IDENTITY) <= set(table.columns):
         return tuple(str(number) for number in range(len(table)))
-    return tuple("/".join(map(str, row)) for row in table[columns].itertuples(index=False))
+    return tuple("/".join(map(str, row)) for row in table[list(IDENTITY)].itertuples(index=False))
 
 
 def _flags(table: pd.DataFrame) -> Tensor:
@@ -277,7 +298,7 @@ def fixed(
         min_gap: s0 [m].
 
     Raises:
-        ConfigError: if a parameter is not positive and finite.
+        ConfigError: if a parameter is not one that a driver can have.
     """
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),

@@ -18,12 +18,13 @@ from lcc_rl.config import require
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs, string_of
-from lcc_rl.evaluation.metrics import energy_measures, safety_measures
+from lcc_rl.evaluation.metrics import energy_measures, measured_ttc, safety_measures
 from lcc_rl.evaluation.rollout import Record, play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.results.tables import FASTER
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 SUMMED = ("energy_kj", "net_energy_kj", "steady_energy_kj", "acceleration_loss_kj")
@@ -97,6 +98,7 @@ def evaluate(
         record, alive = play(env, strategy.policy, given, [*KEYS, INDEX, PROMISED])
         groups = grouped(record, string_of(cfg))
         described = describe(strategy, profiles, inputs.population, *who)
+        described[FASTER] = leader_faster(profiles, who[0], desired_speeds(strategy, described))
         table = pd.concat([described, measure(groups, alive, time_step)], axis=1)
         episodes.append(table)
         if sample_episodes:
@@ -192,6 +194,27 @@ def describe(
     )
 
 
+def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
+    """Return v0 [m/s] by episode: that of the one driver of a strategy, or of the episode's."""
+    controllers = strategy.cfg.scenario.controllers
+    own = controllers.get(AUTOMATED) if string_of(strategy.cfg).count(AUTOMATED) else None
+    given = None if own is None else own.get("desired_speed")
+    drivers = episodes["desired_speed_mps"].to_numpy()
+    return drivers if given is None else np.full_like(drivers, given)
+
+
+def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> np.ndarray:
+    """Return the share of time in which the leader of each episode drives faster than v0."""
+    ids, place = np.unique(profile.numpy(), return_inverse=True)
+    shares = np.zeros(len(desired))
+    for number, index in enumerate(ids):
+        speeds = np.sort(profiles.record(int(index)).numpy())
+        rows = place == number
+        slower = np.searchsorted(speeds, desired[rows], side="right")
+        shares[rows] = 1.0 - slower / len(speeds)
+    return shares
+
+
 def sample(
     groups: Groups, alive: Tensor, episodes: pd.DataFrame, inside: list[int], time_step: float
 ) -> Iterator[pd.DataFrame]:
@@ -201,6 +224,7 @@ def sample(
         columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
         for group, series in groups.items():
             for name, values in series.items():
+                values = measured_ttc(values) if name == "ttc" else values
                 rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
                 for place in range(rows.shape[1]):
                     label = group if rows.shape[1] == 1 else f"{group}{place + 1}"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.functional.power import acceleration_loss, kinetic_energy, steady_power
+from lcc_rl.functional.safety import NEVER
 
 KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
@@ -50,6 +51,11 @@ def energy_measures(
     }
 
 
+def measured_ttc(ttc: Tensor) -> Tensor:
+    """Return times-to-collision [s] with NaN where the number only says that no gap closes."""
+    return torch.where(ttc < NEVER, ttc, torch.nan)
+
+
 def safety_measures(
     series: Mapping[str, Tensor], alive: Tensor, time_step: float
 ) -> dict[str, Tensor]:
@@ -64,7 +70,7 @@ def safety_measures(
 
     Returns:
         Minima and maxima over the vehicles, shares of time and root mean squares averaged over
-        them, each ``[*batch, 1]``.
+        them, each ``[*batch, 1]``; the least time-to-collision is NaN where no gap ever closed.
     """
     steps = alive.sum(0).clamp(min=1).squeeze(-2)
     vehicles = series["gap"].shape[-2]
@@ -81,7 +87,7 @@ def safety_measures(
     unsafe = series["ttc"] < UNSAFE_TTC
     found = {
         "min_gap_m": lowest(series["gap"]),
-        "min_ttc_s": lowest(series["ttc"]),
+        "min_ttc_s": measured_ttc(lowest(series["ttc"])),
         "max_time_gap_s": highest(series["time_gap"]),
         "share_ttc_unsafe": average(unsafe),
         "share_time_gap_long": average(series["time_gap"] > LONG_TIME_GAP),

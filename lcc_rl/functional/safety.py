@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+NEVER = 1e3  # s; stands for "no contact ahead": a number to learn from, not a measured one
+
 
 def time_to_collision(
-    gap: Tensor, approach_rate: Tensor, floor: float = 0.01, ceiling: float = 1e3
+    gap: Tensor, approach_rate: Tensor, floor: float = 0.01, ceiling: float = NEVER
 ) -> Tensor:
     """Time until contact at constant speeds (A10).
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import torch
 
@@ -85,7 +86,8 @@ def write_parquet(
         metadata: further entries, such as a config hash.
 
     Raises:
-        ResultsError: if the file cannot be written.
+        ResultsError: if the file cannot be written, or a number is infinite; it names column and
+            row. NaN is a missing value and is written as null.
     """
     own = {
         "lcc_rl.schema": SCHEMA_VERSION,
@@ -94,6 +96,10 @@ def write_parquet(
         PROCESSOR: processor(),
     }
     table = pa.Table.from_pandas(frame, preserve_index=False)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if pa.types.is_floating(column.type) and pc.any(pc.is_inf(column)).as_py():
+            row = pc.index(pc.is_inf(column), True).as_py()
+            raise ResultsError(f"{path}: row {row}, column {name!r} is infinite; expected a number")
     table = table.replace_schema_metadata(
         {**(table.schema.metadata or {}), **own, **(metadata or {})}
     )

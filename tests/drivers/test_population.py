@@ -10,7 +10,7 @@ import torch
 from lcc_rl.drivers.population import bootstrap, fixed, from_table, kde, load_drivers
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants
-from lcc_rl.io.files import parquet_metadata, write_parquet
+from lcc_rl.io.files import parquet_metadata
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def written(tmp_path):
 
     def write(frame):
         path = tmp_path / "drivers.parquet"
-        write_parquet(frame, path)
+        frame.to_parquet(path)  # whatever it holds
         return path
 
     return write
@@ -119,7 +119,14 @@ def test_tables_of_one_mode_or_none_are_read(table, written):
         (lambda t: t.drop(columns="time_gap_s"), r"drivers\.parquet: missing.*time_gap_s"),
         (lambda t: t.assign(time_gap_s="x"), "'time_gap_s' is not numeric"),
         (lambda t: t.assign(time_gap_s=t["time_gap_s"].where(t.index != 4)), "row 4.*time_gap_s"),
-        (lambda t: t.assign(min_gap_m=0.0), "row 0.*min_gap_m.*positive"),
+        (lambda t: t.assign(min_gap_m=0.0), "row 0.*min_gap_m.*must be 0.05 to 50, got 0"),
+        (lambda t: t.assign(min_gap_m=-2.0), "row 0.*min_gap_m.*got -2"),
+        (lambda t: t.assign(time_gap_s=1e9), "row 0.*time_gap_s.*must be 0.05 to 20"),
+        (lambda t: t.assign(desired_speed_mps=1e6), "row 0.*desired_speed_mps.*must be 1 to 100"),
+        (
+            lambda t: pd.concat([t, t.iloc[3:5]], ignore_index=True),
+            "row 20: a driver appears twice",
+        ),
         (lambda t: t.assign(desired_speed_mps=np.inf), "row 0.*desired_speed_mps"),
         (lambda t: t.assign(time_gap_s=1e-60), "row 0.*time_gap_s"),  # zero in float32
     ],
@@ -146,6 +153,8 @@ def test_bad_settings_are_refused(table, written):
         lambda: kde(bandwidth=-1.0),
         lambda: fixed(desired_speed=-1.0),
         lambda: fixed(time_gap=np.inf),
+        lambda: fixed(time_gap=1e9),
+        lambda: fixed(desired_speed=1e6),
         lambda: fixed(min_gap=0.0),
         lambda: fixed(min_gap=np.inf),
         lambda: replace(fixed(), desired_speed=torch.tensor([np.nan])),

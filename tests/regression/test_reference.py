@@ -21,6 +21,7 @@ from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
+from lcc_rl.functional.safety import NEVER
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.runs import load_policy
@@ -159,6 +160,9 @@ def compare_tables(found: pd.DataFrame, reference: pd.DataFrame, tolerance: floa
     assert len(found) == len(reference)
     for column in reference:
         old, new = reference[column], found[column]
+        if column.endswith("ttc") or column == "min_ttc_s":
+            # Recorded when a gap that never closes was still the number 1000.
+            old = old.mask(old >= NEVER)
         if old.dtype.kind in "fiu" and column != "training_seed":
             # A ratio of two small sums of squares shows every rounding.
             tolerance = 1e-3 if column == "energy_ratio" else tolerance

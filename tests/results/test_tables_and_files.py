@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 import torch
 from rich.console import Console
@@ -88,6 +89,28 @@ def test_parquet_round_trip_with_metadata(tmp_path) -> None:
     assert metadata["lcc_rl.config"] == "abc"
     assert {"lcc_rl.schema", "lcc_rl.version", "lcc_rl.torch"} <= set(metadata)
     assert metadata["lcc_rl.processor"].strip()
+
+
+def test_infinite_numbers_are_not_written_and_missing_ones_are_null(tmp_path) -> None:
+    path = tmp_path / "a.parquet"
+    for bad in (np.inf, -np.inf, np.float32("inf")):
+        frame = pd.DataFrame({"gap_m": [1.0, np.nan, bad, bad]})
+        with pytest.raises(ResultsError, match=r"a\.parquet: row 2, column 'gap_m' is infinite"):
+            write_parquet(frame, path)
+    assert list(tmp_path.iterdir()) == []
+    write_parquet(pd.DataFrame({"gap_m": [1.0, np.nan]}), path)
+    assert pq.read_table(path)["gap_m"].to_pylist() == [1.0, None]
+
+
+def test_a_least_ttc_that_was_not_measured_is_a_dash() -> None:
+    table = summary(
+        episodes().assign(min_ttc_s=lambda rows: rows["min_ttc_s"].where(rows["strategy"] != "idm"))
+    )
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(as_rich(table, "title"))
+    row = next(line for line in console.export_text().splitlines() if "time-to-coll" in line)
+    assert row.count("–") == table["min_ttc_s"].isna().sum() >= 1
+    assert "1000" not in row
 
 
 @pytest.mark.parametrize("read", [read_parquet, parquet_metadata])

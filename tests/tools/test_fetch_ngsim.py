@@ -201,9 +201,31 @@ def generous(query: dict[str, str], content: bytes) -> tuple[int, bytes, int]:
     return 200, content, len(content)
 
 
+def forgetful(query: dict[str, str], content: bytes) -> tuple[int, bytes, int]:
+    """Every page is the first one, as many rows as were asked for."""
+    if "$offset" in query:
+        rows = [HEADER, *(line(n, "i-80") for n in range(1, int(query["$limit"]) + 1)), ""]
+        content = "\n".join(rows).encode()
+    return 200, content, len(content)
+
+
+def spoilt(cell: bytes) -> Callable[..., tuple[int, bytes, int]]:
+    """The second page holds a cell of another kind."""
+
+    def spoil(query: dict[str, str], content: bytes) -> tuple[int, bytes, int]:
+        if query.get("$offset") == "10":
+            content = content.replace(b'"i-80"', cell, 1)
+        return 200, content, len(content)
+
+    return spoil
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (forgetful, "the page from row 10 begins like page 1: the server ignores $offset"),
+        (spoilt(b'"\xff"'), "from row 10: the answer is not a CSV table: 'utf-8' codec"),
+        (spoilt(b'"' + b"x" * 200_000 + b'"'), "from row 10: the answer is not a CSV table: field"),
         (short, "9 rows arrived but the portal counts 25"),
         (generous, "26 rows arrived but the portal counts 25"),
         (lambda query, content: (200, b"<html>", 6), "unexpected answer to a count: b'<html>'"),
@@ -229,7 +251,9 @@ def test_a_wrong_answer_never_becomes_the_file(
     output = tmp_path / "i80.csv"
     portal.spoil = spoil
     assert run(portal, output, "--location", "i-80") == 1
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
     assert not output.exists()
     portal.spoil = None  # and the next attempt succeeds
     assert run(portal, output, "--location", "i-80") == 0

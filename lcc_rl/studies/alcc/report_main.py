@@ -8,6 +8,7 @@ import pandas as pd
 
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results import figures as run_figures
+from lcc_rl.results.tables import leader_too_fast
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.page import Page
 
@@ -53,6 +54,7 @@ def _headline(page: Page, episodes: pd.DataFrame) -> None:
         "over all seeds; savings are positive where energy is saved. Raw trip energy rewards "
         "ending slower than one began, so energies net of the change in kinetic energy stand "
         f"beside it. {sure}"
+        + "".join(f"\n\nWarning: {line}." for line in leader_too_fast(episodes))
     )
     drawn = [
         (
@@ -78,8 +80,8 @@ def _constraints(page: Page, episodes: pd.DataFrame) -> None:
     text = (
         "The study asks for no collision in any episode, time with TTC < 4 s of at most 0.1 %, "
         "and time with a time gap > 2.5 s of at most 1 %, for every seed. Columns: unsafe TTC is "
-        "the share of time with TTC < 4 s, long time gap that with a time gap > 2.5 s; a least TTC "
-        "of 1,000 s means that the car never closed in."
+        "the share of time with TTC < 4 s, long time gap that with a time gap > 2.5 s; no "
+        "least TTC means that the car never closed in."
     )
     shown = [
         ("constraints", f"All episodes, {size(episodes)}", tables.constraints(episodes)),
