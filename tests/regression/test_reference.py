@@ -21,8 +21,8 @@ from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
-from lcc_rl.functional.safety import NEVER
 from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.functional.safety import NEVER
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.runs import load_policy
 
