@@ -155,11 +155,10 @@ def fetch(portal: Portal, output: Path, page_rows: int = PAGE_ROWS) -> int:
         while state.rows < total:
             page = portal.page(state.rows, min(page_rows, total - state.rows))
             rows, header, text = _rows_of(page, f"{portal.query}, from row {state.rows:,}")
-            if rows == 0:
+            if not rows:
                 break
             _check_new(text, state, portal)
-            text = text if state.rows else header + text
-            file.write(text)
+            file.write(text := text if state.rows else header + text)
             file.flush()
             os.fsync(file.fileno())
             state.rows, state.size = state.rows + rows, state.size + len(text)

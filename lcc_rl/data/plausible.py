@@ -76,8 +76,8 @@ class Plausible:
         """Leave out the records that hold an implausible sample.
 
         Args:
-            table: rows of a record (column ``episode``) lie together, in order of time: time_s [s]
-                and, where present, columns that end in ``speed_mps`` and ``length_m``, and gap_m.
+            table: rows of a record (column ``episode``) lie together, in order of time: time_s
+                and, where present, gap_m and columns that end in ``speed_mps`` and ``length_m``.
             source: the file or files, for messages.
             place: describes a row to the user, by its number and the column at fault.
             setting: where the configuration has these thresholds.
@@ -87,31 +87,35 @@ class Plausible:
             The other records, and a line for each kind of fault, counted by its first reason.
 
         Raises:
-            DataError: if more than ``max_share`` of the records, or all, would be left out; it
-                names source, first row, value, threshold and what to set.
+            DataError: if more than ``max_share`` of the records, or all, would be left out.
         """
-        episode = table["episode"].to_numpy()
-        first = np.concatenate([[True], episode[1:] != episode[:-1]])
+        first = table["episode"].ne(table["episode"].shift()).to_numpy()
         starts = np.flatnonzero(first)
+        lengths = np.diff([*starts, len(table)])
         keep, lines, told = np.ones(len(starts), dtype=bool), [], ""
         for fault in self.faults(table, first):
             bad = np.logical_or.reduceat(fault.wrong, starts) & keep
             if not bad.any():
                 continue
-            row = int(np.argmax(fault.wrong & np.repeat(bad, np.diff([*starts, len(table)]))))
+            row = int(np.argmax(fault.wrong & np.repeat(bad, lengths)))
             limit = f"{setting}.{fault.setting}={getattr(self, fault.setting):g}"
             said = f"{place(row, fault.column)} {fault.words.format(fault.values[row])}, {limit}"
             lines.append(f"left out {int(bad.sum()):,} implausible record(s), the first: {said}")
-            rough = remedy if fault.setting == "max_acceleration" else ""
-            told = told or f"{said}; mend the file{rough} or raise that threshold"
+            more = remedy if fault.setting == "max_acceleration" else ""
+            told = told or f"{said}; mend the file{more} or raise that threshold"
             keep &= ~bad
-        if not keep.any() or np.mean(~keep) > self.max_share:
-            count = f"{int((~keep).sum()):,} of {len(keep):,} records are implausible"
-            share = f"at most {setting}.max_share={self.max_share:g} of them may be left out"
-            raise DataError(f"{source}: {count} ({share}), the first: {told}")
-        if keep.all():
-            return table, lines
-        return table[np.repeat(keep, np.diff([*starts, len(table)]))].reset_index(drop=True), lines
+        self._check_share(keep, f"{setting}.max_share={self.max_share:g}", source, told)
+        kept = table if keep.all() else table[np.repeat(keep, lengths)].reset_index(drop=True)
+        return kept, lines
+
+    def _check_share(self, keep: NDArray[np.bool_], limit: str, source: str, told: str) -> None:
+        """Refuse data of which too many records are left out."""
+        if keep.any() and np.mean(~keep) <= self.max_share:
+            return
+        raise DataError(
+            f"{source}: {int((~keep).sum()):,} of {len(keep):,} records are implausible (at most "
+            f"{limit} of them may be left out), the first: {told}"
+        )
 
     def faults(self, table: pd.DataFrame, first: NDArray[np.bool_]) -> Iterator[Fault]:
         """Yield what is outside of the thresholds; ``first`` marks the first row of each record."""

@@ -42,8 +42,7 @@ class Smoothing(ABC):
         """
         samples = trajectories.samples
         starts, lengths = stretches(samples["segment"].to_numpy())
-        position = samples["position_m"].to_numpy(dtype=float)
-        kinematics = self.smooth(position)
+        kinematics = self.smooth(samples["position_m"].to_numpy(dtype=float))
         place = np.arange(len(samples)) - np.repeat(starts, lengths)
         inner = np.minimum(place, np.repeat(lengths, lengths) - 1 - place) >= self.margin
         if not inner.any():
@@ -71,8 +70,8 @@ class Smoothing(ABC):
             f"out {int((~inner).sum()):,} rows within {self.margin * FRAME:.1f} s of the end of a "
             f"stretch, {int((lengths <= 2 * self.margin).sum()):,} stretches entirely"
         )
-        report = replace(trajectories.report, notes=[*trajectories.report.notes, note])
-        return Trajectories(samples, report)
+        report = trajectories.report
+        return Trajectories(samples, replace(report, notes=[*report.notes, note]))
 
     @property
     @abstractmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +14,15 @@ from torch import Tensor
 from lcc_rl.drivers.parameters import (
     COLUMNS,
     DEFAULT_BOUNDS,
-    MODES,
     PLAUSIBLE,
     SHARED,
     Bounds,
     at_bound,
     checked_bounds,
 )
-from lcc_rl.errors import ConfigError, DataError, ResultsError, unknown_name
+from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants
-from lcc_rl.io.files import read_parquet
-
-SHIPPED = "i80_drivers.parquet"
-IDENTITY = ("recording", "follower_id", "leader_id")
 
 
 @dataclass(frozen=True)
@@ -110,82 +105,6 @@ class DriverPopulation:
         }
 
 
-def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.DataFrame:
-    """Read a table of calibrated drivers and check it.
-
-    Args:
-        path: a ``drivers.parquet`` written by the calibration; None reads the shipped I-80 drivers.
-        mode: which calibration to keep, ``local`` or ``global``; by default the one that the
-            table has, local where it has both.
-
-    Returns:
-        One row per driver, columns as written by :func:`lcc_rl.drivers.idm_fit.fit`.
-
-    Raises:
-        ConfigError: if the mode is unknown.
-        DataError: naming file, row and column, if the table is missing, empty or not sound.
-    """
-    if mode is not None and mode not in MODES:
-        raise unknown_name("calibration mode", mode, MODES)
-    try:
-        if path is None:
-            with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED) as file:
-                frame = read_parquet(file)
-        else:
-            frame = read_parquet(path)
-    except ResultsError as error:
-        raise DataError(str(error)) from error
-    name = SHIPPED if path is None else str(path)
-    _check(frame, name)
-    return _of_mode(frame, mode, name)
-
-
-def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
-    """Keep the drivers of one calibration mode."""
-    if "mode" not in frame.columns:
-        return frame
-    held = frame["mode"].unique().tolist()
-    mode = mode or ("local" if "local" in held else held[0])
-    if mode not in held:
-        raise DataError(f"{name}: no drivers of mode {mode!r}; the table holds {', '.join(held)}")
-    return frame[frame["mode"] == mode].reset_index(drop=True)
-
-
-def _check(frame: pd.DataFrame, name: str) -> None:
-    """Raise a DataError for the first fault of a driver table."""
-    if frame.empty:
-        raise DataError(f"{name}: the table holds no drivers")
-    missing = [column for column in COLUMNS.values() if column not in frame.columns]
-    if missing:
-        raise DataError(f"{name}: missing column(s) {', '.join(missing)}")
-    for parameter, column in COLUMNS.items():
-        if not pd.api.types.is_numeric_dtype(frame[column]):
-            raise DataError(f"{name}: column {column!r} is not numeric")
-        values = frame[column].to_numpy(np.float64, na_value=np.nan)
-        low, high = PLAUSIBLE[parameter]
-        bad = ~((values >= low) & (values <= high))
-        if bad.any():
-            row = int(bad.argmax())
-            raise DataError(
-                f"{name}: row {row}, column {column!r}: must be {low:g} to {high:g}, "
-                f"got {frame[column].iloc[row]}"
-            )
-    _check_identities(frame, name)
-
-
-def _check_identities(frame: pd.DataFrame, name: str) -> None:
-    """Raise a DataError where a driver appears twice."""
-    if not set(IDENTITY) <= set(frame.columns):
-        return
-    # A pair that was cut by a lane change is two drivers: its episodes tell them apart.
-    columns = [column for column in ("mode", "episode", *IDENTITY) if column in frame.columns]
-    twice = frame.duplicated(columns).to_numpy()
-    if twice.any():
-        row = int(twice.argmax())
-        shown = ", ".join(f"{column} {frame[column].iloc[row]}" for column in columns)
-        raise DataError(f"{name}: row {row}: a driver appears twice ({shown}); expected it once")
-
-
 def bootstrap(path: str | Path | None = None, mode: str | None = None) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
 
@@ -206,7 +125,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
     Raises:
         DataError: if the table is not sound.
     """
-    _check(table, "driver table")
+    check_drivers(table, "driver table")
     own = {name: table[COLUMNS[name]].to_numpy(np.float64) for name in SHARED}
     constants = IDMConstants(
         **{name: float(values[0]) for name, values in own.items() if np.ptp(values) == 0.0}
