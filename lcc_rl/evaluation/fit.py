@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.config import plain
+from lcc_rl.config_checks import AUTO
 from lcc_rl.errors import ConfigError
 from lcc_rl.results.runs import differing, flatten
 
@@ -36,6 +37,20 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
         raise ConfigError(
             f"policy={cfg.policy} was trained with another observation than this: expected "
             f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
+        )
+    # What a policy's action means: the largest acceleration, and for how long it is held.
+    meanings = [
+        dict(flatten({AUTO: plain(node.scenario.controllers.automated)}))
+        | {"scenario.time_step": node.scenario.time_step}
+        for node in (own, cfg)
+    ]
+    changes = [
+        f"{key}={meanings[0].get(key)}, got {meanings[1].get(key)}" for key in differing(*meanings)
+    ]
+    if changes:
+        raise ConfigError(
+            f"policy={cfg.policy}: its action means something else here: it was trained with "
+            f"{'; '.join(changes)}"
         )
     remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
     if remembered != asked:

@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import TARGET, load, plain, short_name
+from lcc_rl.config import load, plain, short_name
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.evaluation.fit import check_policy, check_width
@@ -24,6 +24,7 @@ from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.policies import shared_policy
+from lcc_rl.targets import TARGET
 
 log = logging.getLogger("lcc_rl")
 
@@ -237,6 +238,11 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
             f"policy={path} was trained as variant {own.variant}, in the scenario "
             f"{own.scenario.name}, not in {cfg.scenario.name}"
         )
+    if own.scenario.time_step != cfg.scenario.time_step:
+        raise ConfigError(
+            f"policy={path}: its action means something else here: it was trained with "
+            f"scenario.time_step={own.scenario.time_step}, got {cfg.scenario.time_step}"
+        )
     for key in ("variant", "agent", "observation"):
         other[key] = own[key]
     other.deployed = own.get("deployed")
@@ -258,7 +264,10 @@ def with_weights(
     Raises:
         ResultsError: if the weights do not fit the network.
     """
-    agent = build_agent(cfg, population, cfg.device)
+    try:
+        agent = build_agent(cfg, population, cfg.device)
+    except ConfigError as error:
+        raise ResultsError(f"{path}: its agent cannot be built: {error}") from error
     check_width(agent.policy, weights, path)
     try:
         agent.policy.load_state_dict(dict(weights))
