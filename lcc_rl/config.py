@@ -202,8 +202,9 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
     """Call a class or function with the arguments that a node gives and, else, the resources."""
     called = getattr(target, "__name__", str(target))
     signature = parameters_of(target, where)
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in signature.values())
     for key in given:
-        if key not in signature:
+        if key not in signature and not takes_any:
             own = set(signature) - set(resources) - INTERNAL
             raise unknown_name(f"setting of {where} ({called})", key, own)
         if given[key] == "???":

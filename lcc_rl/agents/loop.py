@@ -253,8 +253,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         found = state.get("identity") if isinstance(state, dict) else None
         if found != self.identity:
             raise ResultsError(
-                f"{path}: belongs to another configuration (hash {found}, this run has "
-                f"{self.identity}); resume with the settings it was started with"
+                f"{path}: belongs to another configuration (hash {found}, not {self.identity})"
             )
         try:
             self.iteration, self.updates = int(state["iteration"]), int(state["updates"])

@@ -38,25 +38,39 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
             f"policy={cfg.policy} was trained with another observation than this: expected "
             f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
         )
-    # What a policy's action means: the largest acceleration, and for how long it is held.
-    meanings = [
-        dict(flatten({AUTO: plain(node.scenario.controllers.automated)}))
-        | {"scenario.time_step": node.scenario.time_step}
-        for node in (own, cfg)
-    ]
-    changes = [
-        f"{key}={meanings[0].get(key)}, got {meanings[1].get(key)}" for key in differing(*meanings)
-    ]
-    if changes:
-        raise ConfigError(
-            f"policy={cfg.policy}: its action means something else here: it was trained with "
-            f"{'; '.join(changes)}"
-        )
+    check_action(str(cfg.policy), own, cfg)
     remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
     if remembered != asked:
         raise ConfigError(
             f"policy={cfg.policy} was trained with another memory than this: "
             f"expected scenario.pieces.memory={remembered}, got {asked}"
+        )
+
+
+def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
+    """Check that an action means what it did in training: how much, and for how long.
+
+    Args:
+        path: where the policy comes from, for the message.
+        own: configuration of its training.
+        cfg: configuration under study.
+
+    Raises:
+        ConfigError: naming what differs.
+    """
+    trained_with, asked = (
+        {"scenario.time_step": node.scenario.time_step}
+        | dict(flatten({AUTO: plain(node.scenario.controllers.automated)}))
+        for node in (own, cfg)
+    )
+    changes = [
+        f"{key}={trained_with.get(key)}, got {asked.get(key)}"
+        for key in differing(trained_with, asked)
+    ]
+    if changes:
+        raise ConfigError(
+            f"policy={path}: its action means something else here: it was trained with "
+            f"{'; '.join(changes)}"
         )
 
 

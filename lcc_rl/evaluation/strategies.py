@@ -19,7 +19,7 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load, plain, short_name
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.evaluation.fit import check_policy, check_width
+from lcc_rl.evaluation.fit import check_action, check_policy, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.controllers import Population
@@ -238,11 +238,6 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
             f"policy={path} was trained as variant {own.variant}, in the scenario "
             f"{own.scenario.name}, not in {cfg.scenario.name}"
         )
-    if own.scenario.time_step != cfg.scenario.time_step:
-        raise ConfigError(
-            f"policy={path}: its action means something else here: it was trained with "
-            f"scenario.time_step={own.scenario.time_step}, got {cfg.scenario.time_step}"
-        )
     for key in ("variant", "agent", "observation"):
         other[key] = own[key]
     other.deployed = own.get("deployed")
@@ -252,6 +247,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
     for name, node in own.scenario.pieces.items():
         if name in KNOWLEDGE or name not in other.scenario.pieces:
             other.scenario.pieces[name] = node
+    check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
     return replace(strategy, cfg=deployed(strategy.cfg))
 
@@ -272,7 +268,8 @@ def with_weights(
     try:
         agent.policy.load_state_dict(dict(weights))
     except RuntimeError as error:
-        raise ResultsError(f"{path}: the weights do not fit the policy network: {error}") from error
+        words = " ".join(str(error).split())
+        raise ResultsError(f"{path}: the weights do not fit the policy network: {words}") from error
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed)
 
 
