@@ -47,6 +47,19 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
         )
 
 
+def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
+    """Check that a policy to compare with was trained in the scenario under study.
+
+    Raises:
+        ConfigError: naming both.
+    """
+    if own.scenario.name != cfg.scenario.name:
+        raise ConfigError(
+            f"policy={path} was trained as variant {own.variant}, in the scenario "
+            f"{own.scenario.name}, not in {cfg.scenario.name}"
+        )
+
+
 def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
     """Check that an action means what it did in training: how much, and for how long.
 

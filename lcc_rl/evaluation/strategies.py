@@ -19,7 +19,7 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load, plain, short_name
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.evaluation.fit import check_action, check_policy, check_width
+from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.controllers import Population
@@ -233,11 +233,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
     """
     weights, own = policy
     other = _copy(cfg)
-    if own.scenario.name != cfg.scenario.name:
-        raise ConfigError(
-            f"policy={path} was trained as variant {own.variant}, in the scenario "
-            f"{own.scenario.name}, not in {cfg.scenario.name}"
-        )
+    check_scenario(path, own, cfg)
     for key in ("variant", "agent", "observation"):
         other[key] = own[key]
     other.deployed = own.get("deployed")

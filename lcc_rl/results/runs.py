@@ -147,8 +147,7 @@ def load(
 ) -> pd.DataFrame:
     """Read one table of every run below a folder.
 
-    A run whose table or configuration is damaged is left out with a warning in the log;
-    ``frame.attrs["damaged"]`` holds the reason by run.
+    A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run.
 
     Args:
         root: a run folder, or any folder above runs.
@@ -162,7 +161,7 @@ def load(
 
     Raises:
         ConfigError: if the table's name is unknown.
-        ResultsError: if there is no such table below ``root``, or none can be read.
+        ResultsError: if no such table below ``root`` can be read.
     """
     if table not in TABLES:
         raise unknown_name("table", table, TABLES)
@@ -178,9 +177,8 @@ def load(
             log.warning("left out: %s", error)
             damaged[run] = str(error)
     if not frames:
-        reason = f": {next(iter(damaged.values()))}" if damaged else ""
-        what = f"no readable {table}.parquet" if damaged else f"no {table}.parquet"
-        raise ResultsError(f"{root}: {what} in it or below it{reason}")
+        why = f"; none is readable: {next(iter(damaged.values()))}" if damaged else ""
+        raise ResultsError(f"{root}: no {table}.parquet in it or below it{why}")
     rows = pd.concat(frames, ignore_index=True)
     if damaged:
         rows.attrs["damaged"] = damaged

@@ -406,7 +406,7 @@ def test_damaged_runs_are_left_out_by_name(trained, tmp_path, caplog) -> None:
     with pytest.raises(ResultsError, match=r"b/episodes\.parquet"):
         results.load(tmp_path, strict=True)
     shutil.rmtree(tmp_path / "a")
-    with pytest.raises(ResultsError, match=r"no readable episodes\.parquet.*b/episodes\.parquet"):
+    with pytest.raises(ResultsError, match=r"none is readable: .*b/episodes\.parquet"):
         results.load(tmp_path)
 
 
