@@ -245,7 +245,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
             other.scenario.pieces[name] = node
     check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
-    return replace(strategy, cfg=deployed(strategy.cfg))
+    return replace(strategy, cfg=deployed(other))
 
 
 def with_weights(
@@ -254,7 +254,7 @@ def with_weights(
     """Build a strategy and load its policy's weights.
 
     Raises:
-        ResultsError: if the weights do not fit the network.
+        ResultsError: if the agent cannot be built, or the weights do not fit its network.
     """
     try:
         agent = build_agent(cfg, population, cfg.device)
@@ -264,17 +264,14 @@ def with_weights(
     try:
         agent.policy.load_state_dict(dict(weights))
     except RuntimeError as error:
-        words = " ".join(str(error).split())
-        raise ResultsError(f"{path}: the weights do not fit the policy network: {words}") from error
+        words = f"the weights do not fit the policy network: {' '.join(str(error).split())}"
+        raise ResultsError(f"{path}: {words}") from error
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed)
 
 
 def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     """Add its agent to the name of a variant that more than one kind of agent has learned."""
-    kinds = [
-        short_name(strategy.cfg.agent[TARGET]) if strategy.policy is not None else ""
-        for strategy in strategies
-    ]
+    kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
     named = [(strategy.name, kind) for strategy, kind in zip(strategies, kinds, strict=True)]
     learned_by = Counter(name for name, _ in set(named))
     return [

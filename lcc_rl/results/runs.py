@@ -180,8 +180,7 @@ def load(
         why = f"; none is readable: {next(iter(damaged.values()))}" if damaged else ""
         raise ResultsError(f"{root}: no {table}.parquet in it or below it{why}")
     rows = pd.concat(frames, ignore_index=True)
-    if damaged:
-        rows.attrs["damaged"] = damaged
+    rows.attrs |= {"damaged": damaged} if damaged else {}
     return rows
 
 
