@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import inspect
 import json
 import re
-import types
 import typing
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +20,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_checks import check_ignored, renamed_option
 from lcc_rl.config_errors import check_keys, explain, refused_key
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, LccError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.schemas import register_schemas
+from lcc_rl.targets import TARGET, check_types, find_target, forget_places, parameters_of
 
-TARGET = "_target_"
 CONF = "lcc_rl.conf"
+CALLED = ("__call__",)  # what a node that is used as a function makes
 # Settings that do not change any row of a result.
 NOT_IDENTITY = (
     *("resume", "compare", "jobs", "sweep", "objective", "logger", "trust"),
@@ -48,6 +45,11 @@ def chosen_folder(resumed: str | None, fresh: str) -> str:
     return str(resumed or fresh)
 
 
+def hydra_folder(folder: str | None) -> str | None:
+    """Return where Hydra notes its own settings: nowhere in a folder that holds a run before."""
+    return None if folder and (Path(folder) / "config.yaml").is_file() else ".hydra"
+
+
 def terms_of_energy(string: Any) -> float:
     """Return how many vehicles' energy counts for an automated one: its own and those behind."""
     roles = parse_string(plain(string) if OmegaConf.is_config(string) else string)
@@ -56,6 +58,7 @@ def terms_of_energy(string: Any) -> float:
 
 register_schemas()
 OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
+OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
 OmegaConf.register_new_resolver("lcc.pairs", lambda a, b: len(a) * len(b), replace=True)
 OmegaConf.register_new_resolver("lcc.energies", terms_of_energy, replace=True)
 
@@ -91,8 +94,11 @@ def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Leave out settings of a class that was replaced on the command line by another one.
 
     After ``scenario.controllers.automated._target_=mine.Rule`` the settings that the file gives
-    for its own class stay where the new one has them, too; what was typed always stays.
+    for its own class stay where the new one has them, too; what was typed always stays. So are
+    the settings that a recipe gives for an agent left out where nothing is learned.
     """
+    if OmegaConf.is_dict(cfg.get("agent")) and TARGET not in cfg.agent:
+        cfg.agent = None
     typed = set()
     for item in overrides:
         key, _, value = item.lstrip("+~").partition("=")
@@ -104,9 +110,9 @@ def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
             continue
         try:
             target = find_target(str(node[TARGET]), place)
+            known = parameters_of(getattr(target, "Settings", target), place).values()
         except ConfigError:  # said where it is built
             continue
-        known = inspect.signature(getattr(target, "Settings", target)).parameters.values()
         if any(parameter.kind is parameter.VAR_KEYWORD for parameter in known):
             continue
         names = {parameter.name for parameter in known}
@@ -172,16 +178,38 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     )
 
 
+def build_as(
+    kind: str, needed: type | Sequence[str], node: Any, where: str, **resources: Any
+) -> Any:
+    """Construct an object of a certain kind, see :func:`build`.
+
+    Args:
+        kind: what it has to be, in words.
+        needed: its class, or the methods and attributes that make it one.
+
+    Raises:
+        ConfigError: if the node describes something else.
+    """
+    made = build(node, where, **resources)
+    fits = isinstance(made, needed) if isinstance(needed, type) else None
+    if fits is None:
+        fits = all(hasattr(made, name) for name in typing.cast(Sequence[str], needed))
+    require(fits, f"{where}: expected {kind}, {type(made).__name__} is none ({node[TARGET]})")
+    return made
+
+
 def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[str, Any]) -> Any:
     """Call a class or function with the arguments that a node gives and, else, the resources."""
-    signature = inspect.signature(target).parameters
+    called = getattr(target, "__name__", str(target))
+    signature = parameters_of(target, where)
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in signature.values())
     for key in given:
-        if key not in signature:
+        if key not in signature and not takes_any:
             own = set(signature) - set(resources) - INTERNAL
-            raise unknown_name(f"setting of {where} ({target.__name__})", key, own)
+            raise unknown_name(f"setting of {where} ({called})", key, own)
         if given[key] == "???":
             raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
-    _check_types(target, given, where)
+    check_types(target, given, where)
     offered = {k: v for k, v in resources.items() if k in signature and k not in given}
     arguments = {
         key: build(value, f"{where}.{key}", **resources)
@@ -192,21 +220,14 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
     required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}
     missing = sorted(required - set(arguments) - set(offered))
     if missing:
-        raise ConfigError(f"{where}: missing {', '.join(missing)} of {target.__name__}")
-    return target(**arguments, **offered)
-
-
-def find_target(target: str, where: str) -> Any:
-    """Return the class or function that a ``_target_`` names.
-
-    Raises:
-        ConfigError: if there is none.
-    """
-    module, _, name = target.rpartition(".")
+        raise ConfigError(f"{where}: missing {', '.join(missing)} of {called}")
     try:
-        return getattr(import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}") from error
+        return target(**arguments, **offered)
+    except LccError:
+        raise
+    except Exception as error:  # whatever a constructor of the user's own raises
+        words = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{where}: {called} cannot be built: {words}") from error
 
 
 def short_name(target: object) -> str:
@@ -216,37 +237,6 @@ def short_name(target: object) -> str:
 
 # Arguments of the pieces' base classes, which no configuration sets.
 INTERNAL = {"reads", "writes", "constants", "reset_options"}
-SIMPLE: dict[Any, tuple[type, ...]] = {float: (float, int), int: (int,), bool: (bool,), str: (str,)}
-
-
-def _check_types(target: Any, given: Mapping[str, Any], where: str) -> None:
-    """Check numbers, flags and text against the annotations of the constructor."""
-    function = target
-    # The generated constructor of a dataclass does not know the names of its module.
-    if inspect.isclass(target) and not dataclasses.is_dataclass(target):
-        function = target.__init__
-    try:
-        hints = typing.get_type_hints(function)
-    except (NameError, TypeError):
-        return
-    for key, value in given.items():
-        accepted = _accepted(hints.get(key))
-        # bool is an int to Python, but not to a reader of a configuration.
-        wrong = isinstance(value, bool) and bool not in accepted
-        if accepted and (wrong or not isinstance(value, accepted)):
-            wanted = " or ".join(sorted({kind.__name__ for kind in accepted}))
-            raise ConfigError(f"{where}.{key} must be {wanted}, got {value!r}")
-
-
-def _accepted(hint: Any) -> tuple[type, ...]:
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        parts = [_accepted(part) for part in typing.get_args(hint)]
-        return tuple(kind for part in parts for kind in part) if all(parts) else ()
-    if hint is type(None):
-        return (type(None),)
-    if typing.get_origin(hint) is Sequence:
-        return (list,)
-    return SIMPLE.get(hint, ())
 
 
 def plain(config: Any) -> dict[str, Any]:
@@ -264,6 +254,7 @@ def config_hash(config: Any) -> str:
 def identity(cfg: DictConfig) -> str:
     """Return the hash of everything in a configuration that determines the results."""
     content = plain(cfg)
+    forget_places(content)
     for key in NOT_IDENTITY:
         *path, last = key.split(".")
         node = content

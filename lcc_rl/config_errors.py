@@ -50,6 +50,9 @@ def explain(error: Exception, valid: Any) -> Exception:
         node = OmegaConf.select(valid, parent) if parent else valid
     except Exception:  # an interpolation of Hydra's own that exists only inside a run
         return error
+    referring = _reference(valid, key)
+    if referring is not None:
+        return referring
     if parent == "agent" and node is None:
         variant = OmegaConf.select(valid, "variant")
         return ConfigError(f"{key}: variant {variant} learns nothing, it has no agent")
@@ -60,6 +63,24 @@ def explain(error: Exception, valid: Any) -> Exception:
         return ConfigError(f"variant {variant} has no {name} to choose; leave {name}=… out")
     names = {*map(str, node), *(() if parent else ("experiment",))}
     return unknown_name(_what(parent), name, names)
+
+
+def _reference(valid: Any, key: str) -> ConfigError | None:
+    """Return the error for a setting inside a node that only stands for another one."""
+    parts, node = key.split("."), valid
+    for place, name in enumerate(parts[:-1], 1):
+        if not OmegaConf.is_dict(node) or name not in node:
+            return None
+        if OmegaConf.is_interpolation(node, name):
+            text = str(OmegaConf.to_container(node, resolve=False)[name])  # type: ignore[call-overload,index]
+            inside, rest = ".".join(parts[:place]), ".".join(parts[place:])
+            there = f"{text.removeprefix('${').removesuffix('}')}.{rest}"
+            return ConfigError(
+                f"{key}: {inside} stands for {text}; set {there} for both, or give {inside} a node "
+                f"of its own: '{inside}={{_target_: …, {rest}: …}}'"
+            )
+        node = node[name]
+    return None
 
 
 def unknown_at(path: str, valid: Any) -> ConfigError | None:

@@ -46,4 +46,4 @@ def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     options = sorted(valid)
     near = get_close_matches(name, options, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options)}.{hint}")
+    return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options) or 'none'}.{hint}")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from lcc_rl.commands.pipeline import OVERRIDES, run
+from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.results.runs import save_config
-from lcc_rl.runs.cli import entry_point, run_folder
+from lcc_rl.runs.cli import entry_point, root_key, run_folder
 
 log = logging.getLogger("lcc_rl")
 
@@ -25,15 +24,17 @@ def main(cfg: DictConfig) -> None:
     folder = run_folder()
     if cfg.resume is not None:
         folder = Path(cfg.resume)
-        others = [item for item in overrides if not item.startswith("resume=")]
+        others = [item for item in overrides if root_key(item) not in ("resume", "trust")]
         if others:
             raise ConfigError(
                 "a resumed job keeps the settings it was started with; remove " + " ".join(others)
             )
         if not (folder / OVERRIDES).is_file():
             raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {OVERRIDES}")
-        overrides = json.loads((folder / OVERRIDES).read_text())
+        trust = list(cfg.trust)
+        overrides = stored_overrides(folder / OVERRIDES, trust)
         cfg = load("pipeline", overrides)
+        cfg.trust = trust
     save_config(cfg, folder)
     run(cfg, folder, overrides)
     log.info("results in %s", folder)

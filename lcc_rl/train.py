@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from lcc_rl.commands.training import complete, objective, run
 from lcc_rl.config import is_sweep
 from lcc_rl.errors import ConfigError
-from lcc_rl.runs.cli import entry_point, run_folder
+from lcc_rl.runs.cli import entry_point, root_key, run_folder
 
 log = logging.getLogger("lcc_rl")
 
@@ -19,9 +19,9 @@ log = logging.getLogger("lcc_rl")
 @entry_point("train")
 def main(cfg: DictConfig) -> float | list[float]:
     """Train into the run's folder; return the objective to a sweeper that optimises."""
-    own = ("resume", "trust")
+    own = ("resume", "trust", "logger")
     typed = HydraConfig.get().overrides.task
-    others = [item for item in typed if item.split("=")[0] not in own]
+    others = [item for item in typed if root_key(item) not in own]
     if cfg.resume is not None and others:
         raise ConfigError(
             f"a resumed run keeps the settings it was started with; remove {' '.join(others)}"

@@ -11,19 +11,20 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import DictConfig, OmegaConf
 
 import lcc_rl
+import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import TARGET, build, config_hash, find_target, load
+from lcc_rl.config import build, config_hash, load
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import RewardTerm
 from lcc_rl.policies import shared_policy
 from lcc_rl.policies.actor import ACTION
+from lcc_rl.targets import TARGET, find_target
 
 CONF = Path(lcc_rl.conf.__file__).parent
 LEARNED = ("alcc", "reference", "own_energy", "ddpg", "hcfs")

@@ -133,7 +133,7 @@ def disturb(words: Sequence[str], sweep: Path, log: Path, delay: float, kind: in
 def compare(whole: Path, sweep: Path) -> None:
     """Check that two sweeps hold the same runs with the same rows."""
     for table in TABLES:
-        expected, found = results.load(whole, table), results.load(sweep, table)
+        expected, found = (results.load(folder, table, strict=True) for folder in (whole, sweep))
         pd.testing.assert_frame_equal(found, expected, check_exact=True)
 
 

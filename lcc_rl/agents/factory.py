@@ -12,7 +12,7 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import Agent, TrainingLoop
 from lcc_rl.agents.replay import Trainer
-from lcc_rl.config import TARGET, build, identity
+from lcc_rl.config import build_as, identity
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
@@ -20,6 +20,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Piece
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.targets import TARGET
 
 
 def learns(cfg: DictConfig) -> bool:
@@ -41,8 +42,10 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
             f"scenario.string={cfg.scenario.string}: nobody is automated, so nothing can be "
             "learned; say agent=none to evaluate it"
         )
-    observation: Piece = build(cfg.observation, "observation", string=string)
-    agent: Agent = build(
+    observation = build_as("a piece", Piece, cfg.observation, "observation", string=string)
+    agent: Agent = build_as(
+        "an agent",
+        ("policy", "anneal", "load_state_dict"),
         cfg.agent,
         "agent",
         population=population,

@@ -250,15 +250,18 @@ class TrainingLoop(ABC, Generic[AgentT]):
         """
         path = self.folder / "checkpoint.pt"
         state = read_torch(path)
-        if state.get("identity") != self.identity:
+        found = state.get("identity") if isinstance(state, dict) else None
+        if found != self.identity:
             raise ResultsError(
-                f"{path}: belongs to another configuration (hash {state.get('identity')}, this "
-                f"run has {self.identity}); resume with the settings it was started with"
+                f"{path}: belongs to another configuration (hash {found}, not {self.identity})"
             )
-        self.iteration, self.updates = state["iteration"], state["updates"]
-        self.agent.load_state_dict(state["agent"])
-        self._remember(state["memory"])
-        self.rows, self.times = _rows(state["rows"]), _rows(state["times"])
+        try:
+            self.iteration, self.updates = int(state["iteration"]), int(state["updates"])
+            self.agent.load_state_dict(state["agent"])
+            self._remember(state["memory"])
+            self.rows, self.times = _rows(state["rows"]), _rows(state["times"])
+        except Exception as error:  # what a part that does not fit raises is of many kinds
+            raise ResultsError(f"{path}: does not fit this training: {error!r}") from error
 
 
 def episode_statistics(batch: TensorDictBase) -> dict[str, float]:

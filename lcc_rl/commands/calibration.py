@@ -14,11 +14,12 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from lcc_rl.config import build, config_hash, plain
+from lcc_rl.config import CALLED, build_as, config_hash, plain
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.idm_fit import Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
+from lcc_rl.envs.inputs import build_source
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
@@ -51,8 +52,8 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
     if missing:
         raise ConfigError(f"missing settings: give {', '.join(f'{key}=…' for key in missing)}")
     # Settings are checked before the data are read, which may take long.
-    calibrator = build(cfg.calibration, "calibration")
-    dataset = build(cfg.data, "data").load()
+    calibrator = build_as("a calibrator", CALLED, cfg.calibration, "calibration")
+    dataset = build_source(cfg.data).load()
     _say(console, dataset.report)
     start = perf_counter()
     result = _calibrate(calibrator, dataset.episodes, cfg.seed, device, console)

@@ -8,15 +8,21 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
-from lcc_rl.config import TARGET, build, load, require
+from lcc_rl.config import CALLED, build_as, load, require
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import constant_profiles, string_of
+from lcc_rl.envs.inputs import (
+    build_drivers,
+    build_source,
+    constant_profiles,
+    string_of,
+)
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.schemas import TrainConfig
+from lcc_rl.targets import TARGET
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
 OBJECTIVES = {
@@ -49,9 +55,9 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     check_sizes(cfg)
     check_objective(cfg)
     build_logger(cfg)
-    for key in ("data", "split"):
-        build(cfg[key], key)
-    population = build(cfg.drivers, "drivers")
+    build_source(cfg.data)
+    build_as("a split", CALLED, cfg.split, "split")
+    population = build_drivers(cfg)
     check_variant(cfg)
     trial = any_leader(cfg)
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
@@ -65,7 +71,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
 def build_logger(cfg: DictConfig) -> Any:
     """Build the logger of the training rows; a silent one where the run names none."""
     node = cfg.get("logger")
-    return Silent() if node is None else build(node, "logger")
+    return Silent() if node is None else build_as("a logger", ("opened",), node, "logger")
 
 
 def check_variant(cfg: DictConfig) -> None:

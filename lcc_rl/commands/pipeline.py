@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
+from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from functools import cache
 from pathlib import Path
@@ -15,14 +16,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
-from lcc_rl.config import build, load, plain, require
+from lcc_rl.config import load, plain, require
 from lcc_rl.data.episodes import write_episodes
-from lcc_rl.errors import Interrupted
+from lcc_rl.envs.inputs import build_source
+from lcc_rl.errors import Interrupted, ResultsError
 from lcc_rl.io.files import atomic_path
+from lcc_rl.io.settings import read_json
 from lcc_rl.results.drawing import save
 from lcc_rl.results.figures import learning_curve
-from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.results.trust import check_targets
+from lcc_rl.runs.cli import prepare_torch, root_key
 from lcc_rl.runs.progress import watch
+from lcc_rl.targets import forget_places
 
 log = logging.getLogger("lcc_rl")
 
@@ -79,6 +84,43 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
     return episodes
 
 
+def stored_overrides(path: Path, trust: Sequence[str]) -> list[str]:
+    """Read what a stopped job was started with, which may come from somebody else.
+
+    Args:
+        path: the file.
+        trust: modules outside this package that it may name.
+
+    Raises:
+        ResultsError: if it is damaged, or names foreign code or a place to write.
+    """
+    overrides = read_json(path)
+    if not isinstance(overrides, list) or not all(isinstance(item, str) for item in overrides):
+        raise ResultsError(f"{path}: damaged: expected a list of settings")
+    overrides = [item for item in overrides if root_key(item) != "trust"]
+    for item in overrides:
+        if "${" in item:
+            raise ResultsError(f"{path}: {item} refers to another value; expected plain values")
+    places: dict[str, str] = {}
+    for content in _composed(overrides):
+        check_targets(content, str(path), trust)
+        places |= {place.partition("=")[0]: place for place in forget_places(content)}
+    for place in places.values():
+        log.warning("%s: %s names a place to write and is left out", path, place)
+    kept = [item for item in overrides if item.lstrip("+").partition("=")[0] not in places]
+    if any(forget_places(content) for content in _composed(kept)):
+        raise ResultsError(f"{path}: names a place to write: {', '.join(places.values())}")
+    return kept
+
+
+def _composed(overrides: list[str]) -> list[dict[str, Any]]:
+    """Compose a job and the training of each of its variants, as plain containers."""
+    job = load("pipeline", overrides)
+    shared = [item for item in overrides if root_key(item) not in OWN]
+    parts = [load("train", [*shared, f"variant={name}"]) for name in job.variants]
+    return [plain(cfg) for cfg in (job, *parts)]
+
+
 def _episodes(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Return the node of the trajectories that a job keeps in its folder."""
     node = {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
@@ -89,7 +131,7 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
     """Read the trajectories once, keep them, and calibrate; skip what is already there."""
     table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
     if not table.exists():
-        loaded = build(cfg.data, "data").load()
+        loaded = build_source(cfg.data).load()
         for line in loaded.report:
             log.info(line)
         write_episodes(loaded.episodes, table)
@@ -146,11 +188,6 @@ def _train_one(settings: dict[str, Any], folder: str) -> None:
 
 def _finished(folder: Path) -> bool:
     return (folder / "episodes.parquet").exists()
-
-
-def root_key(override: str) -> str:
-    """Return the top-level key that an override changes."""
-    return override.lstrip("+~").split("=")[0].split(".")[0].split("@")[0]
 
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:

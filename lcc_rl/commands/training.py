@@ -7,14 +7,14 @@ from functools import partial
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_settings, objectives
 from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write
 from lcc_rl.config import identity, require
 from lcc_rl.envs import Inputs, load_inputs
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
@@ -25,11 +25,13 @@ from lcc_rl.results.runs import load_config, load_policy, save_config, save_poli
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.loggers import Silent
 from lcc_rl.runs.states import working
 
 log = logging.getLogger("lcc_rl")
 
 POLICIES, POLICY, CHECKPOINT = "policies", "policy.pt", "checkpoint.pt"
+RECORD, IDENTITY = "training.parquet", "lcc_rl.config"
 
 
 def run(
@@ -58,7 +60,7 @@ def run(
     folder, named = Path(folder), cfg.resume is not None
     if named:
         folder = Path(cfg.resume)
-        cfg = load_config(folder, tuple(cfg.trust))
+        cfg = _resumed(cfg, folder)
     elif (folder / CHECKPOINT).exists() and not resume:
         raise ConfigError(
             f"{folder} already holds a training; resume it with resume={folder} or choose another "
@@ -68,13 +70,34 @@ def run(
         return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
 
 
+def _resumed(cfg: DictConfig, folder: Path) -> DictConfig:
+    """Return the configuration of the run in a folder, checked against what that run made.
+
+    Where the rows are logged may be said anew: what is stored names no place to write.
+    """
+    own = load_config(folder, tuple(cfg.trust))
+    for table in (EPISODES, RECORD):
+        made_by = (
+            parquet_metadata(folder / table).get(IDENTITY) if (folder / table).exists() else None
+        )
+        if made_by not in (None, identity(own)):
+            raise ResultsError(
+                f"{folder}: {table} belongs to another configuration than config.yaml (hash "
+                f"{made_by}, not {identity(own)}); resume with the settings it was started with"
+            )
+    if not isinstance(build_logger(cfg), Silent):
+        OmegaConf.update(own, "logger", cfg.logger, force_add=True)
+    return own
+
+
 def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFrame:
     prepare_torch(cfg)
     check_settings(cfg, folder)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
-    save_config(cfg, folder)
+    if not learns(cfg) or cfg.get("policy") is not None:
+        save_config(cfg, folder)
     if not learns(cfg):
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
         strategy = rule(cfg)
@@ -108,6 +131,7 @@ def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: 
     trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
     if resume:
         trainer.load()
+    save_config(cfg, folder)
     remove_leftovers(folder / POLICIES)
     trainer.on_keep = partial(keep_policy, agent, cfg, folder)
     with build_logger(cfg).opened(folder) as trainer.on_row:
@@ -124,7 +148,7 @@ def keep_policy(agent: Agent, cfg: DictConfig, folder: Path, iteration: int) -> 
 def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
-    if table.exists() and parquet_metadata(table).get("lcc_rl.config") == identity(cfg):
+    if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return read_parquet(table)
     return run(cfg, folder, quiet=True, resume=True)

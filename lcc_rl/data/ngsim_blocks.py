@@ -255,6 +255,8 @@ def _line_chunks(name: str) -> Iterator[bytes]:
 
 def _opened(name: str) -> IO[bytes]:
     """Open a file, decompressed where its first bytes are those of gzip."""
+    if Path(name).exists() and not Path(name).is_file():  # a pipe would be waited for
+        raise DataError(f"{name}: cannot be read: a folder, pipe or device; expected a file")
     with open(name, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
     return gzip.open(name, "rb") if packed else open(name, "rb")  # type: ignore[return-value]

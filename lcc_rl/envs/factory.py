@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import build, load
+from lcc_rl.config import CALLED, build_as, load
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic
@@ -107,10 +107,7 @@ def _build(node: Any, where: str, **resources: Any) -> Any:
     Raises:
         ConfigError: if the node describes something else.
     """
-    piece = build(node, where, **resources)
-    if not isinstance(piece, Piece):
-        raise ConfigError(f"{where}: expected a piece, {type(piece).__name__} is none")
-    return piece
+    return build_as("a piece", Piece, node, where, **resources)
 
 
 def _leader(scenario: Any, node: Any, resources: dict[str, Any]) -> list[Piece]:
@@ -146,7 +143,7 @@ def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) ->
 
 def _motion(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> StringMotion:
     start = {
-        role: build(node, f"scenario.start.{role}", role=role, **resources)
+        role: build_as("a start", CALLED, node, f"scenario.start.{role}", role=role, **resources)
         for role, node in scenario.start.items()
         if role in string.names and node is not None and not string.ring
     }

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
 
-from lcc_rl.config import build, is_sweep, plain
+from lcc_rl.config import CALLED, build_as, is_sweep, plain
 from lcc_rl.config_checks import string_of_scenario
 from lcc_rl.data.cycles import Case
 from lcc_rl.data.profiles import Profiles, from_records, leader_profiles
@@ -52,6 +52,25 @@ def string_of(cfg: DictConfig) -> VehicleString:
     return string_of_scenario(cfg.scenario)
 
 
+def build_drivers(cfg: DictConfig) -> Population:
+    """Build the human drivers of a configuration.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    needed = ("desired_speed", "time_gap", "constants")
+    return cast(Population, build_as("a population", needed, cfg.drivers, "drivers"))
+
+
+def build_source(node: Any) -> Any:
+    """Build the source of episodes that the node ``data`` describes.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    return build_as("a source of episodes", ("load",), node, "data")
+
+
 def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     """Read what the leader drives, split it and build the population.
 
@@ -63,7 +82,7 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
         DataError, ConfigError: naming the file, row or option at fault.
     """
     scenario = cfg.scenario
-    population = build(cfg.drivers, "drivers")
+    population = build_drivers(cfg)
     if scenario.road == RING:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
@@ -75,7 +94,7 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
         loaded = _load_episodes(cfg.data)
         episodes, report = loaded.episodes, loaded.report
     profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
-    training, evaluation = build(cfg.split, "split")(profiles)
+    training, evaluation = build_as("a split", CALLED, cfg.split, "split")(profiles)
     windows = evaluation.windows(scenario.horizon, cfg.evaluation.profiles)
     available = {"profiles": len(windows), "drivers": len(population.time_gap)}
     return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
@@ -96,11 +115,11 @@ _loaded: dict[str, LoadedEpisodes] = {}
 def _load_episodes(node: DictConfig) -> LoadedEpisodes:
     """Load episodes; the runs of a sweep that one process does share those of the same files."""
     if not is_sweep():
-        return build(node, "data").load()
+        return build_source(node).load()
     settings = plain(node)
     key = json.dumps([settings, list(_stamps(settings))])
     if key not in _loaded:
-        loaded = build(node, "data").load()
+        loaded = build_source(node).load()
         _loaded.clear()
         _loaded[key] = loaded
     return _loaded[key]
@@ -130,7 +149,7 @@ def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
 def _record_inputs(cfg: DictConfig, population: Population) -> Inputs:
     """Read the records that the leader drives."""
     scenario = cfg.scenario
-    leaders = build(cfg.leader, "leader").load(
+    leaders = build_as("a source of leaders", ("load",), cfg.leader, "leader").load(
         scenario.time_step, scenario.horizon, len(string_of(cfg))
     )
     return Inputs(

@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.config import plain
+from lcc_rl.config_checks import AUTO
 from lcc_rl.errors import ConfigError
 from lcc_rl.results.runs import differing, flatten
 
@@ -37,11 +38,52 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
             f"policy={cfg.policy} was trained with another observation than this: expected "
             f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
         )
+    check_action(str(cfg.policy), own, cfg)
     remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
     if remembered != asked:
         raise ConfigError(
             f"policy={cfg.policy} was trained with another memory than this: "
             f"expected scenario.pieces.memory={remembered}, got {asked}"
+        )
+
+
+def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
+    """Check that a policy to compare with was trained in the scenario under study.
+
+    Raises:
+        ConfigError: naming both.
+    """
+    if own.scenario.name != cfg.scenario.name:
+        raise ConfigError(
+            f"policy={path} was trained as variant {own.variant}, in the scenario "
+            f"{own.scenario.name}, not in {cfg.scenario.name}"
+        )
+
+
+def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
+    """Check that an action means what it did in training: how much, and for how long.
+
+    Args:
+        path: where the policy comes from, for the message.
+        own: configuration of its training.
+        cfg: configuration under study.
+
+    Raises:
+        ConfigError: naming what differs.
+    """
+    trained_with, asked = (
+        {"scenario.time_step": node.scenario.time_step}
+        | dict(flatten({AUTO: plain(node.scenario.controllers.automated)}))
+        for node in (own, cfg)
+    )
+    changes = [
+        f"{key}={trained_with.get(key)}, got {asked.get(key)}"
+        for key in differing(trained_with, asked)
+    ]
+    if changes:
+        raise ConfigError(
+            f"policy={path}: its action means something else here: it was trained with "
+            f"{'; '.join(changes)}"
         )
 
 

@@ -16,14 +16,15 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import TARGET, load, plain, short_name
+from lcc_rl.config import load, plain, short_name
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.evaluation.fit import check_policy, check_width
+from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.policies import shared_policy
+from lcc_rl.targets import TARGET
 
 log = logging.getLogger("lcc_rl")
 
@@ -232,11 +233,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
     """
     weights, own = policy
     other = _copy(cfg)
-    if own.scenario.name != cfg.scenario.name:
-        raise ConfigError(
-            f"policy={path} was trained as variant {own.variant}, in the scenario "
-            f"{own.scenario.name}, not in {cfg.scenario.name}"
-        )
+    check_scenario(path, own, cfg)
     for key in ("variant", "agent", "observation"):
         other[key] = own[key]
     other.deployed = own.get("deployed")
@@ -246,8 +243,9 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
     for name, node in own.scenario.pieces.items():
         if name in KNOWLEDGE or name not in other.scenario.pieces:
             other.scenario.pieces[name] = node
+    check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
-    return replace(strategy, cfg=deployed(strategy.cfg))
+    return replace(strategy, cfg=deployed(other))
 
 
 def with_weights(
@@ -256,23 +254,24 @@ def with_weights(
     """Build a strategy and load its policy's weights.
 
     Raises:
-        ResultsError: if the weights do not fit the network.
+        ResultsError: if the agent cannot be built, or the weights do not fit its network.
     """
-    agent = build_agent(cfg, population, cfg.device)
+    try:
+        agent = build_agent(cfg, population, cfg.device)
+    except ConfigError as error:
+        raise ResultsError(f"{path}: its agent cannot be built: {error}") from error
     check_width(agent.policy, weights, path)
     try:
         agent.policy.load_state_dict(dict(weights))
     except RuntimeError as error:
-        raise ResultsError(f"{path}: the weights do not fit the policy network: {error}") from error
+        words = f"the weights do not fit the policy network: {' '.join(str(error).split())}"
+        raise ResultsError(f"{path}: {words}") from error
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed)
 
 
 def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     """Add its agent to the name of a variant that more than one kind of agent has learned."""
-    kinds = [
-        short_name(strategy.cfg.agent[TARGET]) if strategy.policy is not None else ""
-        for strategy in strategies
-    ]
+    kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
     named = [(strategy.name, kind) for strategy, kind in zip(strategies, kinds, strict=True)]
     learned_by = Counter(name for name, _ in set(named))
     return [

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pandas as pd
-import yaml
+import torch
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import TARGET, find_target, plain
+from lcc_rl.config import plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.files import atomic_path, read_parquet, read_torch, write_torch
+from lcc_rl.io.settings import parse_yaml, read_text
+from lcc_rl.results.trust import trusted
+
+log = logging.getLogger("lcc_rl")
 
 CONFIG = "config.yaml"
 PRETRAINED = "pretrained"
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
-# Packages whose classes a stored configuration may name.
-ROOMS = "agents data drivers evaluation functional pieces policies runs.loggers synthetic"
-REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
+# What evaluating a policy reads of the configuration of its training.
+POLICY_KEYS = (
+    *("agent", "observation", "scenario.controllers.automated", "scenario.pieces"),
+    "scenario.filters",
+)
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 
 
@@ -45,10 +52,9 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:
     path = Path(folder) / CONFIG
     if not path.is_file():
         raise ConfigError(f"{folder}: not a run folder: it has no {CONFIG}")
-    cfg = OmegaConf.create(read_settings(path))
-    if "variant" not in cfg:
-        raise ResultsError(f"{path}: not the configuration of a run")
-    check_targets(cfg, str(path), trust)
+    cfg, places = trusted(read_settings(path), str(path), trust)
+    for place in places:
+        log.warning("%s: %s names a place to write and is left out", path, place)
     return cfg
 
 
@@ -58,15 +64,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     Raises:
         ResultsError: if it is damaged.
     """
-    # The C loader is five times as fast as OmegaConf's.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    try:
-        content = yaml.load(path.read_text(), Loader=loader)  # safe: plain values only
-    except (yaml.YAMLError, OSError, ValueError) as error:
-        raise ResultsError(f"{path}: damaged: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
-        raise ResultsError(f"{path}: damaged: expected settings, got {type(content).__name__}")
-    return content
+    return parse_yaml(read_text(path), str(path))
 
 
 def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None:
@@ -117,66 +115,44 @@ def load_policy(
     content = read_torch(path)
     if not isinstance(content, dict) or not {"weights", "config"} <= set(content):
         raise ResultsError(f"{path}: not a policy: expected the entries weights and config")
-    try:
-        cfg = OmegaConf.create(str(content["config"]))
-    except Exception as error:  # yaml and OmegaConf raise many kinds
-        raise ResultsError(f"{path}: its configuration is damaged: {error}") from error
-    if not isinstance(cfg, DictConfig) or "variant" not in cfg:
-        raise ResultsError(f"{path}: its configuration is damaged")
-    check_targets(cfg, str(path), trust)
-    return content["weights"], cfg
+    weights = content["weights"]
+    check_weights(weights, path)
+    cfg, _ = trusted(parse_yaml(str(content["config"]), f"{path} (config)"), str(path), trust)
+    if not (isinstance(cfg.get("agent"), DictConfig) and isinstance(cfg.get("seed"), int)):
+        raise ResultsError(f"{path}: not the configuration of a training: it has no agent or seed")
+    for key in POLICY_KEYS:
+        if not isinstance(OmegaConf.select(cfg, key), DictConfig):
+            raise ResultsError(f"{path}: its configuration is damaged: {key} is missing")
+    return weights, cfg
 
 
-def check_targets(cfg: DictConfig, where: str, trust: Sequence[str] = ()) -> None:
-    """Check that a stored configuration names no code outside :data:`REGISTRY`.
-
-    Building a node of it imports and calls what it names.
-
-    Args:
-        cfg: the configuration.
-        where: the file it comes from, for the message.
-        trust: further modules that may be named, e.g. ``["mine"]``.
+def check_weights(weights: Any, path: Path) -> None:
+    """Check that weights are finite numbers by name.
 
     Raises:
-        ResultsError: naming the target, or a reference instead of a value.
+        ResultsError: naming the file and the entry at fault.
     """
-    content = cast(Mapping[str, Any], OmegaConf.to_container(cfg, resolve=False))
-    for key, value in flatten(content):
-        if "${" in str(value):
-            raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
-        if key.rpartition(".")[2] == TARGET and not is_registered(str(value), where, trust):
-            module = str(value).rpartition(".")[0]
-            raise ResultsError(
-                f"{where}: {key} names {value!r}, which is not part of lcc_rl; if you trust it, "
-                f"say trust=[{module}]"
-            )
+    if not isinstance(weights, dict) or not weights:
+        raise ResultsError(f"{path}: weights are {type(weights).__name__}, expected named tensors")
+    for name, value in weights.items():
+        if not isinstance(name, str) or not isinstance(value, torch.Tensor):
+            kind = type(value).__name__
+            raise ResultsError(f"{path}: weight {name!r} is {kind}, expected a named tensor")
+        if not bool(torch.isfinite(value).all()):
+            raise ResultsError(f"{path}: weight {name!r} holds values that are no numbers")
 
 
-def is_registered(target: str, where: str, trust: Sequence[str] = ()) -> bool:
-    """Whether a target is defined in :data:`REGISTRY` or in a trusted module.
-
-    Raises:
-        ResultsError: if a module of the registry has no such target.
-    """
-    module = target.rpartition(".")[0]
-    if module in trust:
-        return True
-    if not module.startswith(REGISTRY):
-        return False
-    # A module also holds what it imports, such as import_module.
-    try:
-        found = find_target(target, where)
-    except ConfigError as error:
-        raise ResultsError(f"{error}; of another release, or damaged") from error
-    return str(getattr(found, "__module__", "")).startswith(REGISTRY)
-
-
-def load(root: str | Path = "outputs", table: str = "episodes") -> pd.DataFrame:
+def load(
+    root: str | Path = "outputs", table: str = "episodes", strict: bool = False
+) -> pd.DataFrame:
     """Read one table of every run below a folder.
+
+    A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run.
 
     Args:
         root: a run folder, or any folder above runs.
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
+        strict: raise for a damaged run instead.
 
     Returns:
         The rows of all runs, in the order of their folders, with the column ``run`` and one
@@ -185,23 +161,36 @@ def load(root: str | Path = "outputs", table: str = "episodes") -> pd.DataFrame:
 
     Raises:
         ConfigError: if the table's name is unknown.
-        ResultsError: if there is no such table below ``root``, or one cannot be read.
+        ResultsError: if no such table below ``root`` can be read.
     """
     if table not in TABLES:
         raise unknown_name("table", table, TABLES)
     root = Path(root)
-    frames = []
+    frames, damaged = [], {}
     for path in sorted(root.rglob(f"{table}.parquet")):
-        frame = read_parquet(path)
-        folder = path.parent
-        config = folder / CONFIG
-        settings = dict(flatten(read_settings(config))) if config.is_file() else {}
-        extra = {"run": str(folder.relative_to(root)), **settings}
-        new = {k: [v] * len(frame) for k, v in extra.items() if k not in frame.columns}
-        frames.append(pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1))
+        run = str(path.parent.relative_to(root))
+        try:
+            frames.append(_with_settings(read_parquet(path), path.parent, run))
+        except ResultsError as error:
+            if strict:
+                raise
+            log.warning("left out: %s", error)
+            damaged[run] = str(error)
     if not frames:
-        raise ResultsError(f"{root}: no {table}.parquet in it or below it")
-    return pd.concat(frames, ignore_index=True)
+        why = f"; none is readable: {next(iter(damaged.values()))}" if damaged else ""
+        raise ResultsError(f"{root}: no {table}.parquet in it or below it{why}")
+    rows = pd.concat(frames, ignore_index=True)
+    rows.attrs |= {"damaged": damaged} if damaged else {}
+    return rows
+
+
+def _with_settings(frame: pd.DataFrame, folder: Path, run: str) -> pd.DataFrame:
+    """Add the run's name and its settings as columns."""
+    config = folder / CONFIG
+    settings = dict(flatten(read_settings(config))) if config.is_file() else {}
+    extra = {"run": run, **settings}
+    new = {k: [v] * len(frame) for k, v in extra.items() if k not in frame.columns}
+    return pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1)
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn
+from unittest.mock import patch
 
 import hydra
 import torch
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
@@ -22,8 +24,9 @@ from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible
+from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.precision import set_precision
-from lcc_rl.runs.states import Busy, forget, input_error, is_finished, record
+from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
 
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
@@ -76,13 +79,38 @@ def start(command: Callable[[], Any], config_name: str) -> None:
     wanted = TRACEBACK in os.environ
     # Hydra raises errors instead of printing them.
     os.environ.setdefault(TRACEBACK, "1")
-    guarded = sweep if wanted else main_guard(explaining(sweep, config_name))
+    guarded = run_sorted if wanted else main_guard(explaining(run_sorted, config_name))
     try:
-        with interruptible():
+        with interruptible(), unbroken_output():
             guarded(command)
     finally:
         if not wanted:
             os.environ.pop(TRACEBACK, None)
+
+
+def run_sorted(command: Callable[[], Any]) -> None:
+    """Run a Hydra command whose flags may stand anywhere among the settings."""
+    with patch.object(sys, "argv", [sys.argv[0], *flags_first(sys.argv[1:])]):
+        sweep(command)
+
+
+def flags_first(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with its flags, as ``-m``, before the settings.
+
+    Raises:
+        ConfigError: naming a flag that does not exist.
+    """
+    parser = get_args_parser()
+    known, unknown = parser.parse_known_intermixed_args(list(words))
+    if unknown:
+        raise ConfigError(
+            f"unknown flag {unknown[0]}: settings are written key=value, without dashes; flags "
+            "are --help, --cfg job, --info and, for a sweep, -m"
+        )
+    flags = list(words)
+    for item in known.overrides:
+        flags.remove(item)
+    return [*flags, *known.overrides]
 
 
 def sweep(command: Callable[[], Any]) -> None:
@@ -121,20 +149,22 @@ def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
 
 
 def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """Write ``error.txt`` into the run's folder on an error, unless the run is finished."""
+    """Write ``error.txt`` into the run's folder on an error, unless it held a run before."""
 
     def recording(cfg: DictConfig) -> Any:
         folder = run_folder()
-        forget(folder)
+        before = (folder / CONFIG).exists()
         try:
-            return function(cfg)
+            result = function(cfg)
         except (Interrupted, Busy):
             raise
         except Exception as error:
-            # A command that names a finished run by mistake does not make it a failed one.
-            if not is_finished(folder):
+            # A command that names another run by mistake leaves it as it was.
+            if not before:
                 record(folder, error)
             raise
+        forget(folder)
+        return result
 
     return recording
 
@@ -145,7 +175,8 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def guarded(*arguments: Any, **settings: Any) -> Any:
         try:
-            return function(*arguments, **settings)
+            with unbroken_output():
+                return function(*arguments, **settings)
         except INPUT_ERRORS as error:
             _stop(error)
         except KeyboardInterrupt:
@@ -164,6 +195,11 @@ def _stop(error: Exception) -> NoReturn:
         sys.exit(INTERRUPTED)
     print(f"lcc_rl: error: {text}", file=sys.stderr)
     sys.exit(BAD_INPUT)
+
+
+def root_key(override: str) -> str:
+    """Return the top-level key that an override changes."""
+    return override.lstrip("+~").split("=")[0].split(".")[0].split("@")[0]
 
 
 def run_folder() -> Path:

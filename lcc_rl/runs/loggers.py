@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchrl.record.loggers import Logger
 
@@ -39,6 +39,8 @@ class RowLogger:
     Raises:
         ConfigError: if the kind is unknown.
     """
+
+    WRITES: ClassVar = ("where",)  # settings that name a place to write
 
     kind: str
     where: str | None = None

@@ -5,7 +5,7 @@ A run locks its folder while it works, writes ``error.txt`` when it fails and it
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import traceback
 from collections.abc import Iterator
@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.files import atomic_path, remove_leftovers
+from lcc_rl.io.settings import read_json, read_text
 
 try:
     import fcntl
@@ -26,7 +27,8 @@ except ImportError:  # Windows: runs are not locked there
 LOCK, ERROR, PROGRESS = ".lock", "error.txt", "progress.json"
 # The table that a run writes last: a training or evaluation, a calibration.
 RESULTS = ("episodes.parquet", "drivers.parquet")
-MARKS = {"config.yaml", ERROR, LOCK, *RESULTS}
+CONFIG = "config.yaml"
+MARKS = {CONFIG, ERROR, LOCK, *RESULTS}
 STATES = ("finished", "running", "stopped", "failed")
 
 
@@ -125,7 +127,9 @@ def working(folder: Path) -> Iterator[None]:
         except Interrupted:
             raise
         except Exception as error:
-            record(folder, error)
+            # A finished run that a command could not repeat stays one.
+            if not is_finished(folder):
+                record(folder, error)
             raise
 
 
@@ -173,8 +177,8 @@ def inspect_run(folder: Path, name: str | None = None) -> RunState:
     if is_claimed(folder):
         return RunState(name, "running", done, total, float(progress.get("eta_s", 0.0)))
     if (folder / ERROR).exists():
-        with suppress(OSError):
-            lines = (folder / ERROR).read_text().splitlines()
+        with suppress(ResultsError):
+            lines = read_text(folder / ERROR).splitlines()
             return RunState(name, "failed", done, total, error=lines[0] if lines else "")
     if is_finished(folder):
         return RunState(name, "finished", done, total)
@@ -184,9 +188,15 @@ def inspect_run(folder: Path, name: str | None = None) -> RunState:
 def read_progress(folder: Path) -> dict[str, float] | None:
     """Return the content of a run's ``progress.json``, None if there is none."""
     try:
-        return dict(json.loads((folder / PROGRESS).read_text()))
-    except (OSError, ValueError):
+        content = dict(read_json(folder / PROGRESS))
+        numbers = {
+            key: value
+            for key, value in content.items()
+            if isinstance(value, (int, float)) and math.isfinite(value)
+        }
+    except (ResultsError, ValueError, TypeError, OverflowError):
         return None
+    return numbers if {"done", "total", "eta_s"} <= numbers.keys() else None
 
 
 def run_folders(root: Path) -> list[Path]:

@@ -23,8 +23,9 @@ from rich.console import Console
 from rich.live import Live
 
 from lcc_rl.config import NOT_IDENTITY, identity
-from lcc_rl.errors import Interrupted, LccError
+from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.files import atomic_path
+from lcc_rl.io.settings import read_json
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.search import resume_search
 from lcc_rl.runs.states import Busy, one_line, record, survey
@@ -178,8 +179,9 @@ def make_plan(config: DictConfig) -> Plan:
 def read_plan(folder: Path) -> Plan:
     """Return the plan of the sweep in a folder, an empty one if there is none."""
     try:
-        return Plan(**json.loads((folder / PLAN).read_text()))
-    except (OSError, ValueError, TypeError):
+        plan = Plan(**read_json(folder / PLAN))
+        return Plan(int(plan.runs), [str(key) for key in plan.varied])
+    except (ResultsError, ValueError, TypeError, OverflowError):
         return Plan()
 
 

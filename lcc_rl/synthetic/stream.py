@@ -8,10 +8,14 @@ and calibration as the real files. Unlike there, the parameters of every driver 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from filecmp import cmp
 from pathlib import Path
+from shutil import copyfile
 from tempfile import TemporaryDirectory
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -22,7 +26,7 @@ from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.errors import ConfigError
-from lcc_rl.io.files import write_parquet
+from lcc_rl.io.files import atomic_path, write_parquet
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
@@ -46,12 +50,14 @@ class StreamSource:
         leader: the stochastic leader; by default the one fitted to I-80.
         drivers: the population; by default the shipped I-80 drivers.
         criteria: what counts as car following; by default that of the real files.
-        keep: path under which the file is kept, compressed where it ends in ``.gz``; by default
-            a temporary file is used.
+        keep: new path under which the file is kept, compressed where it ends in ``.gz``; by
+            default a temporary file is used.
 
     Raises:
         ConfigError: if an argument is out of range, naming it.
     """
+
+    WRITES: ClassVar = ("keep",)  # settings that name a place to write
 
     recordings: int = 3
     platoons: int = 30
@@ -80,6 +86,8 @@ class StreamSource:
                 "stream: 'duration_s' must be two numbers, a range from 1 s up, "
                 f"got {self.duration_s!r}"
             )
+        if self.keep is not None and not str(self.keep).endswith((".csv", ".csv.gz")):
+            raise ConfigError(f"data.keep must name a .csv or .csv.gz file, got {self.keep!r}")
         if not isinstance(self.noise, (int, float)) or not 0.0 <= self.noise < 1.0:
             raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise!r}")
 
@@ -124,15 +132,34 @@ class StreamSource:
 
         Raises:
             DataError: if no pair meets the criteria.
+            ConfigError: if ``keep`` names a file that holds something else.
             ResultsError: if the file cannot be written.
         """
         with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
-            path = Path(self.keep or Path(folder) / "stream.csv").expanduser()
+            kept = Path(self.keep or "stream.csv").expanduser()
+            path = Path(folder) / kept.name
             self.write(path)
             loaded = NgsimSource(str(path), criteria=self.criteria).load()
+            if self.keep is not None:
+                keep_files({path: kept, truth_path(path): truth_path(kept)})
         size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"
         line = f"synthetic stream: {size} vehicles, seed {self.seed}"
         return replace(loaded, report=[line, *loaded.report])
+
+
+def keep_files(files: Mapping[Path, Path]) -> None:
+    """Copy files to where nothing stands, or the same already does.
+
+    Raises:
+        ConfigError: if one of the places holds something else; then none is written.
+    """
+    new = {made: place for made, place in files.items() if not place.exists()}
+    for made, place in files.items():
+        if made not in new and not (place.is_file() and cmp(made, place, shallow=False)):
+            raise ConfigError(f"data.keep: {place} exists and holds something else; name a new one")
+    for made, place in new.items():
+        with atomic_path(place) as temporary:
+            copyfile(made, temporary)
 
 
 def truth_path(path: str | Path) -> Path:

@@ -11,8 +11,8 @@ import torch
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.io.files import read_torch, write_torch
-from lcc_rl.results.runs import load_policy, pretrained_path
+from lcc_rl.io.files import read_torch
+from lcc_rl.results.runs import load_policy, pretrained_path, save_policy
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "export_pretrained.py"
 TINY = ("experiment=smoke", "data.platoons=4", "data.recordings=2", "scenario.horizon=40")
@@ -44,9 +44,10 @@ def test_export_leaves_out_what_belongs_to_one_machine(tmp_path) -> None:
     assert spec.loader is not None
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)
-    source = {"weights": {"w": torch.ones(1)}, "config": "variant: mine\ndata: {path: /home/me}\n"}
-    write_torch(source, tmp_path / "policy.pt")
+    cfg = load("train", ["variant=alcc", "data=episodes", "data.path=/home/me"])
+    save_policy({"w": torch.ones(1)}, cfg, tmp_path / "policy.pt")
     content = read_torch(tool.export(tmp_path / "policy.pt", "a trial", tmp_path / "out"))
-    assert content["config"] == "variant: mine\n"
+    assert "variant: alcc\n" in content["config"]
+    assert "/home/me" not in content["config"]
     assert content["provenance"].startswith("a trial")
     assert tool.main([str(tmp_path / "missing.pt"), "nothing"]) == 1

@@ -166,7 +166,7 @@ def test_damaged_parquet(tmp_path, content) -> None:
 
 def test_newer_schema_is_refused(tmp_path) -> None:
     write_parquet(pd.DataFrame({"a": [1]}), tmp_path / "a.parquet", {"lcc_rl.schema": "99"})
-    with pytest.raises(ResultsError, match="schema version 99"):
+    with pytest.raises(ResultsError, match=r"schema version .99."):
         read_parquet(tmp_path / "a.parquet")
 
 

@@ -84,7 +84,7 @@ def _filter(page: Page) -> None:
 def _learning(page: Page) -> None:
     if not any((page.folder / "train").rglob("training.parquet")):
         return
-    training = results.load(page.folder / "train", "training")
+    training = results.load(page.folder / "train", "training", strict=True)
     text = (
         "Rewards are sums per episode as played in training, where agents other than "
         "analytic add noise to their actions, mean over the episodes of a batch. drop: how far "

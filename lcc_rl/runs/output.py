@@ -1,0 +1,58 @@
+"""Standard output that somebody may stop reading."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
+from typing import Any, cast
+
+
+class Unbroken:
+    """A stream of text that drops what is written once nobody reads it.
+
+    ``python -m lcc_rl.train … | head -1`` trains to the end: its results are files.
+
+    Args:
+        stream: the stream itself.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text, or drop it."""
+        self._attempt(lambda: self._stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Hand over what is written, or drop it."""
+        self._attempt(self._stream.flush)
+
+    def _attempt(self, action: Callable[[], Any]) -> None:
+        try:
+            action()
+        except BrokenPipeError:
+            # What is still buffered, and all that follows, goes nowhere.
+            with suppress(OSError):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                os.close(nowhere)
+
+
+@contextmanager
+def unbroken_output() -> Iterator[None]:
+    """Let standard output and error drop what nobody reads, instead of raising."""
+    with ExitStack() as stack:
+        for stream, redirect in ((sys.stdout, redirect_stdout), (sys.stderr, redirect_stderr)):
+            if not isinstance(stream, Unbroken):
+                stack.enter_context(redirect(cast(Any, Unbroken(stream))))
+        try:
+            yield
+        finally:
+            for stream in (sys.stdout, sys.stderr):
+                stream.flush()

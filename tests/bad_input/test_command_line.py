@@ -1,0 +1,238 @@
+"""Whatever is typed: a wrong command ends in one line and leaves every folder as it was."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands import NO_AGENT, run_command
+from test_foreign_files import content
+
+from lcc_rl.agents.factory import learns
+from lcc_rl.commands import calibration, training
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
+from lcc_rl.runs.cli import flags_first
+from lcc_rl.runs.output import Unbroken
+from lcc_rl.runs.states import inspect_run
+
+AUTO = "scenario.controllers.automated"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    words = (*NO_AGENT, "variant=idm", "hydra.run.dir=run")
+    run_command("lcc_rl.train", *words, cwd=folder, check=True)
+    return folder / "run"
+
+
+# -- nodes that describe something else ------------------------------------------------------------
+
+BROKEN = """
+class Raises:
+    def __init__(self, **settings):
+        raise KeyError("inside")
+
+class Other:
+    pass
+
+class Called:
+    __call__ = None
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch) -> None:
+    (tmp_path / "foreign_pieces.py").write_text(BROKEN)
+    (tmp_path / "foreign_broken.py").write_text("raise RuntimeError('on import')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.mark.parametrize("node", ["data", "split", "drivers", "observation", "agent", AUTO])
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("foreign_pieces.Raises", "Raises cannot be built: KeyError: 'inside'"),
+        ("foreign_pieces.Other", "expected an? .*, Other is none"),
+        ("foreign_broken.X", "cannot find 'foreign_broken.X': on import"),
+        ("os.getcwd", "expected an? .*, str is none"),
+        ("os.sep", "'os.sep' is no class or function"),
+        ("builtins.dict", "cannot be built from settings"),
+    ],
+)
+def test_a_node_of_the_wrong_kind_is_named(mine, tmp_path, node, target, words) -> None:
+    cfg = load("train", ["experiment=smoke", "variant=alcc", f"{node}._target_={target}"])
+    with pytest.raises(ConfigError, match=rf"^{node}.*{words}.*$"):
+        training.run(cfg, tmp_path / "run", quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["+logger={_target_: os.getcwd}"], "logger: expected a logger, str is none"),
+        (["scenario.start.automated._target_=os.getcwd"], "start.automated: expected a start, str"),
+        (["reward.terms.safety._target_=builtins.print"], "reward.terms.safety: expected a piece"),
+        (["scenario.pieces.power._target_=fractions.Fraction"], "pieces.power: expected a piece"),
+        (["variant=cacc", "leader._target_=os.getcwd"], "leader: expected a source of leaders"),
+    ],
+)
+def test_nodes_of_other_kinds(tmp_path, overrides, words) -> None:
+    base = ["variant=alcc"] if "variant=cacc" not in overrides else []
+    with pytest.raises(ConfigError, match=words):
+        training.run(load("train", ["experiment=smoke", *base, *overrides]), tmp_path, quiet=True)
+
+
+def test_a_calibrator_that_is_none(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="calibration: expected a calibrator, str is none"):
+        calibration.run(load("calibrate", ["calibration._target_=os.getcwd"]), tmp_path)
+
+
+# -- options ---------------------------------------------------------------------------------------
+
+
+def test_a_setting_inside_a_node_that_stands_for_another() -> None:
+    words = ["variant=alcc", f"controller@{AUTO}=handover", "agent=none"]
+    with pytest.raises(ConfigError, match="stands for") as caught:
+        load("train", [*words, f"{AUTO}.before.noise=0.1"])
+    assert str(caught.value) == (
+        f"{AUTO}.before.noise: {AUTO}.before stands for ${{scenario.controllers.human}}; set "
+        f"scenario.controllers.human.noise for both, or give {AUTO}.before a node of its own: "
+        f"'{AUTO}.before={{_target_: …, noise: …}}'"
+    )
+    own = f"{AUTO}.before={{_target_: lcc_rl.pieces.IDM, noise: 0.1}}"
+    assert load("train", [*words, own])["scenario"]["controllers"]["automated"]["before"]["noise"]
+
+
+def test_a_recipe_for_learners_leaves_no_agent_where_nothing_learns() -> None:
+    cfg = load("train", ["experiment=quickstart", "variant=idm"])
+    assert cfg.agent is None
+    assert not learns(cfg)
+
+
+@pytest.mark.parametrize(
+    ("typed", "sorted_words"),
+    [
+        (["a=1", "-m", "seed=1,2"], ["-m", "a=1", "seed=1,2"]),
+        (["a=1", "--cfg", "job", "b=2"], ["--cfg", "job", "a=1", "b=2"]),
+        (["-m", "a=-m", "b=2"], ["-m", "a=-m", "b=2"]),
+        (["a=1", "--config-dir", "x", "a=1"], ["--config-dir", "x", "a=1", "a=1"]),
+        ([], []),
+    ],
+)
+def test_flags_may_stand_anywhere(typed, sorted_words) -> None:
+    assert flags_first(typed) == sorted_words
+
+
+@pytest.mark.slow
+def test_a_sweep_whose_flag_comes_last(tmp_path) -> None:
+    words = (*NO_AGENT, "variant=idm", "seed=1,2", "sweep=s", "-m")
+    run_command("lcc_rl.train", *words, cwd=tmp_path, check=True)
+    assert len(list((tmp_path / "outputs/train/s").glob("*/episodes.parquet"))) == 2
+
+
+@pytest.mark.parametrize("entry", ["train", "evaluate", "calibrate", "pipeline"])
+def test_an_unknown_flag_is_one_line(tmp_path, entry) -> None:
+    done = run_command(f"lcc_rl.{entry}", "variant=idm", "--seed", "3", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("lcc_rl: error: unknown flag --seed: settings are written key=")
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+# -- refused commands ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("resume=run", "seed=3"),
+        ("resume=run", "training.episodes=abc"),
+        ("hydra.run.dir=run", "variant=idm", "evaluation.drivers=0", *NO_AGENT[:1]),
+        ("hydra.run.dir=run", "variant=idm", "drivers=fixed", "drivers._target_=os.getcwd"),
+        ("hydra.run.dir=run", "variant=alcc", "agent=none"),
+    ],
+)
+def test_a_refused_command_leaves_a_finished_run_as_it_was(finished, tmp_path, words) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    before = content(folder)
+    assert {".hydra/overrides.yaml", "episodes.parquet"} <= before.keys()
+    done = run_command("lcc_rl.train", *words, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert content(folder) == before
+
+
+def test_a_finished_run_of_other_settings_is_refused_and_left(finished, tmp_path) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("seed: 0", "seed: 1", 1))
+    before = content(folder)
+    done = run_command("lcc_rl.train", "resume=run", cwd=tmp_path)
+    assert "episodes.parquet belongs to another configuration" in done.stderr
+    assert done.returncode == 2
+    assert content(folder) == before
+
+
+def test_a_refused_command_does_not_make_a_stopped_run_a_failed_one(finished, tmp_path) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    (folder / "episodes.parquet").unlink()
+    run_command("lcc_rl.train", "resume=run", "seed=3", cwd=tmp_path)
+    assert inspect_run(folder).state == "stopped"
+
+
+def test_a_failed_start_is_recorded_and_forgotten_once_it_works(tmp_path) -> None:
+    words = (*NO_AGENT, "variant=idm", "hydra.run.dir=run")
+    run_command("lcc_rl.train", *words, "evaluation.drivers=0", cwd=tmp_path)
+    assert inspect_run(tmp_path / "run").state == "failed"
+    run_command("lcc_rl.train", *words, cwd=tmp_path, check=True)
+    assert inspect_run(tmp_path / "run").state == "finished"
+
+
+# -- output that nobody reads ----------------------------------------------------------------------
+
+
+class Closed(io.StringIO):
+    """A pipe whose reader is gone."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+    def fileno(self) -> int:
+        raise OSError
+
+
+def test_what_nobody_reads_is_dropped() -> None:
+    stream = Unbroken(Closed())
+    assert stream.write("text") == 4
+    stream.flush()
+    whole = Unbroken(io.StringIO())
+    whole.write("text")
+    assert whole.getvalue() == "text"
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("lcc_rl.status", ("runs",)),
+        pytest.param(
+            "lcc_rl.train", (*NO_AGENT, "variant=idm", "hydra.run.dir=new"), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_a_closed_pipe_ends_nothing_and_says_nothing(finished, tmp_path, module, words) -> None:
+    for name in "ab":
+        shutil.copytree(finished, tmp_path / "runs" / name)
+    command = [sys.executable, "-m", module, *words]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        child.stdout.close()  # as head -0 does
+        errors = child.stderr.read().decode()
+        assert child.wait(timeout=300) == 0, errors
+    assert errors == ""
+    if module == "lcc_rl.train":
+        assert inspect_run(tmp_path / "new").state == "finished"
