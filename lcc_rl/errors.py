@@ -27,7 +27,16 @@ class Interrupted(LccError):
 
 
 class Diverged(LccError):
-    """A loss or reward is no longer a number; the last checkpoint is from before that."""
+    """An action, a state, a reward, an energy or a loss is not a finite number.
+
+    Args:
+        what: which one, where and when.
+        advice: what to do about it.
+    """
+
+    def __init__(self, what: str, advice: str = "") -> None:
+        super().__init__(f"{what}. {advice}" if advice else what)
+        self.what, self.advice = what, advice
 
 
 def require_positive(where: str, **settings: float) -> None:

@@ -10,9 +10,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.analytic import Analytic
+from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import Diverged
+from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import next_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
 
@@ -67,6 +70,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
             begun = time.perf_counter()
             state, record = source.play(state, self.agent.policy.module, self.settings.segment)
             data = source.assemble(record)
+            check_batch(data, pieces_of(self.env))
             collected = time.perf_counter()
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)
@@ -94,7 +98,11 @@ class GradientTrainer(TrainingLoop[Analytic]):
         crashed = data["next", "terminated"].cumsum(1) > 0
         after = running * ~crashed
         before = torch.cat([running, after[:, :-1]], 1)
-        total = torch.stack([factor * self._score(term, data) for term, factor in self.objective])
+        scores = [factor * self._score(term, data) for term, factor in self.objective]
+        for (term, _), score in zip(self.objective, scores, strict=True):
+            if any_lost([score]):
+                raise Diverged(f"the objective's term {term.name} ({type(term).__name__}) is nan")
+        total = torch.stack(scores)
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
         return after, self.agent.update(total.sum(0) * before, after, moments)

@@ -21,6 +21,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.agents.checks import check_learner
 from lcc_rl.config import require
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_torch, write_parquet, write_torch
@@ -168,7 +169,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
 
         Raises:
             Interrupted: on SIGINT or SIGTERM, after the iteration at hand is saved.
-            Diverged: if a loss or the reward is not finite.
+            Diverged: if a loss, a weight, or anything learned from is not a finite number.
         """
         title = f"train {self.folder.name}"
         progress = ProgressReporter(
@@ -177,7 +178,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         source = self._source()
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
-                row = self._iterate(source)
+                row = self._numbers(source)
                 self.on_row(row)
                 if self.keep_every is not None and self.iteration % self.keep_every == 0:
                     self.on_keep(self.iteration)
@@ -195,20 +196,21 @@ class TrainingLoop(ABC, Generic[AgentT]):
         self.save()
         return pd.DataFrame(self.rows)
 
-    def _record(self, row: dict[str, float], collect_s: float, learn_s: float) -> None:
-        """Append an iteration to the record.
+    def _numbers(self, source: Any) -> dict[str, float]:
+        """Do an iteration; an error names it, and where the last good state is."""
+        number = self.iteration + 1
+        try:
+            check_learner(self.agent.policy, {}, self.advice)
+            return self._iterate(source)
+        except Diverged as error:
+            good = self.folder / "checkpoint.pt"
+            state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
+            where = f"in iteration {number} of {self.iterations}"
+            raise Diverged(f"{error.what} {where}; {state}", error.advice) from error
 
-        Raises:
-            Diverged: if a value is not finite.
-        """
-        for name, value in row.items():
-            if not math.isfinite(value):
-                good = self.folder / "checkpoint.pt"
-                state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
-                raise Diverged(
-                    f"{name} became {value} in iteration {self.iteration} of {self.iterations}; "
-                    f"{state}. {self.advice}"
-                )
+    def _record(self, row: dict[str, float], collect_s: float, learn_s: float) -> None:
+        """Append an iteration to the record; raise Diverged where a value is not finite."""
+        check_learner(self.agent.policy, row, self.advice)
         self.rows.append(row)
         times = {"iteration": row["iteration"], "collect_s": collect_s, "learn_s": learn_s}
         self.times.append(times)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -11,10 +12,13 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.config import require
 from lcc_rl.envs import StringCollector
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import Diverged
 from lcc_rl.pieces.rewards import REWARD
 from lcc_rl.policies import shared_policy
 from lcc_rl.policies.actor import ACTION, OBSERVATION
@@ -85,13 +89,14 @@ class Trainer(TrainingLoop[OffPolicy]):
         played, losses, spent = [], [], [0.0, 0.0]
         for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
-            batch = next(segments)
+            batch = self._collect(collector, segments, part * self.settings.segment)
             new = transitions(batch)
             self.buffer.extend(new)
             played.append(batch.select(*REPORTED))
             collected = time.perf_counter()
             before = self.iteration * (self.horizon // self.settings.segment) + part
             losses.append(self._learn(before * len(new), len(new)))
+            check_learner(self.agent.policy, losses[-1], self.advice)
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         episodes = torch.cat(played, dim=1)
@@ -109,6 +114,23 @@ class Trainer(TrainingLoop[OffPolicy]):
         }
         self._record(row, *spent)
         return row
+
+    def _collect(
+        self, collector: BaseCollector, segments: Iterator[TensorDictBase], begun: int
+    ) -> TensorDictBase:
+        """Return the next segment, after so many steps, all of it numbers.
+
+        Raises:
+            Diverged: naming the first entry that is not a number, its step and its episode.
+        """
+        try:
+            batch = next(segments)
+            check_batch(batch, pieces_of(self.env), begun)
+        except Diverged:
+            if isinstance(collector, StringCollector):
+                collector.replay()  # finds what the batch does not hold
+            raise
+        return batch
 
     def _learn(self, before: int, new: int) -> dict[str, float]:
         """Take the updates that are due after ``new`` transitions on top of those ``before``."""

@@ -115,6 +115,7 @@ class StringCollector(BaseCollector):
     def collect(self) -> TensorDictBase:
         """Return the next batch, ``[*batch, steps]``."""
         record = []
+        self._begun = self.state, self.env.base_env.generator.get_state()
         for _ in range(self.steps):
             self.state, kept, over = self.advance(self.state)
             record.append(kept)
@@ -128,14 +129,34 @@ class StringCollector(BaseCollector):
             segment.set(key, torch.stack(values, len(batch)))
         return segment
 
-    def _advance(self, state: State) -> tuple[State, list[Tensor], Tensor]:
-        """Return the moment reached, the entries to keep and whether any episode is over."""
+    @torch.no_grad()
+    def replay(self) -> None:
+        """Play the last batch again, uncompiled, to find what in it is not a number.
+
+        Raises:
+            Diverged: naming the first entry that is not, whether the batch holds it or not.
+        """
+        state, generator = self._begun
+        self.env.base_env.generator.set_state(generator)
+        running = torch.ones_like(state[DONE])
+        for _ in range(self.steps):
+            reached = self.step.checked(self._act(state), running)
+            state = {key: reached.get(key, value) for key, value in state.items()}
+            if reached[DONE].any():
+                state = self._renew(state)
+
+    def _act(self, state: State) -> State:
+        """Return a moment with the policy's action."""
         seen = TensorDict(batch_size=self.env.batch_size)
         for key in self.reads:
             seen.set(key, self._look(state, key))
         action = self.policy(seen).get(self.action)
         inner = self._inner(self.action)
-        before = {**state, inner: action if inner == self.action else action.unsqueeze(-2)}
+        return {**state, inner: action if inner == self.action else action.unsqueeze(-2)}
+
+    def _advance(self, state: State) -> tuple[State, list[Tensor], Tensor]:
+        """Return the moment reached, the entries to keep and whether any episode is over."""
+        before = self._act(state)
         reached = self.step(before)
         kept = [
             self._look(reached, key[1:]) if key[0] == NEXT else self._look(before, key)

@@ -13,20 +13,24 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Size as BatchSize
-from torch import Tensor, compile, device, zeros_like
+from torch import Tensor, compile, compiler, device, ones_like, zeros_like
 from torch._dynamo.exc import TorchDynamoException
 from torch._inductor.exc import InductorError
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from lcc_rl.envs.finite import ACTION, Written, check_moment
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
-from lcc_rl.pieces.rewards import RewardTerm, TotalReward
+from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
 
 log = logging.getLogger("lcc_rl")
 
 COMPILER_ERRORS = (TorchDynamoException, InductorError)
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
+# Where none of these is lost after a step, nothing that matters is.
+TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
 
 
 def tick(seed: Tensor, step: Tensor, horizon: int) -> State:
@@ -52,15 +56,37 @@ class Step:
         self.pieces = [(piece, piece not in chosen) for piece in pieces]
         self.horizon = horizon
 
-    def __call__(self, before: State) -> State:
+    def __call__(self, before: State, watched: list[Written] | None = None) -> State:
         """Return the entries of the moment reached.
 
         Args:
             before: the entries of the moment left that the pieces read, the action among them.
+            watched: gets every entry as it is written, before another piece may replace it.
         """
         reached = tick(before[SEED], before[STEP] + 1, self.horizon)
         for piece, detached in self.pieces:
             piece.apply(before, reached, detached)
+            if watched is not None:
+                watched += written_by(piece, reached)
+        return reached
+
+    def checked(self, before: State, running: Tensor, who: str = "") -> State:
+        """Return the entries of the moment reached, all of them numbers.
+
+        Args:
+            before: see :meth:`__call__`.
+            running: whether each episode runs, ``[*batch, 1]``; of the others, what is not a
+                number becomes zero.
+            who: who drives, for the message.
+
+        Raises:
+            Diverged: naming the first entry that is not, its step and its episode.
+        """
+        watched = [Written(ACTION, before[ACTION], "the policy")] if ACTION in before else []
+        reached = self(before, watched)
+        pieces = [piece for piece, _ in self.pieces]
+        if check_moment(watched, {**before, STEP: reached[STEP]}, running, pieces, who):
+            reached = {key: value.nan_to_num(0.0, 0.0, 0.0) for key, value in reached.items()}
         return reached
 
 
@@ -98,6 +124,13 @@ def written(pieces: Iterable[Piece]) -> set[Key]:
         if isinstance(piece, StepTransform):
             found |= set(piece.constants)
     return found
+
+
+def written_by(piece: Piece, moment: Any) -> list[Written]:
+    """Return what a piece has written to a moment, a mapping or a TensorDict, in order."""
+    found = [(key, moment.get(key, None)) for key in piece.targets]
+    name = type(piece).__name__
+    return [Written(key, value, name) for key, value in found if value is not None]
 
 
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
@@ -165,7 +198,28 @@ class Pieces(Compose):
             next_tensordict = _apply(waiting, tensordict, next_tensordict)
             waiting = []
             next_tensordict = transform._step(tensordict, next_tensordict)
-        return _apply(waiting, tensordict, next_tensordict)
+        next_tensordict = _apply(waiting, tensordict, next_tensordict)
+        if not compiler.is_compiling():  # a compiled step cannot raise
+            self._check_numbers(tensordict, next_tensordict)
+        return next_tensordict
+
+    def _check_numbers(self, td: TensorDictBase, next_td: TensorDictBase) -> None:
+        """Check that a step was taken from numbers to numbers.
+
+        Raises:
+            Diverged: naming the first entry that is not, its step and its episode.
+        """
+        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in TELLING)]
+        if not any_lost(value for value in telling if value is not None):
+            return
+        pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
+        left, reached = ([w for p in pieces for w in written_by(p, x)] for x in (td, next_td))
+        if telling[0] is not None:
+            reached.insert(0, Written(ACTION, telling[0], "the policy"))
+        done = td.get(DONE, None)
+        running = ones_like(next_td.get(DONE)) if done is None else ~done
+        for moment, watched in ((td, left), (next_td, reached)):
+            check_moment(watched, {**_read(td), STEP: moment.get(STEP)}, running, pieces)
 
     def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the inverse of what is not a piece, last first."""

@@ -80,7 +80,7 @@ def drive(
     env = build_env(cfg, case.profile, inputs.population, runs, 0, device, True)
     ids, drivers = torch.arange(runs, device=env.device), len(inputs.population.time_gap)
     given = reset_options(env, ids, ids % drivers, seed, drivers)
-    record, _ = play(env, strategy.policy, given, KEYS)
+    record, _ = play(env, strategy.policy, given, KEYS, strategy.title)
     index, vehicles = record.pop(INDEX, None), len(string_of(cfg))
     series = {"leader": record.pop(("leader", "speed"))}
     for (space, name), entry in record.items():

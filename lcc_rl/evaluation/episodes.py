@@ -95,7 +95,8 @@ def evaluate(
         who = profile[start : start + batch_size], driver[start : start + batch_size]
         env = build_env(cfg, profiles, inputs.population, len(who[0]), 0, device, True)
         given = reset_options(env, *who, seed, count)
-        record, alive = play(env, strategy.policy, given, [*KEYS, INDEX, PROMISED])
+        keys = [*KEYS, INDEX, PROMISED]
+        record, alive = play(env, strategy.policy, given, keys, strategy.title)
         groups = grouped(record, string_of(cfg))
         described = describe(strategy, profiles, inputs.population, *who)
         described[FASTER] = leader_faster(profiles, who[0], desired_speeds(strategy, described))

@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.envs.rollout import ACTION
-from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written
+from lcc_rl.envs.finite import ACTION, check_moment
+from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written, written_by
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import hash_bits
 from lcc_rl.pieces.base import SEED, Key, Piece, State, as_key
@@ -22,7 +22,11 @@ PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "
 
 
 def play(
-    env: TransformedEnv, policy: Policy | None, given: TensorDictBase, keys: Sequence[Key]
+    env: TransformedEnv,
+    policy: Policy | None,
+    given: TensorDictBase,
+    keys: Sequence[Key],
+    who: str = "",
 ) -> tuple[Record, Tensor]:
     """Play all episodes of a batch to the horizon, without resets.
 
@@ -31,6 +35,7 @@ def play(
         policy: writes the action; None where none is needed.
         given: reset options.
         keys: entries to keep; those that the environment lacks are left out.
+        who: who drives, for messages.
 
     Returns:
         The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
@@ -38,6 +43,8 @@ def play(
 
     Raises:
         ConfigError: if a controller takes an action and there is no policy.
+        Diverged: if the action, or an entry that is written, is not a number; what the policy and
+            every controller wish counts, not what a filter makes of it.
     """
     pieces = pieces_of(env)
     _check_driven(policy, pieces)
@@ -52,8 +59,10 @@ def play(
             key: [state[key]] if key[-1] == "speed" else [] for key in kept
         }
         running, alive = torch.ones_like(state[TERMINATED]), []
+        start = [entry for piece in pieces for entry in written_by(piece, state)]
+        check_moment(start, state, running, pieces, who)
         for _ in range(env.base_env.horizon):
-            reached = step({**state, **_action(policy, reads, state, env)})
+            reached = step.checked({**state, **_action(policy, reads, state, env)}, running, who)
             for key in kept:
                 record[key].append(reached[key])
             alive.append(running)

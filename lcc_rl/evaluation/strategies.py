@@ -51,12 +51,19 @@ class Strategy:
         cfg: configuration of its environment.
         policy: writes ``("automated", "action")``, deterministic; None where a rule drives.
         seed: training seed, for the tables; None where nothing was learned.
+        source: file or folder that the policy was read from.
     """
 
     name: str
     cfg: DictConfig
     policy: Policy | None = None
     seed: int | None = None
+    source: str = ""
+
+    @property
+    def title(self) -> str:
+        """How messages call it."""
+        return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
 
 
 def _copy(cfg: DictConfig) -> DictConfig:
@@ -266,7 +273,7 @@ def with_weights(
     except RuntimeError as error:
         words = f"the weights do not fit the policy network: {' '.join(str(error).split())}"
         raise ResultsError(f"{path}: {words}") from error
-    return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed)
+    return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)
 
 
 def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:

@@ -99,7 +99,8 @@ class Controller(StepTransform):
 class Action(Controller):
     """The action of a policy, in [−1, 1], times the largest acceleration.
 
-    Reads ``(role, "action")``, ``[*batch, n, 1]``; actions beyond the range count as its ends.
+    Reads ``(role, "action")``, ``[*batch, n, 1]``; like everybody who reads it by its name, it
+    sees actions beyond the range as its ends (:mod:`lcc_rl.pieces.views`).
 
     Args:
         max_acceleration: acceleration of action 1, braking of action −1 [m/s²].
@@ -121,7 +122,7 @@ class Action(Controller):
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commands."""
-        return action.clamp(-1.0, 1.0) * self.max_acceleration
+        return action * self.max_acceleration
 
 
 class ConstantAcceleration(Controller):

@@ -132,7 +132,7 @@ class HCFS(Controller):
         )
         return hybrid_decision(
             rule,
-            action.clamp(-1.0, 1.0) * self.max_acceleration,
+            action * self.max_acceleration,
             speed,
             last,
             last_winner,

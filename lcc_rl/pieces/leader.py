@@ -88,7 +88,7 @@ class NGSIMLeader(StepTransform):
         if profile is not None and not 0 <= profile < len(profiles):
             raise ConfigError(f"leader.profile must lie in 0…{len(profiles) - 1}, got {profile}")
         self.start, self.profile, self.time_step = start, profile, time_step
-        self.foresight = foresight
+        self.foresight, self.names = foresight, profiles.names
         self.profile_stream = stream_id("leader.profile")
         self.start_stream = stream_id("leader.start")
         self.streams = [stream_id(f"leader.perturbation.{part}") for part in "cAtp"]

@@ -7,6 +7,7 @@
 ``behind.present``      1 where there is a vehicle behind, else 0
 ``leader.x``            of the leader, ahead of the whole string
 ``episode.x``           of the episode: its seed, its step
+``role.action``         the action, held within [−1, 1]
 any other ``name.x``    the entry as it is, ``[*batch, n, w]``: one row per vehicle of the role
 ======================  ====================================================================
 
@@ -29,7 +30,7 @@ from lcc_rl.pieces.base import NEXT, Key, as_key
 
 VEHICLES, LEADER, EPISODE = "vehicles", "leader", "episode"
 SELF, AHEAD, BEHIND = "self", "ahead", "behind"
-PRESENT = "present"
+PRESENT, ACTION = "present", "action"
 
 
 Resolver = Callable[[Sequence[Tensor]], Tensor]
@@ -90,6 +91,8 @@ class Views:
             key = (*prefix, VEHICLES, "speed" if present else entry)
             distances = range(1, self.behind + 1)
             return partial(_joined, [self._at(key, distance, present) for distance in distances])
+        if entry == ACTION:
+            return partial(_held, self._place(name))
         return partial(_row if space in (LEADER, EPISODE) else _as_it_is, self._place(name))
 
     def _at(self, key: Key, distance: int, present: bool = False) -> Resolver:
@@ -151,6 +154,10 @@ def _row(place: int, entries: Sequence[Tensor]) -> Tensor:
 
 def _as_it_is(place: int, entries: Sequence[Tensor]) -> Tensor:
     return entries[place]
+
+
+def _held(place: int, entries: Sequence[Tensor]) -> Tensor:
+    return entries[place].clamp(-1.0, 1.0)
 
 
 def _joined(parts: Sequence[Resolver], entries: Sequence[Tensor]) -> Tensor:
