@@ -52,19 +52,16 @@ def check_batch(batch: TensorDictBase, pieces: Sequence[Piece], begun: int = 0) 
     """
     if not any_lost(batch.values(True, True)):
         return
-    writers = {key: type(piece).__name__ for piece in pieces for key in piece.targets}
+    writers = {key: piece for piece in pieces for key in piece.targets}
     found = {as_key(name): entry.detach() for name, entry in batch.items(True, True)}
     for step in range(batch.shape[1]):
         now = {key: entry[:, step] for key, entry in found.items()}
-        count = torch.full((len(batch), 1), begun + step)
-        moment: dict[Key, Tensor] = {
-            STEP: count,
-            **{key: now[key] for key in EPISODE if key in now},
-        }
-        left = [Written(key, now[key], who) for key, who in writers.items() if key in now]
-        reached = [Written(ACTION, now[ACTION], "the policy")] if ACTION in now else []
-        for key, who in writers.items():
-            reached += [Written(key, now[k], who) for k in [next_key(key)] if k in now]
+        count = torch.full((len(batch), 1), begun + step, device=batch.device)
+        moment: dict[Key, Tensor] = {STEP: count, **{k: now[k] for k in EPISODE if k in now}}
+        left = [Written(key, now[key], piece) for key, piece in writers.items() if key in now]
+        reached = [Written(ACTION, now[ACTION])] if ACTION in now else []
+        after = [(key, next_key(key)) for key in writers]
+        reached += [Written(key, now[late], writers[key]) for key, late in after if late in now]
         running = torch.ones_like(count, dtype=torch.bool)
         check_moment(left, moment, running, pieces)
         check_moment(reached, {**moment, STEP: moment[STEP] + 1}, running, pieces)

@@ -19,14 +19,15 @@ EPISODE = (PROFILE, DRIVER, SEED, STEP)  # what tells episodes apart
 
 
 class Written(NamedTuple):
-    """An entry and who wrote it, ``""`` where nobody in particular did; values ``[*batch, …]``."""
+    """An entry, its values ``[*batch, …]``, and the piece that wrote it; None for the policy."""
 
     key: Key
     value: Tensor
-    writer: str = ""
+    writer: Piece | None = None
 
     def __str__(self) -> str:
-        return ".".join(self.key) + (f", written by {self.writer}," if self.writer else "")
+        writer = "the policy" if self.writer is None else type(self.writer).__name__
+        return f"{'.'.join(self.key)}, written by {writer},"
 
 
 def check_moment(

@@ -67,7 +67,7 @@ class Step:
         for piece, detached in self.pieces:
             piece.apply(before, reached, detached)
             if watched is not None:
-                watched += written_by(piece, reached)
+                watched += [Written(key, reached[key], piece) for key in piece.targets]
         return reached
 
     def checked(self, before: State, running: Tensor, who: str = "") -> State:
@@ -82,7 +82,7 @@ class Step:
         Raises:
             Diverged: naming the first entry that is not, its step and its episode.
         """
-        watched = [Written(ACTION, before[ACTION], "the policy")] if ACTION in before else []
+        watched = [Written(ACTION, before[ACTION])] if ACTION in before else []
         reached = self(before, watched)
         pieces = [piece for piece, _ in self.pieces]
         if check_moment(watched, {**before, STEP: reached[STEP]}, running, pieces, who):
@@ -129,8 +129,7 @@ def written(pieces: Iterable[Piece]) -> set[Key]:
 def written_by(piece: Piece, moment: Any) -> list[Written]:
     """Return what a piece has written to a moment, a mapping or a TensorDict, in order."""
     found = [(key, moment.get(key, None)) for key in piece.targets]
-    name = type(piece).__name__
-    return [Written(key, value, name) for key, value in found if value is not None]
+    return [Written(key, value, piece) for key, value in found if value is not None]
 
 
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
@@ -215,7 +214,7 @@ class Pieces(Compose):
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
         left, reached = ([w for p in pieces for w in written_by(p, x)] for x in (td, next_td))
         if telling[0] is not None:
-            reached.insert(0, Written(ACTION, telling[0], "the policy"))
+            reached.insert(0, Written(ACTION, telling[0]))
         done = td.get(DONE, None)
         running = ones_like(next_td.get(DONE)) if done is None else ~done
         for moment, watched in ((td, left), (next_td, reached)):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 def any_lost(values: Iterable[Tensor]) -> bool:
     """Whether something may not be a number: a sum of each, which neither NaN nor inf leaves."""
-    sums = [value.detach().sum() for value in values if value.is_floating_point()]
+    sums = [value.sum() for value in values if value.is_floating_point()]
     return bool(sums) and not bool(torch.stack(sums).sum().isfinite())
 
 

@@ -138,7 +138,8 @@ def hybrid_decision(
         last_winner: winner of the frame before; negative or None where there was none.
         leader_next: the predicted speed of each vehicle's leader [m/s].
         interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
-        cap: see :func:`safe_acceleration`; None leaves it out.
+        cap: see :func:`safe_acceleration`; None leaves it out. Where it or a candidate is not a
+            finite number, the vehicle brakes as hard as it can.
         reward: the reward to compare by.
         time_step: T [s].
         max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
@@ -172,4 +173,7 @@ def _bounded(
     if cap is None:
         return candidates, clamped, torch.zeros_like(clamped)
     bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
+    # Where a wish, or what the cap is computed from, is no number, nothing is known to be safe.
+    known = (free.isfinite() & bounded.isfinite() & cap.isfinite()).all(0)
+    bounded = torch.where(known, bounded, -max_acceleration)
     return bounded, clamped, (bounded != candidates).any(0)

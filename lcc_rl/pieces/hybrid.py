@@ -45,7 +45,8 @@ class HCFS(Controller):
         clamp: hold the candidates within the jerk bound; false is the literal rule, which
             violates it.
         safe_cap: hold the result below what braking allows; false is the literal rule, which in
-            long runs drives through the vehicle ahead: the reward has no spacing term.
+            long runs drives through the vehicle ahead: the reward has no spacing term. It brakes
+            fully where a measurement, the action or the rule's command is no finite number.
         braking: b of the safe cap [m/s²].
         margin: gap that it keeps at standstill [m].
         velocity_weight, speed_scale, jerk_weight, jerk_scale: of the reward compared, see

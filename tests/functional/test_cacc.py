@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -262,6 +263,17 @@ def test_the_larger_reward_wins_and_ties_go_to_the_rule() -> None:
     assert decide(0.7, 0.7).winner.item() == 0
     # Same speed error on both sides of the target; the gentler one wins.
     assert decide(1.0, -0.9).winner.item() == 1
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_a_cap_brakes_where_it_cannot_know(number) -> None:
+    for rule, learned, cap in ((number, 0.5, 1.0), (0.5, number, 1.0), (0.5, 0.5, number)):
+        for bound in (None, 10.0):
+            got = decide(rule, learned, cap=cap, jerk_bound=bound)
+            assert got.acceleration.item() == -A_MAX
+            assert got.capped.item()
+    # Without the cap, nothing hides it.
+    assert not decide(math.nan, math.nan).acceleration.isfinite()
 
 
 def test_blend_only_in_the_frame_of_a_switch() -> None:

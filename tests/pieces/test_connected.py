@@ -293,6 +293,29 @@ def test_a_controller_that_remembers_is_no_policy() -> None:
         ControllerPolicy(HCFS(rule, T, string=parse_string("automated*2")))
 
 
+def test_the_hybrid_brakes_where_what_it_measures_is_no_number() -> None:
+    string = parse_string("automated*2")
+    hybrid = HCFS(CACC(T, string=string), T, string=string)
+    measured = (
+        "action",
+        "speed",
+        "acceleration",
+        "received_gap",
+        "speed_error",
+        "leader_gap_error",
+    )
+    for name in measured:
+        entries = []
+        for key in hybrid.names:
+            value = torch.full((1, 2, 1), 20.0 if key == "self.received_gap" else 0.0)
+            if key.endswith(f".{name}"):
+                value[0, 1] = torch.nan
+            entries.append(value)
+        command, *_ = hybrid.command(*entries)
+        assert command[0, 1] == -A_MAX, name
+        assert command[0, 0] > -A_MAX
+
+
 # -- any number of vehicles ------------------------------------------------------------------------
 
 

@@ -1,0 +1,253 @@
+"""What is not a number ends an evaluation or a training with one error, and nothing is written."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+
+import pytest
+import torch
+from commands import tiny
+from helpers import ACTION, compose, network, single_env, small_env
+from platoons import env_of, hcfs, ramps
+from tensordict.nn import TensorDictSequential
+
+from lcc_rl.commands import evaluation, training
+from lcc_rl.config import load
+from lcc_rl.envs import StringCollector
+from lcc_rl.errors import Diverged, ResultsError
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.io.files import read_torch, write_torch
+from lcc_rl.results.runs import load_policy, pretrained_path
+
+MODULE = """
+import torch
+from lcc_rl.pieces import IDM, Controller, Feature, MotorPower, RewardTerm
+
+def lost(step, value, at=3):
+    return torch.where(step == at, float("VALUE"), value)
+
+class LostControl(Controller):
+    reads = ("self.speed", "episode.step")
+
+    def __init__(self, max_acceleration=3.0, lookahead="", string=None, role="automated"):
+        super().__init__(string, role)
+
+    def command(self, speed, step):
+        return lost(step, 0.0 * speed)
+
+class LostDriver(IDM):
+    def command(self, *entries):
+        return lost(entries[-1], super().command(*entries))
+
+class LostReward(RewardTerm):
+    reads = ("self.jerk", "episode.step")
+
+    def reward(self, jerk, step):
+        return lost(step, -jerk.abs())
+
+class LostPower(MotorPower):
+    def compute(self, *entries):
+        return super().compute(*entries) / 0.0
+
+class LostEntry(Feature):
+    def __init__(self, string):
+        reads = [("vehicles", "speed"), ("episode", "step")]
+        super().__init__(reads, [("vehicles", "lost")], (len(string), 1))
+
+    def compute(self, speed, step):
+        return lost(step.unsqueeze(-2), speed, at=4)
+"""
+CONTROL = ("variant=idm", "scenario.controllers.automated._target_=lost_pieces.LostControl")
+DRIVER = ("scenario.controllers.human._target_=lost_pieces.LostDriver",)
+POWER = ("scenario.pieces.power._target_=lost_pieces.LostPower",)
+TERM = ("+reward.terms.comfort={_target_: lost_pieces.LostReward, weight: 0.1}",)
+ENTRY = (
+    "+scenario.pieces.lost={_target_: lost_pieces.LostEntry}",
+    "+observation.scales.self.lost=0.1",
+)
+FILTER = ("+filter=cbf",)
+EPISODE = r"of episode \d+ \(profile \S+, driver \d+, seed \d+\)"
+
+
+@pytest.fixture(autouse=True, params=["nan"])
+def value(request, tmp_path, monkeypatch) -> str:
+    """The number that is none, as the pieces of lost_pieces write it."""
+    # The module of the test before, of another number, would be found loaded.
+    monkeypatch.delitem(sys.modules, "lost_pieces", raising=False)
+    (tmp_path / "lost_pieces.py").write_text(MODULE.replace("VALUE", request.param))
+    monkeypatch.syspath_prepend(tmp_path)
+    return request.param
+
+
+# -- evaluation ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"], indirect=True)
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (
+            CONTROL,
+            r"strategy lostcontrol: command.automated, written by LostControl, is {} at step 4",
+        ),
+        (DRIVER, r"strategy direct: command.human, written by LostDriver, is {} at step 4"),
+        (POWER, r"strategy direct: vehicles.power, written by LostPower, is -?inf at step 1"),
+    ],
+    ids=["controller", "driver", "power"],
+)
+def test_an_evaluation_names_strategy_entry_step_and_episode(
+    overrides, words, value, tmp_path
+) -> None:
+    folder = tmp_path / "run"
+    cfg = tiny("evaluate", "variant=idm", *overrides, agent=False)
+    with pytest.raises(Diverged, match=words.format(value) + f" {EPISODE}"):
+        evaluation.run(cfg, folder, quiet=True)
+    assert not list(folder.glob("*.parquet"))
+
+
+def test_a_platoon_names_its_run(tmp_path) -> None:
+    words = ["variant=deadbeat", CONTROL[1], "evaluation.baselines=[]", "experiment=smoke"]
+    cfg = load("evaluate", words)
+    expected = r"lostcontrol: command.automated, written by LostControl, is nan at step 4 of ep"
+    with pytest.raises(Diverged, match=expected):
+        evaluation.run(cfg, tmp_path / "run", quiet=True)
+    assert not list((tmp_path / "run").glob("*.parquet"))
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+@pytest.mark.parametrize("overrides", [(), FILTER])
+def test_the_action_counts_before_clamp_and_filter(overrides, number) -> None:
+    env, good = small_env("alcc", 3, overrides), network(compose("alcc", *overrides))
+
+    def policy(td):
+        td = good(td)
+        if int(td["episode", "step"][0]) == 5:
+            td[ACTION][1] = number
+        return td
+
+    policy.in_keys = [*good.in_keys, ("episode", "step")]
+    words = rf"strategy x: automated.action, written by the policy, is {number} at step 6 of .* 1 "
+    with pytest.raises(Diverged, match=words):
+        play(env, policy, None, [("vehicles", "gap")], "strategy x")
+
+
+def test_what_follows_the_end_of_an_episode_does_not_count() -> None:
+    env = small_env("alcc", 2, ["scenario.start.automated.time_gap=0.05"], nominal=True)
+
+    def policy(td):
+        crashed = (td["vehicles", "gap"] <= 0).any(-2, keepdim=True)
+        return td.set(ACTION, torch.where(crashed, math.nan, torch.ones(2, 1, 1)))
+
+    record, alive = play(env, policy, None, [("vehicles", "gap")])
+    assert not alive[-1].any()
+    assert record["vehicles", "gap"].isfinite().all()
+
+
+@pytest.mark.parametrize("number", [math.nan, -math.inf])
+def test_a_policy_with_a_broken_weight_is_refused(number, tmp_path) -> None:
+    content = read_torch(pretrained_path("alcc"))
+    name = list(content["weights"])[-1]
+    content["weights"][name] = content["weights"][name].clone().fill_(number)
+    path = tmp_path / "policy.pt"
+    write_torch(content, path)
+    words = f"{path}: weight {name} holds something other than finite numbers"
+    with pytest.raises(ResultsError, match=re.escape(words)):
+        load_policy(path)
+
+
+# -- training --------------------------------------------------------------------------------------
+
+
+def train(folder, *overrides: str) -> None:
+    training.run(tiny("train", "variant=alcc", *overrides), folder, quiet=True)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"], indirect=True)
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (TERM, r"automated.reward_terms.comfort, written by LostReward, is -?{} at step 3"),
+        (DRIVER, r"command.human, written by LostDriver, is {} at step 4"),
+        (POWER, r"vehicles.power, written by LostPower, is -?inf at step 1"),
+        (ENTRY, r"vehicles.lost, written by LostEntry, is {} at step 4"),
+    ],
+    ids=["reward", "driver", "power", "observation"],
+)
+@pytest.mark.parametrize("agent", ["ddpg", "torchrl"])
+def test_a_training_names_what_it_would_have_learned_from(
+    agent, overrides, words, value, tmp_path
+) -> None:
+    own = ("training.collector=torchrl",) if agent == "torchrl" else ()
+    words = words.format(value) + f" {EPISODE} in iteration 1 of .*; nothing is saved$"
+    with pytest.raises(Diverged, match=words):
+        train(tmp_path / "run", *own, *overrides)
+    assert not (tmp_path / "run" / "policy.pt").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (TERM, r"automated.reward_terms.comfort, written by LostReward, is -?nan at step 3"),
+        (DRIVER, r"command.human, written by LostDriver, is nan at step 4"),
+        (ENTRY, r"vehicles.lost, written by LostEntry, is nan at step 4"),
+    ],
+    ids=["reward", "driver", "observation"],
+)
+def test_the_analytic_agent_names_it_too(overrides, words, tmp_path) -> None:
+    own = ("agent=analytic", "training=analytic", "training.episodes=4", "training.environments=4")
+    cfg = tiny("train", "variant=alcc", *own, *overrides, agent=False)
+    with pytest.raises(Diverged, match=words + r" of episode .* in iteration 1 of 1"):
+        training.run(cfg, tmp_path / "run", quiet=True)
+
+
+# -- the environment -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+@pytest.mark.parametrize("make", [small_env, single_env])
+def test_a_step_refuses_an_action_that_is_no_number(make, number) -> None:
+    env = make("alcc", 2)
+    td = env.rand_action(env.reset())
+    key = ACTION if make is small_env else "action"
+    td[key][1] = number
+    with pytest.raises(Diverged, match=rf"automated.action, .* is {number} at step 1 of episode 1"):
+        env.step(td)
+
+
+def test_a_step_refuses_a_state_that_is_no_number() -> None:
+    env = small_env("alcc", 2)
+    td = env.rand_action(env.reset())
+    td["vehicles", "speed"][0] = math.nan
+    with pytest.raises(Diverged, match=r"vehicles.speed, .* is nan at step 0 of episode 0"):
+        env.step(td)
+
+
+@pytest.mark.parametrize("name", ["plain", "filtered", "single", "hcfs"])
+def test_actions_beyond_the_range_count_as_its_ends(name) -> None:
+    makers = {
+        "plain": lambda: small_env("alcc", 3),
+        "filtered": lambda: small_env("alcc", 3, FILTER),
+        "single": lambda: single_env("alcc", 3),
+        "hcfs": lambda: env_of(ramps(), hcfs(safe_cap=False)),
+    }
+    env = makers[name]()
+    reached = []
+    for size in (1.0, 7.0):
+        env.set_seed(0)
+        td = env.rand_action(env.reset())
+        key = "action" if name == "single" else ACTION
+        reached.append(env.step(td.set(key, torch.full_like(td[key], size)))["next"])
+    assert (reached[0].exclude(ACTION) == reached[1].exclude(ACTION)).all()
+
+
+def test_a_compiled_step_of_the_collector_is_watched_from_outside() -> None:
+    env, good = small_env("alcc", 2), network(compose("alcc"))
+    collector = StringCollector(env, TensorDictSequential(good), frames_per_batch=20)
+    collector.collect()
+    with torch.no_grad():
+        next(good.parameters()).fill_(math.nan)
+    collector.collect()
+    with pytest.raises(Diverged, match=r"automated.action, written by the policy, is nan at step"):
+        collector.replay()
