@@ -90,6 +90,12 @@ def hcfs(learned: Any = "good", rule: str = "tuned", **settings: Any) -> Driver:
     return Driver(("variant=hcfs", f"gains={rule}", *own), actor)
 
 
+def wider(driver: Driver, headway: float) -> Driver:
+    """The same driver in a platoon of another headway [m]."""
+    own = f"scenario.start.automated.headway={headway}"
+    return Driver((*driver.overrides, own), driver.policy)
+
+
 def env_of(profiles: Profiles, driver: Driver, vehicles: int = 6, horizon: int | None = None):
     """The platoon's environment, a slot for every record, as in an evaluation."""
     horizon = int(profiles.lengths.min()) - 1 if horizon is None else horizon

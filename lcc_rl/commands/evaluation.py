@@ -88,6 +88,8 @@ def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
     strategies += [trained(cfg, path, compared[path], inputs.population) for path in cfg.compare]
     if own:
         strategies += studied(cfg, policy, inputs.population)
+    for strategy in (s for s in strategies if s.policy is not None):
+        cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)
     check_distinct(strategies)
     return strategies, inputs

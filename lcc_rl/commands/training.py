@@ -15,7 +15,7 @@ from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write
 from lcc_rl.config import identity, require
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
@@ -96,6 +96,7 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
+    check_cases(deployed(cfg), inputs)
     if not learns(cfg) or cfg.get("policy") is not None:
         save_config(cfg, folder)
     if not learns(cfg):

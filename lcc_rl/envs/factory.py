@@ -21,6 +21,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
 from lcc_rl.pieces import CBFFilter, Piece, Places, StringMotion, TotalReward
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.pieces.hybrid import check_spacing
 
 ACTION = (AUTOMATED, "action")
 
@@ -90,6 +91,7 @@ def build_pieces(
     pieces += [Places(string), *drivers, _motion(scenario, string, resources)]
     pieces += [piece.watch() for piece in drivers if isinstance(piece, CBFFilter)]
     pieces += [_build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
+    check_spacing(pieces, profiles)
     if not string.count(AUTOMATED):
         return pieces
     pieces.append(_build(cfg.observation, "observation", **resources))

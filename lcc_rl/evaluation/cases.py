@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lcc_rl.data.cycles import Case
 from lcc_rl.envs import build_env
+from lcc_rl.envs.factory import build_pieces
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
@@ -33,11 +34,8 @@ def evaluate(
     Returns:
         One row per run and vehicle, and the time series of the cases.
     """
-    cases = [*inputs.cases, Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))]
-    if cfg.evaluation.full_length and inputs.full_length is not None:
-        cases.append(inputs.full_length)
     rows, steps = [], []
-    for case in cases:
+    for case in cases_of(cfg, inputs):
         series = drive(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
         frame = measure(series)
         frame.insert(0, "strategy", strategy.name)
@@ -53,6 +51,28 @@ def evaluate(
             steps.append(drawn)
     trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
     return pd.concat(rows, ignore_index=True), trails
+
+
+def cases_of(cfg: DictConfig, inputs: Inputs) -> list[Case]:
+    """Return what an evaluation drives: its cases, the held-out windows and one whole record."""
+    windows = Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))
+    whole = [inputs.full_length] if inputs.full_length and cfg.evaluation.full_length else []
+    return [*inputs.cases, windows, *whole]
+
+
+def check_cases(cfg: DictConfig, inputs: Inputs) -> None:
+    """Check, before anything expensive starts, that a strategy can follow the fastest leader.
+
+    Args:
+        cfg: configuration of the strategy.
+        inputs: what it will be evaluated on.
+
+    Raises:
+        ConfigError: naming what does not fit that leader.
+    """
+    if cfg.evaluation.rows == "vehicles":
+        case = max(cases_of(cfg, inputs), key=lambda case: float(case.profile.speeds.max()))
+        build_pieces(of_case(cfg, case), case.profile, inputs.population, True)
 
 
 def of_case(cfg: DictConfig, case: Case) -> DictConfig:

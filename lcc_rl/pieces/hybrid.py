@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
@@ -19,11 +22,12 @@ from lcc_rl.functional.hcfs import (
     safe_acceleration,
 )
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.pieces.base import Key
-from lcc_rl.pieces.connected import check_leader, leader_names
+from lcc_rl.pieces.base import Key, Piece
+from lcc_rl.pieces.connected import Communication, check_leader, leader_names
 from lcc_rl.pieces.controllers import Controller
 
 HYBRID, COUNTERS = "hybrid", ("switches", "clamps", "cap_interventions")
+SPARE = 2.0  # beyond the gap that the cap needs, for what vehicles deviate from it [m]
 
 
 class HCFS(Controller):
@@ -156,3 +160,34 @@ class HCFS(Controller):
         super().begin(given, start)
         winner = start.get((HYBRID, "winner"))
         start.set((HYBRID, "winner"), torch.full_like(winner, -1))
+
+
+def check_spacing(pieces: Sequence[Piece], profiles: Profiles) -> None:
+    """Check that a platoon keeps the gap that the safe cap of its hybrid controller needs.
+
+    At a speed v shared with the vehicle ahead the cap lets a vehicle be T·v + margin behind it, by
+    the position received, which is delay·v behind the true one. A constant headway below that
+    would set the controller and its cap against each other for ever.
+
+    Args:
+        pieces: the pieces of an environment.
+        profiles: the speeds of its leader.
+
+    Raises:
+        ConfigError: naming the fastest leader, both gaps and the option.
+    """
+    hybrids = [piece for piece in pieces if isinstance(piece, HCFS) and piece.safe_cap]
+    for heard in (piece for piece in pieces if isinstance(piece, Communication)):
+        for hybrid in hybrids:
+            fastest = max(range(len(profiles)), key=lambda i: float(profiles.record(i).max()))
+            speed = float(profiles.record(fastest).max())
+            reach = hybrid.time_step + heard.delay
+            needed = hybrid.margin + reach * speed
+            if needed > heard.headway:
+                raise ConfigError(
+                    f"the leader drives {speed:.1f} m/s ({profiles.names[fastest]}): the safe cap "
+                    f"of HCFS then needs a gap of {needed:.2f} m, the platoon keeps a headway of "
+                    f"{heard.headway:g} m, enough up to "
+                    f"{(heard.headway - hybrid.margin) / reach:.1f} m/s; say "
+                    f"scenario.start.automated.headway={math.ceil(needed + SPARE)}"
+                )

@@ -22,12 +22,14 @@ from platoons import (
     ramps,
     repeated,
     whole,
+    wider,
     windows,
 )
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import reset_options
@@ -196,7 +198,7 @@ def test_no_collision_over_windows_and_hard_braking(rule, bound) -> None:
 @pytest.mark.slow
 def test_no_collision_over_the_whole_udds_at_half_and_full_speed() -> None:
     profiles = whole(("udds", 0.5), ("udds", 1.0))
-    series = play(repeated(profiles, 3), hcfs("mixed"), 6)
+    series = play(repeated(profiles, 3), wider(hcfs("mixed"), 8), 6)
     assert series["gap"].min() > 0.0
 
 
@@ -205,7 +207,8 @@ def test_no_collision_behind_measured_leaders(shared_data) -> None:
     files = [shared_data / f"leader_openacc_platoon{n}_10hz.csv" for n in (3, 10)]
     if not all(file.is_file() for file in files):
         pytest.skip(f"no OpenACC leaders in {shared_data}")
-    series = play(repeated(whole(*((str(file), 1.0) for file in files)), 3), hcfs("mixed"), 6)
+    records = repeated(whole(*((str(file), 1.0) for file in files)), 3)
+    series = play(records, wider(hcfs("mixed"), 12), 6)
     assert series["gap"].min() > 0.0
 
 
@@ -426,3 +429,31 @@ def test_on_a_ring_a_chain_needs_a_leader() -> None:
 def test_no_oracle_behind_a_human_driver() -> None:
     with pytest.raises(ConfigError, match="oracle knows the recorded leader only"):
         DeadBeat(T, lookahead="oracle", string=MIXED)
+
+
+# -- the headway and the safe cap ------------------------------------------------------------------
+
+
+def fast(speed: float) -> Profiles:
+    time = T * torch.arange(101)
+    return leader(*(speed + a * torch.sin(time / p) for a, p in ((1.5, 1.5), (2.0, 3.0))))
+
+
+def test_a_headway_that_the_safe_cap_contradicts_is_refused_with_the_remedy() -> None:
+    words = (
+        r"leader drives 32\.0 m/s \(leader1\): the safe cap of HCFS then needs a gap of 7\.06 m, "
+        r"the platoon keeps a headway of 5 m, enough up to 22\.0 m/s; say "
+        r"scenario\.start\.automated\.headway=10$"
+    )
+    with pytest.raises(ConfigError, match=words):
+        play(fast(30.0), hcfs())
+    play(fast(19.9).select([1]), hcfs())  # 21.9 m/s
+    play(fast(30.0), hcfs(safe_cap=False))
+    play(fast(30.0), cacc())
+
+
+def test_with_the_remedy_a_fast_platoon_earns_what_a_slow_one_does() -> None:
+    slow = play(fast(15.0), hcfs())["reward"].sum()
+    quick = play(fast(30.0), wider(hcfs(), 10))
+    assert 1.2 * slow < quick["reward"].sum() < 0.8 * slow
+    assert quick["gap"].min() > 9.0
