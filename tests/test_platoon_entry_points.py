@@ -52,6 +52,28 @@ def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:
     assert episodes["learned_share"].between(0.0, 1.0).all()
 
 
+def test_a_leader_too_fast_for_the_headway_is_refused_before_the_training(tmp_path) -> None:
+    cfg = tiny("train", "hcfs", "leader.cases.case_3.scale=1.5")
+    words = (
+        r"leader drives 2\d\.\d m/s \(wltc.*\): the safe cap .* scenario.start.automated.headway="
+    )
+    with pytest.raises(ConfigError, match=words):
+        training.run(cfg, tmp_path / "run", quiet=True)
+    assert not list((tmp_path / "run").glob("*.p*"))
+    with pytest.raises(ConfigError, match=words):
+        evaluation.run(
+            load(
+                "evaluate",
+                [*TINY, "variant=hcfs", "policy=pretrained", "leader.cases.case_3.scale=1.5"],
+            ),
+            tmp_path / "evaluated",
+            quiet=True,
+        )
+    # Nobody else has such a cap.
+    rows = load("evaluate", [*TINY, "variant=cacc", "leader.cases.case_3.scale=1.5"])
+    assert len(evaluation.run(rows, tmp_path / "cacc", quiet=True))
+
+
 def test_hcfs_builds_on_a_given_policy(trained, tmp_path) -> None:
     rows = training.run(tiny("train", "hcfs", f"policy={trained}"), tmp_path, quiet=True)
     assert not (tmp_path / "training.parquet").exists()

@@ -37,7 +37,9 @@ def check_learner(
         raise Diverged(f"the policy's weight {found} became no number", advice)
 
 
-def check_batch(batch: TensorDictBase, pieces: Sequence[Piece], begun: int = 0) -> None:
+def check_batch(
+    batch: TensorDictBase, pieces: Sequence[Piece], begun: int = 0, who: str = ""
+) -> None:
     """Check that transitions are numbers, before anything is learned from them.
 
     One sum per entry; only where that is lost, the first cause is looked for.
@@ -46,6 +48,7 @@ def check_batch(batch: TensorDictBase, pieces: Sequence[Piece], begun: int = 0) 
         batch: ``[environments, steps]``.
         pieces: the environment's.
         begun: steps played before the batch, for batches that do not hold the steps themselves.
+        who: who drives, for the message.
 
     Raises:
         Diverged: naming the first entry that is not a number, its step and its episode.
@@ -63,5 +66,5 @@ def check_batch(batch: TensorDictBase, pieces: Sequence[Piece], begun: int = 0) 
         after = [(key, next_key(key)) for key in writers]
         reached += [Written(key, now[late], writers[key]) for key, late in after if late in now]
         running = torch.ones_like(count, dtype=torch.bool)
-        check_moment(left, moment, running, pieces)
-        check_moment(reached, {**moment, STEP: moment[STEP] + 1}, running, pieces)
+        check_moment(left, moment, running, pieces, who)
+        check_moment(reached, {**moment, STEP: moment[STEP] + 1}, running, pieces, who)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from time import perf_counter
 
@@ -24,6 +25,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 from lcc_rl.results.drawing import save
+from lcc_rl.results.report import MISSING
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.cli import prepare_torch
 
@@ -120,7 +122,9 @@ def _summary(drivers: pd.DataFrame) -> Table:
             *(_spread(part[column]) for part in parts.values()),
         )
     populations = [from_table(part).summary() for part in parts.values()]
-    table.add_row("correlation of (v0, T)", *(f"{row['correlation']:.2f}" for row in populations))
+    correlations = (row["correlation"] for row in populations)
+    shown = (f"{value:.2f}" if math.isfinite(value) else MISSING for value in correlations)
+    table.add_row("correlation of (v0, T)", *shown)
     shares = (f"{100 * row['share_at_bound']:.0f} %" for row in populations)
     table.add_row("v0 on a bound", *shares)
     return table

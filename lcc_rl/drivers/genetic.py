@@ -72,7 +72,7 @@ class Evolution:
 
     Args:
         best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
-        fitness: its objective, ``[problems]``.
+        fitness: its objective, ``[problems]``; infinite where every individual was unfit.
         generations: generations evolved before the stopping rule ended the run.
         evaluations: objective evaluations per problem.
     """
@@ -174,7 +174,8 @@ def _in_units(objective: Objective, lower: Tensor, upper: Tensor) -> Objective:
     span = upper - lower
 
     def evaluate(genes: Tensor) -> Tensor:
-        return objective(lower + genes * span).nan_to_num(nan=math.inf, posinf=math.inf)
+        value = objective(lower + genes * span)
+        return torch.where(value.isfinite(), value, math.inf)
 
     return evaluate
 

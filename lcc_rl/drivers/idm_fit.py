@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from lcc_rl.drivers.parameters import (
     checked_bounds,
 )
 from lcc_rl.drivers.speed_error import SpeedError
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, DataError, unknown_name
 from lcc_rl.functional.idm import IDMConstants
 
 DEFAULT_GENETIC = {
@@ -76,7 +77,8 @@ def fit(
 
     Raises:
         ConfigError: if a mode, parameter or bound is unknown or impossible.
-        DataError: if the table lacks a column or holds no usable episode.
+        DataError: if the table lacks a column or holds no usable episode, or an episode's error is
+            no number whatever the parameters.
     """
     if mode not in MODES:
         raise unknown_name("calibration mode", mode, MODES)
@@ -178,6 +180,13 @@ def _table(
     for name, column in COLUMNS.items():
         columns[column] = fitted.get(name, getattr(constants, name, None))
     columns["rmspe"] = exact(best.unsqueeze(1)).squeeze(1).numpy()
+    lost = ~np.isfinite(columns["rmspe"])
+    if lost.any():
+        raise DataError(
+            f"episode {columns['episode'].iloc[lost.argmax()]} (and {lost.sum() - 1} others): no "
+            f"{mode} parameters within the bounds give a finite relative speed error; a follower "
+            "that never moves has none, see selection.min_mean_speed_mps"
+        )
     columns["samples"] = observed.samples
     for name in COLUMNS:
         columns[f"{name}_at_bound"] = name in fitted and at_bound(fitted[name], limits[name])

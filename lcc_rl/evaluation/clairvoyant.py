@@ -17,10 +17,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.agents.checks import check_batch
 from lcc_rl.config import require
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.envs.rollout import ACTION
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.evaluation.episodes import any_leader, pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
@@ -80,6 +82,7 @@ def clairvoyant(
 
     Raises:
         ConfigError: if there are no iterations.
+        Diverged: if an action, or an entry that is minimised or limited, is not a number.
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
     count = len(inputs.population.time_gap)
@@ -98,6 +101,7 @@ def clairvoyant(
         share = iteration / iterations
         _, record = source.play(source.start(given), network, steps, shifts)
         data = source.assemble(record)
+        check_batch(data, pieces_of(env), who=strategy.title)
         energy = path_energy(data, strategy.cfg.scenario.time_step)
         missed = misses(data, string)
         _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)

@@ -222,7 +222,9 @@ def _column(frame: pd.DataFrame, name: str) -> list[str]:
         return cells
     bounds = zip(frame[f"{name}_low"], frame[f"{name}_high"], strict=True)
     return [
-        cell if pd.isna(low) else f"{cell} ({_cell(low, places)} … {_cell(high, places)})"
+        cell
+        if not np.isfinite([low, high]).all()
+        else f"{cell} ({_cell(low, places)} … {_cell(high, places)})"
         for cell, (low, high) in zip(cells, bounds, strict=True)
     ]
 
@@ -249,6 +251,8 @@ def _cell(value: object, places: int) -> str:
     if isinstance(value, (int, np.integer)):
         return f"{value:,}"
     if isinstance(value, (float, np.floating)):
+        if not np.isfinite(value):
+            return MISSING
         text = f"{value:,.{places}f}"
         return text.replace("-", "−")
     return str(value)

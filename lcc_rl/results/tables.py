@@ -188,7 +188,8 @@ def strategies_side_by_side(
         drawn.add_column(str(strategy), justify="right")
     for label, key, form in rows:
         if table[key].notna().any():
-            cells = ("–" if pd.isna(value) else form.format(value) for value in table[key])
+            known = np.isfinite(table[key].astype(float))
+            cells = (form.format(x) if k else "–" for x, k in zip(table[key], known, strict=True))
             drawn.add_row(escape(label), *cells)
     return drawn
 

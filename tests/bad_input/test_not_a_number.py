@@ -5,21 +5,42 @@ from __future__ import annotations
 import math
 import re
 import sys
+from io import StringIO
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 from commands import tiny
-from helpers import ACTION, compose, network, single_env, small_env
+from helpers import (
+    ACTION,
+    POPULATION,
+    compose,
+    make_agent,
+    network,
+    single_env,
+    small_env,
+    wavy_profiles,
+)
 from platoons import env_of, hcfs, ramps
+from rich.console import Console
 from tensordict.nn import TensorDictSequential
 
+from lcc_rl.agents.factory import make_trainer
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
-from lcc_rl.envs import StringCollector
-from lcc_rl.errors import Diverged, ResultsError
+from lcc_rl.drivers.genetic import GeneticSettings, minimise
+from lcc_rl.drivers.idm_fit import fit
+from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.envs import Inputs, StringCollector
+from lcc_rl.errors import DataError, Diverged, ResultsError
+from lcc_rl.evaluation.clairvoyant import clairvoyant
 from lcc_rl.evaluation.rollout import play
+from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_torch, write_torch
+from lcc_rl.results.report import Section, write_report
 from lcc_rl.results.runs import load_policy, pretrained_path
+from lcc_rl.results.tables import strategies_side_by_side
 
 MODULE = """
 import torch
@@ -66,6 +87,14 @@ TERM = ("+reward.terms.comfort={_target_: lost_pieces.LostReward, weight: 0.1}",
 ENTRY = (
     "+scenario.pieces.lost={_target_: lost_pieces.LostEntry}",
     "+observation.scales.self.lost=0.1",
+)
+SMALL_TRAINING = (
+    "training.episodes=40",
+    "training.environments=4",
+    "training.segment=10",
+    "agent.batch_size=32",
+    "agent.buffer_size=200",
+    "agent.hidden=[16,16]",
 )
 FILTER = ("+filter=cbf",)
 EPISODE = r"of episode \d+ \(profile \S+, driver \d+, seed \d+\)"
@@ -251,3 +280,72 @@ def test_a_compiled_step_of_the_collector_is_watched_from_outside() -> None:
     collector.collect()
     with pytest.raises(Diverged, match=r"automated.action, written by the policy, is nan at step"):
         collector.replay()
+
+
+# -- what else computes ----------------------------------------------------------------------------
+
+
+def test_the_clairvoyant_names_it() -> None:
+    cfg = compose("alcc", *DRIVER)
+    policy = network(cfg)
+    inputs = Inputs(wavy_profiles(2), wavy_profiles(2), POPULATION)
+    strategy = Strategy("alcc", cfg, policy, source="a.pt")
+    words = r"strategy alcc \(policy=a.pt\): command.human, .*LostDriver, is nan at step 4 of epis"
+    with pytest.raises(Diverged, match=words):
+        clairvoyant(strategy, inputs, 2, 0, iterations=2, compiled=False)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_an_individual_whose_objective_is_no_number_is_unfit(number) -> None:
+    bounds = torch.zeros(1), torch.ones(1)
+    settings = GeneticSettings(population=8, generations=4)
+
+    def objective(genes):
+        value = (genes[..., 0] - 0.25).abs()
+        return torch.where(genes[..., 0] > 0.5, number, value)
+
+    found = minimise(objective, *bounds, 2, torch.Generator().manual_seed(0), settings)
+    assert (found.best < 0.5).all()
+    hopeless = minimise(
+        lambda genes: torch.full(genes.shape[:-1], number),
+        *bounds,
+        2,
+        torch.Generator().manual_seed(0),
+        settings,
+    )
+    assert (hopeless.fitness == math.inf).all()
+
+
+def test_a_calibration_without_any_fit_names_the_episode() -> None:
+    time = 0.1 * np.arange(200)
+    still = pd.DataFrame({"time_s": time, "follower_speed_mps": 0.0, "leader_speed_mps": 0.0})
+    still = still.assign(episode=7, gap_m=5.0, follower_position_m=0.0, leader_position_m=10.0)
+    observed = observe(still.assign(leader_length_m=5.0), Selection(min_mean_speed_mps=0.0))
+    with pytest.raises(DataError, match=r"episode 7 .*no local parameters .* finite relative"):
+        fit(observed, genetic=GeneticSettings(population=4, generations=1))
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_no_table_shows_what_is_no_number(number, tmp_path) -> None:
+    frame = pd.DataFrame({"strategy": ["a", "b"], "x": [1.0, number], "n": [1, 2]})
+    frame = frame.assign(x_low=[number, number], x_high=[2.0, number])
+    page = write_report(tmp_path, "t", [Section("s", tables=[("c", frame)])]).read_text()
+    assert ">–<" in page
+    rows = [("x", "x", "{:.2f}"), ("n", "n", "{:d}")]
+    console = Console(file=StringIO(), width=80)
+    console.print(strategies_side_by_side(frame, rows, "t", "c"))
+    printed = console.file.getvalue()
+    assert "–" in printed
+    for text in (page.partition("<tbody>")[2], printed):
+        assert "nan" not in text
+        assert "inf" not in text
+
+
+def test_no_logger_is_told_what_is_no_number(tmp_path) -> None:
+    cfg = compose("alcc", *SMALL_TRAINING, "agent.critic_lr=1e12")
+    trainer = make_trainer(cfg, make_agent(cfg), wavy_profiles(), POPULATION, tmp_path)
+    told = []
+    trainer.on_row = told.append
+    with pytest.raises(Diverged, match=r"became (nan|-?inf) in iteration .* Lower agent.critic_lr"):
+        trainer.run()
+    assert all(math.isfinite(x) for row in told for x in row.values())

@@ -118,17 +118,21 @@ def _windows(page: Page, episodes: pd.DataFrame) -> None:
         table = case_table(episodes, "full length")
         tables.append(("full_length", "A whole record, first training", table))
     literal = episodes[episodes["strategy"] == "hcfs literal"]
-    short = literal[literal["case"] != "full length"]["peak_jerk_mps3"].max()
-    whole = literal["peak_jerk_mps3"].max()
-    text = f"""Every window of 20 s of the held-out records in which the leader changes its
+    text = """Every window of 20 s of the held-out records in which the leader changes its
         speed by at least 2 m/s in total, six followers each; and one record from end to end. The
         string ratio is the energy of the speed error to the predecessor over that of the vehicle
-        ahead, the worst of all; above 1 a disturbance grows along the string.
-
-        The literal rule has neither the clamp to the jerk bound of 10 m/s³ nor the safe cap. Its
-        peak jerk is {short:.1f} m/s³ in cases and windows and {whole:.1f} m/s³ anywhere; a random
-        actor in the place of DDPG violates the bound at every turn, as the tests show."""
+        ahead, the worst of all; above 1 a disturbance grows along the string."""
+    text += "" if literal.empty else f"\n\n{_literal_rule(literal)}"
     page.add("Held-out windows and a whole record", text, tables)
+
+
+def _literal_rule(rows: pd.DataFrame) -> str:
+    """Describe the peak jerk of the literal rule."""
+    short = rows[rows["case"] != "full length"]["peak_jerk_mps3"].max()
+    whole = rows["peak_jerk_mps3"].max()
+    return f"""The literal rule has neither the clamp to the jerk bound of 10 m/s³ nor the safe cap.
+        Its peak jerk is {short:.1f} m/s³ in cases and windows and {whole:.1f} m/s³ anywhere; a
+        random actor in the place of DDPG violates the bound at every turn, as the tests show."""
 
 
 def _learning(page: Page) -> None:
