@@ -74,9 +74,7 @@ def _copy(cfg: DictConfig) -> DictConfig:
 
 def deployed(cfg: DictConfig) -> DictConfig:
     """Return a configuration in which the automated vehicles drive as after training."""
-    if cfg.get("deployed") is None:
-        return cfg
-    return driven_by(cfg, cfg.deployed)
+    return cfg if cfg.get("deployed") is None else driven_by(cfg, cfg.deployed)
 
 
 def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
@@ -220,9 +218,8 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
         found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
     if set(string_of(cfg).names) == {AUTOMATED}:
-        oracle = {**plain(cfg.deployed), "lookahead": "oracle"}
-        name = f"{strategy.name} oracle"
-        found.append(replace(strategy, name=name, cfg=driven_by(cfg, oracle)))
+        knowing = driven_by(cfg, {**plain(cfg.deployed), "lookahead": "oracle"})
+        found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found
 
 
@@ -293,13 +290,10 @@ def check_distinct(strategies: Sequence[Strategy]) -> None:
     Raises:
         ConfigError: naming the variant and the seed.
     """
-    seen = set()
-    for strategy in strategies:
-        key = (strategy.name, strategy.seed)
-        if key in seen:
-            seed = "" if strategy.seed is None else f" with training seed {strategy.seed}"
-            raise ConfigError(
-                f"policy and compare name two policies of variant {strategy.name}{seed}; their "
-                "rows could not be told apart: evaluate them one after the other"
-            )
-        seen.add(key)
+    counts = Counter((strategy.name, strategy.seed) for strategy in strategies)
+    for name, seed in (key for key, count in counts.items() if count > 1):
+        which = name if seed is None else f"{name} with training seed {seed}"
+        raise ConfigError(
+            f"policy and compare name two policies of variant {which}; their rows could not be "
+            "told apart: evaluate them one after the other"
+        )
