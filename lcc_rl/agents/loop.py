@@ -147,9 +147,8 @@ class TrainingLoop(ABC, Generic[AgentT]):
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
         self.times: list[dict[str, float]] = []
-        # Told every row as it appears; see lcc_rl.runs.loggers.
+        # Told every row (lcc_rl.runs.loggers), and every iteration whose policy is to be kept.
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
-        # Told the number of every iteration whose policy is to be kept.
         self.on_keep: Callable[[int], None] = lambda iteration: None
         self._prepare()
 
@@ -198,22 +197,21 @@ class TrainingLoop(ABC, Generic[AgentT]):
 
     def _numbers(self, source: Any) -> dict[str, float]:
         """Do an iteration; an error names it, and where the last good state is."""
-        number = self.iteration + 1
+        good = self.folder / "checkpoint.pt"
+        where = f"in iteration {self.iteration + 1} of {self.iterations}"
         try:
             check_learner(self.agent.policy, {}, self.advice)
             return self._iterate(source)
         except Diverged as error:
-            good = self.folder / "checkpoint.pt"
             state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
-            where = f"in iteration {number} of {self.iterations}"
             raise Diverged(f"{error.what} {where}; {state}", error.advice) from error
 
     def _record(self, row: dict[str, float], collect_s: float, learn_s: float) -> None:
         """Append an iteration to the record; raise Diverged where a value is not finite."""
         check_learner(self.agent.policy, row, self.advice)
         self.rows.append(row)
-        times = {"iteration": row["iteration"], "collect_s": collect_s, "learn_s": learn_s}
-        self.times.append(times)
+        spent = {"collect_s": collect_s, "learn_s": learn_s}
+        self.times.append({"iteration": row["iteration"], **spent})
 
     # -- state ---------------------------------------------------------------------------------
 

@@ -181,7 +181,7 @@ def test_a_policy_with_a_broken_weight_is_refused(number, tmp_path) -> None:
     content["weights"][name] = content["weights"][name].clone().fill_(number)
     path = tmp_path / "policy.pt"
     write_torch(content, path)
-    words = f"{path}: weight {name} holds something other than finite numbers"
+    words = f"{path}: weight {name!r} holds values that are no numbers"
     with pytest.raises(ResultsError, match=re.escape(words)):
         load_policy(path)
 
