@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Integral
 
 
 class LccError(Exception):
@@ -48,6 +49,23 @@ def require_positive(where: str, **settings: float) -> None:
     for name, value in settings.items():
         if not value > 0:
             raise ConfigError(f"{where}.{name} must be positive, got {value}")
+
+
+LARGEST_SEED = 2**32 - 1  # NumPy takes no larger ones
+
+
+def require_whole(name: str, value: object, least: int, most: int | None = None) -> None:
+    """Check a size, a count or a seed.
+
+    Raises:
+        ConfigError: naming the option unless the value is a whole number within the bounds.
+    """
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        number = int(value)
+        if least <= number <= (number if most is None else most):
+            return
+    bounds = f"from {least} up" if most is None else f"from {least} to {most}"
+    raise ConfigError(f"{name} must be a whole number {bounds}, got {value!r}")
 
 
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:

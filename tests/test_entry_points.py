@@ -184,9 +184,9 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("training.environments=0", r"training\.environments must be at least 1"),
-        ("evaluation.drivers=0", r"evaluation\.drivers must be at least 1"),
-        ("evaluation.profiles=0", r"evaluation\.profiles must be at least 1"),
+        ("training.environments=0", r"training\.environments must be a whole number from 1"),
+        ("evaluation.drivers=0", r"evaluation\.drivers must be a whole number from 1"),
+        ("evaluation.profiles=0", r"evaluation\.profiles must be a whole number from 1"),
         ("scenario.time_step=-0.1", r"time_step must be positive"),
         ("~scenario.pieces.ttc", r"lacks \['ttc'\], which the evaluation measures"),
         ("~scenario.pieces.predicted_power", r"reads human\.predicted_power, which no piece"),

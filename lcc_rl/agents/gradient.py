@@ -12,11 +12,12 @@ from torch import Tensor
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import Diverged
 from lcc_rl.functional.finite import any_lost
-from lcc_rl.pieces.base import next_key
+from lcc_rl.pieces.base import State, next_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
 
 log = logging.getLogger("lcc_rl")
@@ -52,12 +53,48 @@ class GradientTrainer(TrainingLoop[Analytic]):
             compiled = self.settings.compiled
         if compiled is None:
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
+        return self._rollout(compiled)
+
+    def _rollout(self, compiled: bool) -> DifferentiableRollout:
         return DifferentiableRollout(
             self.env,
             wanted=[key for term, _ in self.objective for _, key in term.sources],
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=compiled,
         )
+
+    def footprint(self) -> Footprint:
+        source, own = self._rollout(False), self.agent.settings
+        # The first steps lack the gradient that reaches the later ones through the motion.
+        (less, _, _), (more, data, state) = (self._played(source, steps) for steps in (2, 3))
+        count = self.env.batch_size.numel()
+        vehicles = data.get(OBSERVATION).shape[-2]
+        layers = 4 * sum(own.hidden) * COPIES * vehicles if own.bootstrap else 0
+        return Footprint(
+            # Twice the graph: what it holds, and the gradients on the way back.
+            step=(2 * (more - less) + COPIES * data.bytes() / 3) / count + layers,
+            reported=data.select(*REPORTED).bytes() / 3 / count,
+            moment=nbytes(state.values()) / count,
+            fixed={},
+        )
+
+    def _played(
+        self, source: DifferentiableRollout, steps: int
+    ) -> tuple[int, TensorDictBase, State]:
+        """Play some steps; return the bytes that their graph holds, and what was played."""
+        held: dict[int, int] = {}  # by the place in memory
+
+        def keep(tensor: Tensor) -> Tensor:
+            held[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            state, record = source.play(source.start(), self.agent.policy.module, steps)
+            data = source.assemble(record)
+            # Kept until all are counted: what is freed would give its place to another.
+            total = [self._score(term, data) for term, _ in self.objective]
+        assert total
+        return sum(held.values()), data.detach(), state
 
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Play one batch of episodes, with a gradient step after every segment of them."""

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.checks import check_learner
+from lcc_rl.agents.sizes import Footprint, check_length
 from lcc_rl.config import require
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_torch, write_parquet, write_torch
@@ -120,30 +121,12 @@ class TrainingLoop(ABC, Generic[AgentT]):
         folder: Path,
         identity: str,
     ) -> None:
-        batch, self.horizon = env.batch_size[0], env.base_env.horizon
-        require(
-            settings.episodes >= batch,
-            f"training.episodes ({settings.episodes}) must be at least "
-            f"training.environments ({batch})",
-        )
-        require(
-            settings.episodes % batch == 0,
-            f"training.episodes ({settings.episodes}) must be a multiple of "
-            f"training.environments ({batch})",
-        )
-        require(
-            settings.segment >= 1 and self.horizon % settings.segment == 0,
-            f"training.segment ({settings.segment}) must divide scenario.horizon ({self.horizon})",
-        )
-        require(settings.checkpoint_every >= 1, "training.checkpoint_every must be at least 1")
+        self.horizon = env.base_env.horizon
+        check_length(settings, self.horizon)
         self.keep_every = settings.keep_every
-        require(
-            self.keep_every is None or self.keep_every >= 1,
-            f"training.keep_every must be at least 1, or null, got {self.keep_every}",
-        )
         self.agent, self.env, self.settings = agent, env, settings
         self.seed, self.folder, self.identity = seed, folder, identity
-        self.iterations = settings.episodes // batch
+        self.iterations = settings.episodes // settings.environments
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
         self.times: list[dict[str, float]] = []
@@ -158,6 +141,10 @@ class TrainingLoop(ABC, Generic[AgentT]):
     @abstractmethod
     def _source(self) -> Any:
         """Return what :meth:`_iterate` plays episodes with; made once per run."""
+
+    @abstractmethod
+    def footprint(self) -> Footprint:
+        """Measure the memory that an iteration needs on one step of this loop's episodes."""
 
     @abstractmethod
     def _iterate(self, source: Any) -> dict[str, float]:

@@ -28,6 +28,7 @@ from lcc_rl.results.drawing import save
 from lcc_rl.results.report import MISSING
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.states import claim
 
 
 def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
@@ -48,7 +49,11 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
         DataError: if the data cannot be read or hold no usable episode.
         ResultsError: if a file cannot be written.
     """
-    console, folder = console or Console(highlight=False), Path(folder)
+    with claim(Path(folder)):
+        return _run(cfg, Path(folder), console or Console(highlight=False))
+
+
+def _run(cfg: DictConfig, folder: Path, console: Console) -> pd.DataFrame:
     device = prepare_torch(cfg)
     missing = [key for key in sorted(OmegaConf.missing_keys(cfg)) if key.startswith("data.")]
     if missing:

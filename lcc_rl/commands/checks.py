@@ -5,21 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
+from lcc_rl.agents.sizes import check_length
 from lcc_rl.config import CALLED, build_as, load, require
-from lcc_rl.envs import build_env
+from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
     build_drivers,
     build_source,
     constant_profiles,
     string_of,
 )
-from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.evaluation.episodes import any_leader
+from lcc_rl.errors import LARGEST_SEED, ConfigError, require_whole, unknown_name
+from lcc_rl.evaluation.episodes import any_leader, needed
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.schemas import TrainConfig
 from lcc_rl.targets import TARGET
@@ -41,6 +43,7 @@ OBJECTIVES = {
     # Of the table of windows; it has no energies, the default is read as the first.
     "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
 }
+MOMENT = 64  # bytes of a moment of the one record that settings are tried on
 MEASURED = ("ttc", "time_gap", "power")
 
 
@@ -64,8 +67,22 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if learns(cfg):
         agent = build_agent(cfg, population, cfg.device)
-        make_trainer(trial, agent, profiles, population, folder)
+        check_length(cfg.training, horizon)
+        trial.training.environments, trial.training.episodes = 2, 2
+        footprint = make_trainer(trial, agent, profiles, population, folder).footprint()
+        require_memory(footprint.needs(cfg.training, horizon), cfg.device)
     build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
+
+
+def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
+    """Check that an evaluation fits into memory, once the data are read and nothing else is done.
+
+    Raises:
+        ConfigError: saying what it needs.
+    """
+    own, profiles = deployed(any_leader(cfg)), inputs.evaluation
+    env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
+    require_memory(needed(env, cfg, inputs), cfg.device)
 
 
 def build_logger(cfg: DictConfig) -> Any:
@@ -129,12 +146,14 @@ def check_sizes(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    sizes = {f"evaluation.{key}": cfg.evaluation[key] for key in ("profiles", "drivers")}
-    sizes["evaluation.batch_size"] = cfg.evaluation.batch_size
-    if not OmegaConf.is_missing(cfg.training, "environments"):
-        sizes["training.environments"] = cfg.training.environments
-    for name, value in sizes.items():
-        require(value is None or value >= 1, f"{name} must be at least 1, got {value}")
+    horizon, own = cfg.scenario.horizon, cfg.evaluation
+    require_whole("scenario.horizon", horizon, 1)
+    for name in ("profiles", "drivers", "batch_size"):
+        if own[name] is not None:
+            require_whole(f"evaluation.{name}", own[name], 1)
+    require_whole("evaluation.sample_episodes", own.sample_episodes, 0)
+    require_whole("evaluation.seed", own.seed, 0, LARGEST_SEED)
+    require_memory({f"scenario.horizon={horizon}": MOMENT * horizon})
     pieces = cfg.scenario.pieces
     measured = [name for name in MEASURED if pieces.get(name) is None]
     require(

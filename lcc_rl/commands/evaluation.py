@@ -10,7 +10,7 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import check_sizes, check_variant
+from lcc_rl.commands.checks import check_evaluation, check_sizes, check_variant
 from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, unknown_name
@@ -31,6 +31,7 @@ from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
 from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.states import check_present, claim
 
 log = logging.getLogger("lcc_rl")
 
@@ -56,7 +57,11 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
     Raises:
         LccError: one clear error for whatever is wrong with settings, data or files.
     """
-    folder = Path(folder)
+    with claim(Path(folder)):
+        return _run(cfg, Path(folder), own, quiet)
+
+
+def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool) -> pd.DataFrame:
     prepare_torch(cfg)
     check_sizes(cfg)
     if own:
@@ -84,6 +89,7 @@ def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
+    check_evaluation(cfg, inputs)
     strategies = baselines(cfg)
     strategies += [trained(cfg, path, compared[path], inputs.population) for path in cfg.compare]
     if own:
@@ -111,6 +117,7 @@ def evaluate_and_write(
     metadata = {"lcc_rl.config": identity(cfg)}
     rows = pd.concat([table for table, _ in results], ignore_index=True)
     steps = pd.concat([trace for _, trace in results], ignore_index=True)
+    check_present(folder)
     write_parquet(steps, folder / STEPS, metadata)
     # Last: who finds it finds a finished run.
     write_parquet(rows, folder / EPISODES, metadata)

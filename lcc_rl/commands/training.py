@@ -10,7 +10,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
-from lcc_rl.commands.checks import build_logger, check_settings, objectives
+from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
 from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write
 from lcc_rl.config import identity, require
 from lcc_rl.envs import Inputs, load_inputs
@@ -97,6 +97,7 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFra
     for line in inputs.report:
         log.info(line)
     check_cases(deployed(cfg), inputs)
+    check_evaluation(cfg, inputs)
     if not learns(cfg) or cfg.get("policy") is not None:
         save_config(cfg, folder)
     if not learns(cfg):

@@ -9,11 +9,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_whole
+from lcc_rl.io.memory import require_memory
 
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
+SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
 _LEAST = {"population": 4, "generations": 1, "founders": 1, "tournament": 1, "patience": 1}
 
 
@@ -54,8 +56,8 @@ class GeneticSettings:
 
     def __post_init__(self) -> None:
         for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"genetic setting {name!r} must be at least {least}")
+            require_whole(f"genetic setting {name!r}", getattr(self, name), least)
+        self.check_memory(1, 1)
         for name in ("elites", "difference_rate", "mutation_rate"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ConfigError(f"genetic setting {name!r} must lie in 0…1")
@@ -64,6 +66,16 @@ class GeneticSettings:
                 raise ConfigError(f"genetic setting {name!r} must be positive")
         if self.blend < 0.0 or self.tolerance < 0.0:
             raise ConfigError("genetic settings 'blend' and 'tolerance' must not be below 0")
+
+    def check_memory(self, problems: int, dims: int, device: torch.device | str = "cpu") -> None:
+        """Check that the first generation, the largest one, fits into memory.
+
+        Raises:
+            ConfigError: saying what it needs.
+        """
+        largest = self.founders * self.population
+        what = f"a genetic search of {problems} × {largest} (founders × population) individuals"
+        require_memory({what: problems * largest * (4 * dims + SIMULATED) * 4}, device)
 
 
 @dataclass(frozen=True)
@@ -108,11 +120,12 @@ def minimise(
         progress: called as ``progress(generation, total, text)`` after each generation.
 
     Raises:
-        ConfigError: if the bounds are empty or crossed.
+        ConfigError: if the bounds are empty or crossed, or memory is short.
     """
     settings = settings or GeneticSettings()
     if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
         raise ConfigError("bounds must be two vectors of one length with lower < upper")
+    settings.check_memory(problems, lower.numel(), lower.device)
     evaluate = _in_units(objective, lower, upper)
     found = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
     return replace(found, best=lower + found.best * (upper - lower))

@@ -21,8 +21,11 @@ from lcc_rl.drivers.parameters import (
     checked_bounds,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import LARGEST_SEED, ConfigError, DataError, require_whole
 from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.io.memory import require_memory
+
+DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, and its name
 
 
 @dataclass(frozen=True)
@@ -183,8 +186,11 @@ def kde(
         ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
-    if drivers < 1 or (bandwidth is not None and not bandwidth > 0.0):
-        raise ConfigError("kde: 'drivers' and 'bandwidth' must be positive")
+    require_whole("kde: 'drivers'", drivers, 1)
+    require_whole("kde: 'seed'", seed, 0, LARGEST_SEED)
+    if bandwidth is not None and not bandwidth > 0.0:
+        raise ConfigError(f"kde: 'bandwidth' must be positive, got {bandwidth}")
+    require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
     limits = checked_bounds(bounds)
     table = load_drivers(path, mode)
     names = [name for name, column in COLUMNS.items() if np.ptp(table[column].to_numpy()) > 0.0]

@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import require
 from lcc_rl.data.profiles import Profiles
@@ -23,6 +24,7 @@ from lcc_rl.evaluation.rollout import Record, play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import gather
+from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.tables import FASTER
 
@@ -88,7 +90,8 @@ def evaluate(
     require(batch_size >= 1, f"evaluation.batch_size must be at least 1, got {batch_size}")
     profiles, count = inputs.evaluation, len(inputs.population.time_gap)
     profile, driver = pairs(len(profiles), count, drivers)
-    kept = set(np.linspace(0, len(profile) - 1, max(sample_episodes, 1)).round().astype(int))
+    samples = min(max(sample_episodes, 1), len(profile))
+    kept = set(np.linspace(0, len(profile) - 1, samples).round().astype(int))
     cfg, time_step = any_leader(strategy.cfg), strategy.cfg.scenario.time_step
     episodes, steps = [], []
     for start in range(0, len(profile), batch_size):
@@ -107,6 +110,31 @@ def evaluate(
             steps += list(sample(groups, alive, table, inside, time_step))
     trace = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
     return pd.concat(episodes, ignore_index=True), trace
+
+
+def needed(
+    env: TransformedEnv, cfg: DictConfig, inputs: Inputs, copies: int = 4
+) -> dict[str, float]:
+    """Return the bytes that the largest batch of an evaluation needs, by option.
+
+    Args:
+        env: an environment of the configuration with one episode.
+        cfg: the configuration.
+        inputs: what it is evaluated on.
+        copies: of an entry: the steps, the record, the record of each group, its measures.
+    """
+    moment = env.reset()
+    known = set(map(as_key, moment.keys(True, True)))
+    size = sum(moment.get(key).nbytes for key in KEYS if key in known)
+    settings, people = cfg.evaluation, len(inputs.population.time_gap)
+    count = len(inputs.evaluation)
+    if settings.rows == "episodes":
+        count = min(count * min(settings.drivers or people, people), settings.batch_size)
+    steps = cfg.scenario.horizon
+    if settings.full_length and inputs.full_length and inputs.full_length.horizon > count * steps:
+        count, steps = 1, inputs.full_length.horizon
+    what = f"an evaluation of {count} episodes of {steps} steps side by side"
+    return {what: count * copies * size * steps}
 
 
 def any_leader(cfg: DictConfig) -> DictConfig:

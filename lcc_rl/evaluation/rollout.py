@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.envs.finite import ACTION, check_moment
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written, written_by
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.random import hash_bits
+from lcc_rl.functional.random import MASK, hash_bits
 from lcc_rl.pieces.base import SEED, Key, Piece, State, as_key
 
 # Reads and writes a TensorDict; None where a rule drives.
@@ -109,7 +109,7 @@ def reset_options(
     # of the next ids follow: every driver is met equally often in every place.
     number = profile * drivers + driver
     given = TensorDict(batch_size=batch, device=env.device)
-    given.set(SEED, (hash_bits(number + seed * 0x9E3779B1) >> 1).unsqueeze(-1))
+    given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & MASK)) >> 1).unsqueeze(-1))
     spec = env.full_state_spec
     known = [as_key(key) for key in spec.keys(True, True)]
     if PROFILE in known:

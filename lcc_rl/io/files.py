@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import torch
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.io.memory import require_memory
 from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
@@ -122,7 +123,10 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
 
     Raises:
         ResultsError: if the file is missing, damaged or of a newer schema.
+        ConfigError: if it does not fit into memory.
     """
+    # As a table, as a data frame, and once more while it is checked.
+    require_memory({f"reading {path}": 3 * _read(path, _unpacked_size)})
     table = _read(path, partial(pq.read_table, page_checksum_verification=True))
     # Tables of other origin have no schema version and are read unchanged.
     version = (table.schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
@@ -130,6 +134,11 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
         found = f"schema version {version[:20]!r}"
         raise ResultsError(f"{path}: {found}; this package reads 1 to {SCHEMA_VERSION}")
     return migrated(table.to_pandas(), int(version))
+
+
+def _unpacked_size(path: Path) -> int:
+    found = pq.read_metadata(path)
+    return sum(found.row_group(place).total_byte_size for place in range(found.num_row_groups))
 
 
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
@@ -161,9 +170,19 @@ def parquet_metadata(path: str | Path) -> dict[str, str]:
 
 
 def write_torch(content: Any, path: str | Path) -> None:
-    """Write tensors atomically, in a form that loads with ``weights_only=True``."""
-    with atomic_path(path) as temporary:
-        torch.save(content, temporary)
+    """Write tensors atomically, in a form that loads with ``weights_only=True``.
+
+    Raises:
+        ResultsError: if the file cannot be written.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:
+            # Torch hides what went wrong with the file behind a fault of its own.
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def read_torch(path: str | Path) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from tensordict import TensorDictBase
@@ -12,15 +13,33 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from lcc_rl.errors import require_whole
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
+from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces.base import SEED, STEP
 
+# Bytes that a weight costs a training: it, its gradient, two moments of Adam, its target.
+WEIGHT = 5 * 4
 OBSERVATION, ACTION = (AUTOMATED, "observation"), (AUTOMATED, "action")
 
 
 def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:
-    """Build a ReLU network whose initial weights depend on ``seed`` alone."""
+    """Build a ReLU network whose initial weights depend on ``seed`` alone.
+
+    Args:
+        inputs: entries read.
+        outputs: entries written.
+        hidden: sizes of the layers between; none for a linear map.
+        seed: seed of the weights.
+
+    Raises:
+        ConfigError: if a size is no positive whole number, or the weights do not fit into memory.
+    """
+    for size in hidden:
+        require_whole(f"agent.hidden={list(hidden)}: every size", size, 1)
+    weights = sum(a * b for a, b in pairwise([inputs, *hidden, outputs]))
+    require_memory({f"agent.hidden={list(hidden)}": WEIGHT * weights})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return MLP(

@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import patch
@@ -22,8 +22,15 @@ from omegaconf.errors import OmegaConfBaseException
 from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys
-from lcc_rl.errors import ConfigError, Interrupted, LccError
-from lcc_rl.runs.interrupts import INTERRUPTED, interruptible
+from lcc_rl.errors import (
+    LARGEST_SEED,
+    ConfigError,
+    Interrupted,
+    LccError,
+    ResultsError,
+    require_whole,
+)
+from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.precision import set_precision
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
@@ -32,7 +39,9 @@ from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
-BAD_INPUT = 2
+DEVICES = ("cpu", "cuda")
+# Threads, or processes: more of them than this on any machine are a mistake, and can crash it.
+MOST_PARALLEL = 64
 NO_BEST = "No trials are completed"  # message of Optuna
 
 
@@ -49,6 +58,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
         def checked(config: DictConfig) -> Any:
+            heed_logs()
             check_keys(config)
             typed = list(HydraConfig.get().overrides.task)
             check_ignored(config, typed, is_sweep())
@@ -169,6 +179,20 @@ def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], An
     return recording
 
 
+def heed_logs() -> None:
+    """Let a log file that cannot be written end the command, as any other file does.
+
+    By default Python prints a traceback for each line that is lost, and nothing else happens.
+    """
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.handleError = partial(_lost, handler.baseFilename)  # type: ignore[method-assign]
+
+
+def _lost(path: str, record: logging.LogRecord) -> NoReturn:
+    raise ResultsError(f"{path}: cannot be written: {sys.exception()}")
+
+
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
     """Turn input errors into one line on stderr and exit code 2."""
 
@@ -190,6 +214,8 @@ def _stop(error: Exception) -> NoReturn:
     """Print an error, or the input error that Hydra wraps, in one line and exit."""
     cause = input_error(error)
     text = " ".join(str(cause or error).split())
+    if isinstance(error, OSError) and error.filename is None and SweepCallback.target is not None:
+        text = f"{SweepCallback.target}: {text}"  # of a file that Hydra writes itself
     if isinstance(cause, Interrupted):
         print(f"lcc_rl: {text}", file=sys.stderr)
         sys.exit(INTERRUPTED)
@@ -207,22 +233,28 @@ def run_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
+def most_parallel() -> int:
+    """Return the largest number of threads or processes that a command starts here."""
+    return max(MOST_PARALLEL, 4 * (os.cpu_count() or 1))
+
+
 def prepare_torch(cfg: DictConfig) -> torch.device:
     """Check ``seed``, ``threads`` and ``device``, set up torch and return the device.
 
     Raises:
         ConfigError: if one of them is of the wrong type or impossible on this machine.
     """
-    for name, least in (("seed", 0), ("threads", 1)):
-        value = cfg.get(name)
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise ConfigError(f"{name} must be a whole number from {least} up, got {value!r}")
+    require_whole("seed", cfg.get("seed"), 0, LARGEST_SEED)
+    require_whole("threads", cfg.get("threads"), 1, most_parallel())
     try:
         device = torch.device(cfg.device)
         torch.empty(0, device=device)
     # Which error torch raises depends on how it was built.
     except (RuntimeError, AssertionError, TypeError) as error:
-        raise ConfigError(f"device {cfg.device!r} is not available: {error}") from error
+        reason = str(error).strip().partition("\n")[0]
+        raise ConfigError(f"device {cfg.device!r} is not available: {reason}") from error
+    if device.type not in DEVICES:
+        raise ConfigError(f"device must be cpu, cuda or one such as cuda:0, got {cfg.device!r}")
     torch.set_num_threads(cfg.threads)
     set_precision(cfg.get("matmul_precision", "highest"))
     # TorchRL logs every buffer it allocates.

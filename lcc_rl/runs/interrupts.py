@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-INTERRUPTED = 130  # exit code
+# Exit codes.
+BAD_INPUT, INTERRUPTED = 2, 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Restore = Callable[[], None]
 

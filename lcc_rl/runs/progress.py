@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from lcc_rl.config import is_sweep
 from lcc_rl.io.files import atomic_path
-from lcc_rl.runs.states import PROGRESS, read_progress
+from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")
 
@@ -68,6 +68,8 @@ class ProgressReporter:
         self.folder, self.every = folder, every
         self.console = console or Console(stderr=True)
         self.live = self.console.is_terminal and not is_sweep()
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
         self.begun = self.last_line = time.monotonic()
         self.bar = bar(self.console, self.live)
         self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note="")
@@ -106,6 +108,7 @@ class ProgressReporter:
     def _write_state(self, done: int, remaining: float, values: Mapping[str, float]) -> None:
         if self.folder is None:
             return
+        check_present(self.folder)
         state = {"title": self.title, "done": done, "total": self.total}
         state |= {"eta_s": round(remaining, 1)}
         state |= {name: float(f"{value:.6g}") for name, value in values.items()}

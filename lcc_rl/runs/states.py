@@ -36,6 +36,11 @@ class Busy(LccError):
     """Another process works on this run."""
 
 
+def busy(folder: Path) -> Busy:
+    """Build the error for a folder in which another process works."""
+    return Busy(f"{folder}: another process is working on this run")
+
+
 @dataclass(frozen=True)
 class RunState:
     """State of a run.
@@ -59,26 +64,33 @@ class RunState:
 
 @contextmanager
 def claim(folder: Path) -> Iterator[None]:
-    """Lock a run's folder; the lock is released however the process ends.
+    """Lock a run's folder and remove what a killed process left half-written.
+
+    The lock is released however the process ends.
 
     Raises:
         Busy: if another process holds the lock.
         ResultsError: if the folder cannot be written.
     """
-    path = folder / LOCK
+    path, made = folder / LOCK, False
     try:
+        made = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         file = _locked(path)
     except BlockingIOError:
-        raise Busy(f"{folder}: another process is working on this run") from None
+        raise busy(folder) from None
     except OSError as error:
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
     try:
+        remove_leftovers(folder)
         yield
     finally:
         with suppress(OSError):
             path.unlink()
         os.close(file)
+        if made:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
 
 
 def _locked(path: Path) -> int:
@@ -121,7 +133,6 @@ def working(folder: Path) -> Iterator[None]:
     """Claim a folder and record an error raised inside."""
     with claim(folder):
         forget(folder)
-        remove_leftovers(folder)
         try:
             yield
         except Interrupted:
@@ -131,6 +142,16 @@ def working(folder: Path) -> Iterator[None]:
             if not is_finished(folder):
                 record(folder, error)
             raise
+
+
+def check_present(folder: Path) -> None:
+    """Check that the folder of a run was not removed meanwhile; a file would make it anew.
+
+    Raises:
+        ResultsError: if it is gone.
+    """
+    if not folder.is_dir():
+        raise ResultsError(f"{folder}: cannot be written: the folder was removed during the run")
 
 
 def forget(folder: Path) -> None:

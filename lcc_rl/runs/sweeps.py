@@ -19,6 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import configure_log
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, read_write
+from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.live import Live
 
@@ -26,9 +27,10 @@ from lcc_rl.config import NOT_IDENTITY, identity
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.files import atomic_path
 from lcc_rl.io.settings import read_json
+from lcc_rl.runs.interrupts import BAD_INPUT
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.search import resume_search
-from lcc_rl.runs.states import Busy, one_line, record, survey
+from lcc_rl.runs.states import Busy, busy, is_claimed, one_line, record, survey
 
 log = logging.getLogger("lcc_rl")
 
@@ -90,18 +92,33 @@ register_resolvers()
 
 
 class SweepCallback(Callback):
-    """Writes the plan of a sweep at its start and draws its runs on a terminal."""
+    """Writes the plan of a sweep at its start and draws its runs on a terminal.
+
+    Before a single run, leaves a folder alone in which another process works.
+    """
 
     folder: Path | None = None  # of this process's sweep; Hydra does not keep it
+    target: ClassVar[Path | None] = None  # the folder that Hydra writes to
     table: Live | None = None
     lines: ClassVar[Any] = None  # logging configuration without a table
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Exit with one line before Hydra writes into the folder of another process's run."""
+        try:
+            type(self).target = folder = Path(config.hydra.run.dir)
+        except OmegaConfBaseException:  # resume=nowhere: Hydra says so itself when it gets there
+            return
+        if is_claimed(folder):
+            print(f"lcc_rl: error: {busy(folder)}", file=sys.stderr)
+            # Hydra turns any other exception of a callback into a warning.
+            sys.exit(BAD_INPUT)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the plan and log the folder."""
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
         plan = make_plan(config)
-        type(self).folder = folder
+        type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"

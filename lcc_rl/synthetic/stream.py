@@ -25,11 +25,13 @@ from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import LARGEST_SEED, ConfigError, require_whole
 from lcc_rl.io.files import atomic_path, write_parquet
+from lcc_rl.io.memory import require_memory
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
+SAMPLE = 600  # bytes that a sample of a vehicle costs while the file is written and read back
 FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 
 
@@ -71,12 +73,9 @@ class StreamSource:
     keep: str | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise ConfigError(
-                    f"stream: {name!r} must be a whole number from {least} up, got {value!r}"
-                )
+        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2)):
+            require_whole(f"stream: {name!r}", getattr(self, name), least)
+        require_whole("stream: 'seed'", self.seed, 0, LARGEST_SEED)
         try:
             low, high = map(float, self.duration_s)
         except (TypeError, ValueError):
@@ -90,6 +89,9 @@ class StreamSource:
             raise ConfigError(f"data.keep must name a .csv or .csv.gz file, got {self.keep!r}")
         if not isinstance(self.noise, (int, float)) or not 0.0 <= self.noise < 1.0:
             raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise!r}")
+        count = self.recordings * self.platoons * self.vehicles
+        size = f"data: recordings × platoons × vehicles = {count}, up to {high:g} s each,"
+        require_memory({size: count * high / FRAME * SAMPLE})
 
     def generate(self) -> Stream:
         """Simulate all recordings.
