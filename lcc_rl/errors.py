@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Integral, Real
+from typing import Any
 
 
 class LccError(Exception):
@@ -39,15 +41,63 @@ class Diverged(LccError):
         self.what, self.advice = what, advice
 
 
-def require_positive(where: str, **settings: float) -> None:
-    """Check settings of one piece or agent.
+# Far beyond every quantity of traffic and learning; its square is a number in single precision.
+LARGEST = 1e9
+WORDS = {
+    "(-inf, inf)": "be a number",
+    "(0, inf)": "be positive",
+    "[0, inf)": "not be negative",
+}
+
+
+def require_in(where: str, interval: str, **settings: Any) -> None:
+    """Check that settings of one piece or agent are numbers in an interval.
+
+    Args:
+        where: what has the settings: their place in the configuration.
+        interval: an interval such as ``"[0, 1)"``; with an infinite end it reaches to
+            :data:`LARGEST`.
+        **settings: the values by name.
 
     Raises:
-        ConfigError: naming the first that is not positive, as ``where.setting``.
+        ConfigError: naming the first that is no number, not finite or outside, as
+            ``where.setting``.
+
+    Examples:
+        >>> require_in("agent", "[0, 1)", gamma=0.9)
+    """
+    low, high = (float(end) for end in interval[1:-1].split(","))
+    for name, value in settings.items():
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        bounded = number and abs(value) <= LARGEST
+        if (
+            bounded
+            and (low < value or (interval[0] == "[" and value == low))
+            and (value < high or (interval[-1] == "]" and value == high))
+        ):
+            continue
+        wanted = WORDS.get(interval, f"lie in {interval}")
+        if interval in WORDS and not bounded:
+            wanted += f", and a finite number up to {LARGEST:g}"
+        raise ConfigError(f"{where}.{name} must {wanted}, got {value!r}")
+
+
+def require_positive(where: str, **settings: Any) -> None:
+    """Check that settings of one piece or agent are positive numbers; see :func:`require_in`."""
+    require_in(where, "(0, inf)", **settings)
+
+
+def require_whole(where: str, least: int, most: int = 2**31 - 1, **settings: Any) -> None:
+    """Check that settings are whole numbers in a range; seeds must not exceed 2³¹ − 1.
+
+    Raises:
+        ConfigError: naming the first that is not, as ``where.setting``.
     """
     for name, value in settings.items():
-        if not value > 0:
-            raise ConfigError(f"{where}.{name} must be positive, got {value}")
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not (whole and least <= value <= most):
+            key = f"{where}.{name}" if where else name
+            raise ConfigError(f"{key} must be a whole number in {least}…{most}, got {value!r}")
 
 
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
