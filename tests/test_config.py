@@ -343,7 +343,7 @@ def test_impossible_agent_settings(overrides, words) -> None:
         (["scenario.pieces.estimator.measurement_error=0"], "measurement_error"),
         (["scenario.controllers.automated.max_acceleration=-1"], "max_acceleration"),
         (["+scenario.controllers.automated.mass=1000"], "mass"),
-        (["reward.terms.safety.threshold=0"], "floor"),
+        (["reward.terms.safety.threshold=0"], "threshold"),
         (["reward.terms.safety.weight=heavy"], "weight"),
         (["reward.terms.cav_energy.scale=0"], "scale"),
         (["reward.terms.safety._target_=lcc_rl.pieces.Safety"], "Safety"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
 from lcc_rl.config import CALLED, build_as, load, require
@@ -21,7 +21,7 @@ from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.runs.loggers import Silent
-from lcc_rl.schemas import TrainConfig
+from lcc_rl.schemas import TrainConfig, check_ranges
 from lcc_rl.targets import TARGET
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
@@ -129,12 +129,7 @@ def check_sizes(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    sizes = {f"evaluation.{key}": cfg.evaluation[key] for key in ("profiles", "drivers")}
-    sizes["evaluation.batch_size"] = cfg.evaluation.batch_size
-    if not OmegaConf.is_missing(cfg.training, "environments"):
-        sizes["training.environments"] = cfg.training.environments
-    for name, value in sizes.items():
-        require(value is None or value >= 1, f"{name} must be at least 1, got {value}")
+    check_ranges(cfg)
     pieces = cfg.scenario.pieces
     measured = [name for name in MEASURED if pieces.get(name) is None]
     require(
@@ -145,5 +140,3 @@ def check_sizes(cfg: DictConfig) -> None:
         cfg.evaluation.rows != "vehicles" or pieces.get("communication") is not None,
         "evaluation.rows=vehicles measures what scenario.pieces.communication writes",
     )
-    step = cfg.scenario.time_step
-    require(step > 0, f"scenario.time_step must be positive, got {step}")

@@ -9,12 +9,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_in, require_whole
 
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 _LEAST = {"population": 4, "generations": 1, "founders": 1, "tournament": 1, "patience": 1}
+_INTERVALS = {
+    **dict.fromkeys(("elites", "difference_rate", "mutation_rate"), "[0, 1]"),
+    **dict.fromkeys(("mutation_start", "mutation_end"), "(0, inf)"),
+    **dict.fromkeys(("blend", "tolerance"), "[0, inf)"),
+}
 
 
 @dataclass(frozen=True)
@@ -53,17 +58,10 @@ class GeneticSettings:
     tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
+        for name, interval in _INTERVALS.items():
+            require_in("genetic", interval, **{name: getattr(self, name)})
         for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"genetic setting {name!r} must be at least {least}")
-        for name in ("elites", "difference_rate", "mutation_rate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ConfigError(f"genetic setting {name!r} must lie in 0…1")
-        for name in ("mutation_start", "mutation_end"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"genetic setting {name!r} must be positive")
-        if self.blend < 0.0 or self.tolerance < 0.0:
-            raise ConfigError("genetic settings 'blend' and 'tolerance' must not be below 0")
+            require_whole("genetic", least, **{name: getattr(self, name)})
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from lcc_rl.drivers.parameters import (
     checked_bounds,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError, require_positive, require_whole
 from lcc_rl.functional.idm import IDMConstants
 
 
@@ -183,8 +183,10 @@ def kde(
         ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
-    if drivers < 1 or (bandwidth is not None and not bandwidth > 0.0):
-        raise ConfigError("kde: 'drivers' and 'bandwidth' must be positive")
+    require_whole("drivers", 1, 1_000_000, drivers=drivers)
+    require_whole("drivers", 0, seed=seed)
+    if bandwidth is not None:
+        require_positive("drivers", bandwidth=bandwidth)
     limits = checked_bounds(bounds)
     table = load_drivers(path, mode)
     names = [name for name, column in COLUMNS.items() if np.ptp(table[column].to_numpy()) > 0.0]
@@ -219,6 +221,7 @@ def fixed(
     Raises:
         ConfigError: if a parameter is not one that a driver can have.
     """
+    require_positive("drivers", desired_speed=desired_speed, time_gap=time_gap)
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
         time_gap=torch.tensor([float(time_gap)]),

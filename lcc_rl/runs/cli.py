@@ -21,13 +21,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
-from lcc_rl.config_errors import check_keys
-from lcc_rl.errors import ConfigError, Interrupted, LccError
+from lcc_rl.config_errors import check_keys, refused_by_hydra
+from lcc_rl.errors import ConfigError, Interrupted, LccError, require_whole
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.precision import set_precision
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
+from lcc_rl.schemas import check_ranges
 
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
@@ -52,6 +53,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             check_keys(config)
             typed = list(HydraConfig.get().overrides.task)
             check_ignored(config, typed, is_sweep())
+            check_ranges(config)
             leave_out_foreign(config, typed)
             return function(config)
 
@@ -138,7 +140,9 @@ def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
     def explained_function(*arguments: Any) -> Any:
         try:
             return function(*arguments)
-        except HydraException as error:
+        except Exception as error:
+            if isinstance(error, OmegaConfBaseException) or not refused_by_hydra(error):
+                raise
             overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
             clearer = explained(error, entry, overrides)
             if clearer is error:
@@ -213,10 +217,8 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
     Raises:
         ConfigError: if one of them is of the wrong type or impossible on this machine.
     """
-    for name, least in (("seed", 0), ("threads", 1)):
-        value = cfg.get(name)
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise ConfigError(f"{name} must be a whole number from {least} up, got {value!r}")
+    require_whole("", 0, seed=cfg.get("seed"))
+    require_whole("", 1, threads=cfg.get("threads"))
     try:
         device = torch.device(cfg.device)
         torch.empty(0, device=device)
