@@ -91,7 +91,7 @@ class Clock(EnvBase):
         if seeds is None:
             seeds = self._draw_seeds()
         else:
-            require_option(SEED, seeds, 2**31)
+            require_option(SEED, seeds, 2**32)  # of which all bits count
         return self._moment(seeds, torch.zeros_like(seeds))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -118,6 +118,11 @@ class Traffic(TransformedEnv):
             self._check_options(tensordict)
         return super()._reset(tensordict, **settings)
 
+    def _moment_keys(self) -> set[Key]:
+        """Return the keys of everything that a reset writes."""
+        specs = (self.full_observation_spec, self.full_done_spec)
+        return {as_key(key) for spec in specs for key in spec.keys(True, True)}
+
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
         if tensordict.batch_size != self.batch_size:
             raise ConfigError(
@@ -133,10 +138,12 @@ class Traffic(TransformedEnv):
         """
         options = reset_options(self)
         names = ", ".join(".".join(key) for key in options)
-        masks = [as_key(key) for key in self.reset_keys]
-        for key in map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)):
-            if key in masks:
-                continue
+        keys = set(map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)))
+        keys -= {as_key(key) for key in self.reset_keys}
+        if keys - set(options) and self._moment_keys() <= keys:
+            # TorchRL writes the first moment into what it is given; that may be given again.
+            keys &= set(options)
+        for key in sorted(keys):
             name, value = ".".join(key), given.get(key)
             if key not in options:
                 raise ConfigError(f"reset: {name} is no reset option; those that exist: {names}")

@@ -39,7 +39,7 @@ BAD = {
     ),
     "far driver": ({DRIVER: torch.full((2, 1, 1), 10**6)}, r"human.driver must lie .* got 1000000"),
     "negative seed": ({SEED: torch.tensor([[1], [-3]])}, "episode.seed must lie .* got -3"),
-    "huge seed": ({SEED: torch.tensor([[1], [2**40]])}, "episode.seed must lie in 0…2147483647"),
+    "huge seed": ({SEED: torch.tensor([[1], [2**40]])}, "episode.seed must lie in 0…4294967295"),
     "far profile": ({PROFILE: torch.tensor([[0], [4]])}, r"leader.profile must lie in 0…3, got 4"),
     "negative start": ({START: torch.full((2, 1), -1)}, "leader.start must lie .* got -1"),
     "late start": (
@@ -78,6 +78,15 @@ def test_evaluation_and_differentiable_rollout_refuse_them_too(envs) -> None:
         play(envs["group"], lambda td: td, given, [REWARD])
     with pytest.raises(ConfigError, match=words):
         DifferentiableRollout(envs["group"], [REWARD]).start(given)
+
+
+@pytest.mark.parametrize("kind", ["group", "single"])
+def test_a_whole_moment_may_be_given_and_replays_its_episode(envs, kind) -> None:
+    env, given = envs[kind], TensorDict({SEED: torch.tensor([[3], [4]])}, [2])
+    first = env.reset(given).clone()
+    assert (env.reset(given) == first).all()  # TorchRL has written the moment into it
+    reached = env.rollout(5, break_when_any_done=False, tensordict=first.clone())[:, -1]
+    assert torch.equal(env.reset(reached.exclude("next"))[SEED], first[SEED])
 
 
 def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
