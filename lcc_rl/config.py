@@ -7,6 +7,7 @@ import json
 import re
 import typing
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_checks import check_ignored, renamed_option
-from lcc_rl.config_errors import check_keys, explain, refused_key
+from lcc_rl.config_errors import check_keys, explain, refused_by_hydra, refused_key
+from lcc_rl.config_types import check_numbers, check_types
 from lcc_rl.errors import ConfigError, LccError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
-from lcc_rl.schemas import register_schemas
-from lcc_rl.targets import TARGET, check_types, find_target, forget_places, parameters_of
+from lcc_rl.schemas import check_ranges, register_schemas
+from lcc_rl.targets import TARGET, find_target, forget_places, parameters_of
 
 CONF = "lcc_rl.conf"
 CALLED = ("__call__",)  # what a node that is used as a function makes
@@ -71,14 +73,18 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
         overrides: what one would type after the command.
 
     Raises:
-        ConfigError: if an override is unknown or of the wrong type.
+        ConfigError: if an override is unknown, of the wrong type or out of range.
     """
     try:
         cfg = _compose(entry, overrides)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(str(explained(error, entry, overrides))) from error
-    check_keys(cfg)
-    check_ignored(cfg, overrides)
+        check_keys(cfg)
+        check_ignored(cfg, overrides)
+        check_ranges(cfg)
+    except Exception as error:
+        if isinstance(error, LccError) or not refused_by_hydra(error):
+            raise
+        said = str(explained(error, entry, overrides))
+        raise ConfigError(" ".join(said.split())) from error
     leave_out_foreign(cfg, overrides)
     return cfg
 
@@ -132,6 +138,8 @@ def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Excepti
     renamed = renamed_option(overrides)
     if renamed is not None:
         return renamed
+    if not isinstance(error, (HydraException, OmegaConfBaseException)):
+        return ConfigError(f"{_culprit(entry, overrides)}: {error}")
     key = refused_key(error)
     hydra = key is not None and key.startswith("hydra.")
     # What exists may depend on the other overrides: leave out only those that fail.
@@ -144,6 +152,15 @@ def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Excepti
             if not kept:
                 return error
             wrong = refused_key(next_error)
+
+
+def _culprit(entry: str, overrides: Sequence[str]) -> str:
+    """Return the override without which a configuration can be composed; all where none is."""
+    for place, item in enumerate(overrides):
+        with suppress(Exception):
+            _compose(entry, [*overrides[:place], *overrides[place + 1 :]])
+            return item
+    return " ".join(overrides)
 
 
 def build(node: Any, where: str, **resources: Any) -> Any:
@@ -160,13 +177,14 @@ def build(node: Any, where: str, **resources: Any) -> Any:
 
     Raises:
         ConfigError: if the target is unknown, a key is none of its arguments, one is missing, or
-            a value has the wrong type.
+            a value has the wrong type or is no finite number.
     """
     settings: Any = (
         OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     )
     if not isinstance(settings, Mapping) or TARGET not in settings:
         raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}")
+    check_numbers(settings, where)
     target = find_target(str(settings[TARGET]), where)
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
     own = getattr(target, "Settings", None)
@@ -209,7 +227,6 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
             raise unknown_name(f"setting of {where} ({called})", key, own)
         if given[key] == "???":
             raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
-    check_types(target, given, where)
     offered = {k: v for k, v in resources.items() if k in signature and k not in given}
     arguments = {
         key: build(value, f"{where}.{key}", **resources)
@@ -217,6 +234,7 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
         else value
         for key, value in given.items()
     }
+    check_types(target, arguments, where)
     required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}
     missing = sorted(required - set(arguments) - set(offered))
     if missing:

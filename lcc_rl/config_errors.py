@@ -8,8 +8,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from hydra.errors import MissingConfigException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.errors import ConfigError, unknown_name
 
@@ -28,6 +29,17 @@ def refused_key(error: Exception) -> str | None:
     """Return the dotted key that Hydra could not override, where that is what went wrong."""
     found = REFUSED.search(str(error))
     return found.group(1).partition("@")[0] if found else None
+
+
+def refused_by_hydra(error: BaseException) -> bool:
+    """Whether an error comes from Hydra or OmegaConf, which say some by ValueError or TypeError."""
+    trail = error.__traceback__
+    while trail is not None and trail.tb_next is not None:
+        trail = trail.tb_next
+    module = "" if trail is None else str(trail.tb_frame.f_globals.get("__name__"))
+    return isinstance(error, (HydraException, OmegaConfBaseException)) or (
+        isinstance(error, Exception) and module.partition(".")[0] in ("hydra", "omegaconf")
+    )
 
 
 def explain(error: Exception, valid: Any) -> Exception:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
-from numbers import Integral
+from numbers import Integral, Real
+from typing import Any
 
 
 class LccError(Exception):
@@ -40,32 +41,72 @@ class Diverged(LccError):
         self.what, self.advice = what, advice
 
 
-def require_positive(where: str, **settings: float) -> None:
-    """Check settings of one piece or agent.
+# Far beyond every quantity of traffic and learning; its square is a number in single precision.
+LARGEST = 1e9
+LAST_WHOLE = 2**31 - 1
+WORDS = {
+    "(-inf, inf)": "be a number",
+    "(0, inf)": "be positive",
+    "[0, inf)": "not be negative",
+}
+
+
+def require_in(where: str, interval: str, **settings: Any) -> None:
+    """Check that settings of one piece or agent are numbers in an interval.
+
+    Args:
+        where: what has the settings: their place in the configuration.
+        interval: an interval such as ``"[0, 1)"``; with an infinite end it reaches to
+            :data:`LARGEST`.
+        **settings: the values by name.
 
     Raises:
-        ConfigError: naming the first that is not positive, as ``where.setting``.
+        ConfigError: naming the first that is no number, not finite or outside, as
+            ``where.setting``.
+
+    Examples:
+        >>> require_in("agent", "[0, 1)", gamma=0.9)
     """
+    low, high = (float(end) for end in interval[1:-1].split(","))
     for name, value in settings.items():
-        if not value > 0:
-            raise ConfigError(f"{where}.{name} must be positive, got {value}")
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        bounded = number and abs(value) <= LARGEST
+        if (
+            bounded
+            and (low < value or (interval[0] == "[" and value == low))
+            and (value < high or (interval[-1] == "]" and value == high))
+        ):
+            continue
+        wanted = WORDS.get(interval, f"lie in {interval}")
+        if interval in WORDS and not bounded:
+            wanted += f", and a finite number up to {LARGEST:g}"
+        raise ConfigError(f"{where}.{name} must {wanted}, got {value!r}")
 
 
-LARGEST_SEED = 2**32 - 1  # NumPy takes no larger ones
+def require_positive(where: str, **settings: Any) -> None:
+    """Check that settings of one piece or agent are positive numbers; see :func:`require_in`."""
+    require_in(where, "(0, inf)", **settings)
 
 
-def require_whole(name: str, value: object, least: int, most: int | None = None) -> None:
-    """Check a size, a count or a seed.
+def require_whole(where: str, least: int, most: int | None = None, **settings: Any) -> None:
+    """Check that settings are whole numbers in a range: sizes, counts and seeds.
+
+    Args:
+        where: what has the settings; empty for options that belong to nothing.
+        least, most: the range; without ``most`` up to what 31 bits hold.
+        **settings: the values by name.
 
     Raises:
-        ConfigError: naming the option unless the value is a whole number within the bounds.
+        ConfigError: naming the first that is not, as ``where.setting``.
     """
-    if isinstance(value, Integral) and not isinstance(value, bool):
-        number = int(value)
-        if least <= number <= (number if most is None else most):
-            return
-    bounds = f"from {least} up" if most is None else f"from {least} to {most}"
-    raise ConfigError(f"{name} must be a whole number {bounds}, got {value!r}")
+    last = LAST_WHOLE if most is None else most
+    for name, value in settings.items():
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not (whole and least <= value <= last):
+            key = f"{where}.{name}" if where else name
+            small = most is None and not (whole and value > last)
+            bounds = f"from {least} up" if small else f"from {least} to {last}"
+            raise ConfigError(f"{key} must be a whole number {bounds}, got {value!r}")
 
 
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:

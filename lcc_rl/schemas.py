@@ -6,7 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from lcc_rl.config_types import check_numbers
+from lcc_rl.errors import ConfigError, require_in, require_whole
 
 
 @dataclass
@@ -114,6 +118,50 @@ class PipelineConfig(TrainConfig):
     calibration: Any = MISSING
     variants: list[str] = MISSING
     jobs: int = MISSING
+
+
+# Ranges of the numbers above; other numbers are checked by the classes that take them.
+RANGES = {
+    "scenario.time_step": "[0.001, 10]",
+    "scenario.circumference": "(0, inf)",
+    "scenario.vehicle_length": "(0, inf)",
+    "scenario.initial_speed": "[0, inf)",
+}
+WHOLE: dict[str, tuple[int, ...]] = {
+    "seed": (0,),
+    "threads": (1,),
+    "jobs": (1,),
+    "scenario.horizon": (1, 1_000_000),
+    # What is too large for the machine is said with what it needs.
+    **{f"training.{name}": (1, 10**15) for name in ("episodes", "environments")},
+    **{f"training.{name}": (1,) for name in ("segment", "checkpoint_every", "keep_every")},
+    **{f"evaluation.{name}": (1,) for name in ("profiles", "drivers", "batch_size")},
+    **{f"evaluation.{name}": (0,) for name in ("seed", "sample_episodes")},
+}
+
+
+def check_ranges(cfg: Any) -> None:
+    """Check that all numbers of a configuration are finite, and the schema's in their range.
+
+    Args:
+        cfg: configuration of an entry point, or a part such as ``{"scenario": …}``.
+
+    Raises:
+        ConfigError: naming the first key at fault.
+    """
+    try:
+        check_numbers(OmegaConf.to_container(cfg, resolve=True), "")
+    except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
+        raise ConfigError(" ".join(str(error).split())) from error
+    for key in (*RANGES, *WHOLE):
+        value = OmegaConf.select(cfg, key)
+        if value is None:
+            continue
+        where, _, name = key.rpartition(".")
+        if key in RANGES:
+            require_in(where, RANGES[key], **{name: value})
+        else:
+            require_whole(where, *WHOLE[key], **{name: value})
 
 
 def register_schemas() -> None:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
-import types
-import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import Any
 
 from lcc_rl.errors import ConfigError
 
 TARGET = "_target_"
-SIMPLE: dict[Any, tuple[type, ...]] = {float: (float, int), int: (int,), bool: (bool,), str: (str,)}
 
 
 def find_target(target: str, where: str) -> Any:
@@ -77,37 +73,3 @@ def forget_places(content: Mapping[str, Any]) -> list[str]:
                 found.append(f"{where}{name}={node[name]}")
                 node[name] = None
     return found
-
-
-def check_types(target: Any, given: Mapping[str, Any], where: str) -> None:
-    """Check numbers, flags and text against the annotations of a constructor.
-
-    Raises:
-        ConfigError: naming the setting, what it must be, and what it is.
-    """
-    function = target
-    # The generated constructor of a dataclass does not know the names of its module.
-    if inspect.isclass(target) and not dataclasses.is_dataclass(target):
-        function = target.__init__
-    try:
-        hints = typing.get_type_hints(function)
-    except (NameError, TypeError):
-        return
-    for key, value in given.items():
-        accepted = _accepted(hints.get(key))
-        # bool is an int to Python, but not to a reader of a configuration.
-        wrong = isinstance(value, bool) and bool not in accepted
-        if accepted and (wrong or not isinstance(value, accepted)):
-            wanted = " or ".join(sorted({kind.__name__ for kind in accepted}))
-            raise ConfigError(f"{where}.{key} must be {wanted}, got {value!r}")
-
-
-def _accepted(hint: Any) -> tuple[type, ...]:
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        parts = [_accepted(part) for part in typing.get_args(hint)]
-        return tuple(kind for part in parts for kind in part) if all(parts) else ()
-    if hint is type(None):
-        return (type(None),)
-    if typing.get_origin(hint) is Sequence:
-        return (list,)
-    return SIMPLE.get(hint, ())

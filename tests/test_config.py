@@ -11,12 +11,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import DictConfig, OmegaConf
 
 import lcc_rl
-import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import build, config_hash, load
 from lcc_rl.envs import build_env
@@ -343,7 +343,7 @@ def test_impossible_agent_settings(overrides, words) -> None:
         (["scenario.pieces.estimator.measurement_error=0"], "measurement_error"),
         (["scenario.controllers.automated.max_acceleration=-1"], "max_acceleration"),
         (["+scenario.controllers.automated.mass=1000"], "mass"),
-        (["reward.terms.safety.threshold=0"], "floor"),
+        (["reward.terms.safety.threshold=0"], "threshold"),
         (["reward.terms.safety.weight=heavy"], "weight"),
         (["reward.terms.cav_energy.scale=0"], "scale"),
         (["reward.terms.safety._target_=lcc_rl.pieces.Safety"], "Safety"),

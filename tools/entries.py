@@ -15,6 +15,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.envs.clock import reset_options
 from lcc_rl.envs.inputs import constant_profiles, string_of
 from lcc_rl.envs.single import group_key
 from lcc_rl.envs.step import pieces_of, tick, written
@@ -38,7 +39,9 @@ Keys of the environments' TensorDicts, at the root after a reset and under `"nex
 `role` stands for a role of the string, such as `"human"`; `name` for a term of the reward.
 Shapes: `*B` batch of episodes, `N` vehicles of the string from front to back, `A` automated
 vehicles, `n` vehicles of the role, `k` a width that depends on settings; float32 unless said
-otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`.
+otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`. A *reset option* may be given to
+`env.reset(TensorDict({key: value}, env.batch_size))`; any other key is
+refused, unless a whole moment of an episode is given, of which the reset options count.
 """
 
 
@@ -101,7 +104,9 @@ def writers(env: TransformedEnv, key: Key) -> list[str]:
 
 
 def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Key, list[str]]:
-    """Return the shape and then the writers of every entry, in the order of the dictionary.
+    """Return shape, mark and then the writers of every entry, in the order of the dictionary.
+
+    The mark says which may be given to ``env.reset``.
 
     Raises:
         ConfigError: if an entry is not in the dictionary, or has two shapes.
@@ -109,13 +114,15 @@ def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Ke
     rows: dict[Key, list[str]] = {}
     for env, string in found_in:
         parts = [getattr(env, f"full_{x}_spec") for x in SPECS]
+        options = reset_options(env)
         specs = {as_key(key): spec for part in parts for key, spec in part.items(True, True)}
         for key, spec in specs.items():
             if ("observation",) in specs and group_key(key) == key:
                 continue  # of the single-agent view only what it shows at the root
             kind = "" if spec.dtype == torch.float32 else f" {str(spec.dtype).split('.')[1]}"
             shape = symbols(key, spec.shape, string) + kind
-            row = rows.setdefault(entry_key(key, string.names), [shape])
+            row = rows.setdefault(entry_key(key, string.names), [shape, ""])
+            row[1] = "; reset option" if key in options else row[1]
             if row[0] != shape:
                 raise ConfigError(f"{'.'.join(key)} has two shapes, {row[0]} and {shape}")
             row += [name for name in writers(env, key) if name not in row]
@@ -131,9 +138,10 @@ def table(*rows: Iterable[str]) -> str:
 def page(rows: dict[Key, list[str]]) -> str:
     """Return the page."""
     entries = [("key", "shape", "unit", "meaning", "written by")]
-    for key, (shape, *names) in rows.items():
+    for key, (shape, mark, *names) in rows.items():
         shown = ", ".join(part if part in (ROLE, NAME) else f'"{part}"' for part in key)
-        entries.append((f"`{shown}`", f"`{shape}`", *ENTRIES[key], ", ".join(names)))
+        unit, meaning = ENTRIES[key]
+        entries.append((f"`{shown}`", f"`{shape}`", unit, meaning + mark, ", ".join(names)))
     equations = [("equation", "formula", "symbols and units", "implemented by", "deviation")]
     for number, formula, symbols, functions, deviation in EQUATIONS:
         paths = ", ".join(f"`{path}`" for path in functions) or "–"

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.loop import anneal, check_fraction
 from lcc_rl.config import build, require
-from lcc_rl.errors import require_positive
+from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.policies.actor import make_actor, seeded_mlp
@@ -66,13 +66,9 @@ class AnalyticSettings:
     compiled: bool | None = None
 
     def __post_init__(self) -> None:
-        require(0.0 < self.gamma <= 1.0, f"agent.gamma must lie in (0, 1], got {self.gamma}")
+        require_in("agent", "(0, 1]", gamma=self.gamma, tau=self.tau)
+        require_in("agent", "[0, 1]", td_lambda=self.td_lambda)
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
-        require(
-            0.0 <= self.td_lambda <= 1.0,
-            f"agent.td_lambda must lie in [0, 1], got {self.td_lambda}",
-        )
-        require(0.0 < self.tau <= 1.0, f"agent.tau must lie in (0, 1], got {self.tau}")
         require_positive(
             "agent",
             learning_rate=self.learning_rate,

@@ -12,7 +12,7 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import Agent, TrainingLoop
 from lcc_rl.agents.replay import Trainer
-from lcc_rl.config import build_as, identity
+from lcc_rl.config import build_as, identity, short_name
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
@@ -62,8 +62,18 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
 def make_trainer(
     cfg: DictConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
 ) -> TrainingLoop:
-    """Build the training loop of an agent with its environment."""
+    """Build the training loop of an agent with its environment.
+
+    Raises:
+        ConfigError: naming the option at fault, or if no vehicle takes the agent's action.
+    """
     env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
+    if not list(env.full_action_spec.keys(True, True)):
+        kind = short_name(cfg.scenario.controllers.automated.get(TARGET))
+        raise ConfigError(
+            f"scenario.controllers.automated ({kind}) takes no action of a policy, so nothing can "
+            "be learned; say agent=none, or leave the controller out"
+        )
     loop: Any = GradientTrainer if isinstance(agent, Analytic) else Trainer
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
     return trained

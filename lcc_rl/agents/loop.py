@@ -23,8 +23,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.checks import check_learner
 from lcc_rl.agents.sizes import Footprint, check_length
-from lcc_rl.config import require
-from lcc_rl.errors import Diverged, Interrupted, ResultsError
+from lcc_rl.errors import Diverged, Interrupted, ResultsError, require_in
 from lcc_rl.io.files import read_torch, write_parquet, write_torch
 from lcc_rl.pieces.rewards import REWARD, TERMS
 from lcc_rl.runs.interrupts import stop_signal
@@ -47,10 +46,7 @@ def check_fraction(final_lr_fraction: float) -> None:
     Raises:
         ConfigError: if it is out of range.
     """
-    require(
-        0 < final_lr_fraction <= 1,
-        f"agent.final_lr_fraction must lie in (0, 1], got {final_lr_fraction}",
-    )
+    require_in("agent", "(0, 1]", final_lr_fraction=final_lr_fraction)
 
 
 def anneal(

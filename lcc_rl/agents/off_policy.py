@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import torch
@@ -17,7 +17,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
 from lcc_rl.agents.loop import anneal, check_fraction, derived_seed
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive, unknown_name
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
@@ -40,11 +40,9 @@ class Exploration:
     decay_share: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.initial < 0 or self.final < 0 or not 0 < self.decay_share <= 1:
-            raise ConfigError(
-                "agent.exploration: initial and final must not be negative and decay_share must "
-                f"lie in (0, 1], got {self}"
-            )
+        where = "agent.exploration"
+        require_in(where, "[0, inf)", initial=self.initial, final=self.final)
+        require_in(where, "(0, 1]", decay_share=self.decay_share)
 
     def sigma(self, share: float) -> float:
         """Return the standard deviation after this share of the training."""
@@ -90,24 +88,22 @@ class OffPolicySettings:
     )
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.gamma < 1.0:
-            raise ConfigError(f"agent.gamma must lie in [0, 1), got {self.gamma}")
-        if not 0.0 < self.tau <= 1.0:
-            raise ConfigError(f"agent.tau must lie in (0, 1], got {self.tau}")
+        require_in("agent", "[0, 1)", gamma=self.gamma)
+        require_in("agent", "(0, 1]", tau=self.tau)
         if not 0 < self.batch_size <= self.buffer_size:
             raise ConfigError(
                 f"agent.batch_size ({self.batch_size}) must be positive and at most "
                 f"agent.buffer_size ({self.buffer_size})"
             )
-        if self.saturation < 0:
-            raise ConfigError(f"agent.saturation must not be negative, got {self.saturation}")
+        require_in("agent", "[0, inf)", saturation=self.saturation)
         check_fraction(self.final_lr_fraction)
-        require_positive(
-            "agent",
-            updates_per_transition=self.updates_per_transition,
-            actor_lr=self.actor_lr,
-            critic_lr=self.critic_lr,
-        )
+        # Far more updates than that would be a training without end.
+        require_in("agent", "(0, 1000]", updates_per_transition=self.updates_per_transition)
+        require_positive("agent", actor_lr=self.actor_lr, critic_lr=self.critic_lr)
+        known = [item.name for item in fields(Exploration)]
+        for key in self.exploration:
+            if key not in known:
+                raise unknown_name("setting of agent.exploration", key, known)
 
 
 class OffPolicy(ABC):

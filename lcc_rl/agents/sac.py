@@ -14,7 +14,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
-from lcc_rl.errors import require_positive
+from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.policies.actor import ACTION, OBSERVATION, action_noise, seeded_mlp
@@ -88,6 +88,8 @@ class SACSettings(OffPolicySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_positive("agent", alpha_init=self.alpha_init, alpha_lr=self.alpha_lr)
+        if self.target_entropy is not None:
+            require_in("agent", "(-inf, inf)", target_entropy=self.target_entropy)
 
 
 class SAC(OffPolicy):

@@ -51,8 +51,8 @@ def check_length(settings: TrainingConfig, horizon: int) -> None:
     Raises:
         ConfigError: if a number is too small or the settings contradict each other.
     """
-    require_whole("training.environments", settings.environments, 1)
-    require_whole("training.checkpoint_every", settings.checkpoint_every, 1)
+    for name in ("environments", "checkpoint_every"):
+        require_whole("training", 1, **{name: getattr(settings, name)})
     episodes, environments = settings.episodes, settings.environments
     require(
         episodes >= environments,

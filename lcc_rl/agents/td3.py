@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.objectives import TD3Loss
 
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
-from lcc_rl.config import require
+from lcc_rl.errors import require_in, require_whole
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,9 @@ class TD3Settings(OffPolicySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        delay = self.policy_delay
-        require(delay >= 1, f"agent.policy_delay must be at least 1, got {delay}")
-        require(
-            self.policy_noise >= 0 and self.noise_clip >= 0,
-            "agent.policy_noise and agent.noise_clip must not be negative",
-        )
+        require_whole("agent", 1, policy_delay=self.policy_delay)
+        noise = {"policy_noise": self.policy_noise, "noise_clip": self.noise_clip}
+        require_in("agent", "[0, inf)", **noise)
 
 
 class TD3(OffPolicy):

@@ -17,13 +17,13 @@ from lcc_rl.envs.inputs import (
     constant_profiles,
     string_of,
 )
-from lcc_rl.errors import LARGEST_SEED, ConfigError, require_whole, unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader, needed
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
-from lcc_rl.schemas import TrainConfig
+from lcc_rl.schemas import TrainConfig, check_ranges
 from lcc_rl.targets import TARGET
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
@@ -146,13 +146,8 @@ def check_sizes(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    horizon, own = cfg.scenario.horizon, cfg.evaluation
-    require_whole("scenario.horizon", horizon, 1)
-    for name in ("profiles", "drivers", "batch_size"):
-        if own[name] is not None:
-            require_whole(f"evaluation.{name}", own[name], 1)
-    require_whole("evaluation.sample_episodes", own.sample_episodes, 0)
-    require_whole("evaluation.seed", own.seed, 0, LARGEST_SEED)
+    check_ranges(cfg)
+    horizon = cfg.scenario.horizon
     require_memory({f"scenario.horizon={horizon}": MOMENT * horizon})
     pieces = cfg.scenario.pieces
     measured = [name for name in MEASURED if pieces.get(name) is None]
@@ -164,5 +159,3 @@ def check_sizes(cfg: DictConfig) -> None:
         cfg.evaluation.rows != "vehicles" or pieces.get("communication") is not None,
         "evaluation.rows=vehicles measures what scenario.pieces.communication writes",
     )
-    step = cfg.scenario.time_step
-    require(step > 0, f"scenario.time_step must be positive, got {step}")

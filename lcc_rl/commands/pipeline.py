@@ -64,7 +64,7 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
 def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> pd.DataFrame:
     prepare_torch(cfg)
     require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
-    require_whole("jobs", cfg.jobs, 1, most_parallel())
+    require_whole("", 1, most_parallel(), jobs=cfg.jobs)
     shared = [item for item in overrides if root_key(item) not in OWN]
     # Every part is composed before the first one runs: a typo must not cost an hour.
     parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}

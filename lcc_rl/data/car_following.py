@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lcc_rl.data.places import find_leaders
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError, require_in
 
 PASSENGER_CAR = 2
 LANE_CHANGES = ("split", "reject")
@@ -54,8 +54,10 @@ class Criteria:
     def __post_init__(self) -> None:
         for name in ("min_duration_s", "max_duration_s", "max_gap_m"):
             value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise ConfigError(f"criteria: {name!r} must be at least 0, got {value}")
+            if value is not None or name == "min_duration_s":
+                require_in("criteria", "[0, inf)", **{name: value})
+        if self.min_gap_m is not None:
+            require_in("criteria", "(-inf, inf)", min_gap_m=self.min_gap_m)
         if self.min_duration_s < FRAME:
             raise ConfigError(
                 f"criteria: 'min_duration_s' must be at least {FRAME:g} s, two samples, got "

@@ -7,10 +7,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lcc_rl.config_types import check_types
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, Split, at_step, from_records, leader_profiles
 from lcc_rl.data.speed_records import read_speed_record, resample
-from lcc_rl.errors import ConfigError, DataError, unknown_name
+from lcc_rl.errors import (
+    ConfigError,
+    DataError,
+    require_in,
+    require_positive,
+    require_whole,
+    unknown_name,
+)
+from lcc_rl.functional.pattern import LARGEST
 
 
 @dataclass(frozen=True)
@@ -76,8 +85,7 @@ def stretch(
         DataError: if the record cannot be read or does not cover the stretch.
         ConfigError: if the scale is not positive or the stretch empty.
     """
-    if not scale > 0:
-        raise ConfigError(f"leader: scale of {path} must be positive, got {scale}")
+    require_positive(f"leader: {path}", scale=scale)
     time, speed = read_speed_record(path, plausible)
     begin = time[0] if from_s is None else float(from_s)
     end = time[-1] if to_s is None else float(to_s)
@@ -121,6 +129,9 @@ class RecordLeaders:
             [m/s].
         path: default path of the stretches.
         plausible: thresholds of every sample, before scaling; None for the defaults.
+
+    Raises:
+        ConfigError: if ``least_variation`` is negative.
     """
 
     training: Mapping[str, Any]
@@ -130,6 +141,9 @@ class RecordLeaders:
     least_variation: float = 2.0
     path: str | None = None
     plausible: Plausible | None = None
+
+    def __post_init__(self) -> None:
+        require_in("leader", "[0, inf)", least_variation=self.least_variation)
 
     def load(self, time_step: float, horizon: int, followers: int) -> Leaders:
         """Read everything.
@@ -167,19 +181,22 @@ class RecordLeaders:
 
     def _case(self, name: str, node: Mapping[str, Any], time_step: float, horizon: int) -> Case:
         given = self._checked(node, f"leader.cases.{name}", CASE)
-        start, followers = float(given.pop("start_s", 0.0)), int(given.pop("followers", 6))
-        if followers < 1:
-            raise ConfigError(f"leader.cases.{name}.followers must be at least 1, got {followers}")
+        start, followers = given.pop("start_s", 0.0), given.pop("followers", 6)
+        require_in(f"leader.cases.{name}", "[0, inf)", start_s=start)
+        require_whole(f"leader.cases.{name}", 1, LARGEST, followers=followers)
         end = start + horizon * time_step
         profile = stretch(time_step=time_step, from_s=start, to_s=end, **given)
         return Case(name.replace("_", " "), profile, followers)
 
     def _checked(self, node: Any, where: str, known: set[str]) -> dict[str, Any]:
         """Settings of a stretch or case with its path, or a ConfigError."""
+        if not isinstance(node, Mapping | None):
+            raise ConfigError(f"{where} must be a mapping with {', '.join(sorted(known))}")
         settings = {} if node is None else dict(node)
         for key in settings:
             if key not in known:
                 raise unknown_name(f"setting of {where}", str(key), known)
+        check_types(stretch, {k: x for k, x in settings.items() if k != "path" or x}, where)
         path = settings.get("path") or self.path
         if path is None:
             raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
@@ -195,12 +212,19 @@ class TrajectoryLeaders:
         split: how they are divided, like the nodes of ``split``.
         source_step: step of the episodes [s].
         least_variation: see :class:`RecordLeaders`.
+
+    Raises:
+        ConfigError: if a number is out of range.
     """
 
     source: Any
     split: Split
     source_step: float = 0.1
     least_variation: float = 2.0
+
+    def __post_init__(self) -> None:
+        require_positive("leader", source_step=self.source_step)
+        require_in("leader", "[0, inf)", least_variation=self.least_variation)
 
     def load(self, time_step: float, horizon: int, followers: int) -> Leaders:
         """Read everything; see :meth:`RecordLeaders.load`."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import resample
 from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError, require_in, require_positive
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,7 @@ def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Pro
         ConfigError: if the step is not positive and finite.
         DataError: if a file cannot be read or holds no car-following episode.
     """
-    if not 0.0 < time_step < float("inf"):
-        raise ConfigError(f"time_step must be positive and finite, got {time_step}")
+    require_positive("profiles", time_step=time_step)
     episodes = NgsimSource(path).load().episodes
     return at_step(leader_profiles(episodes, FRAME), time_step)
 
@@ -221,10 +220,7 @@ class Split:
     def __post_init__(self) -> None:
         if self.by not in ("recording", "vehicle"):
             raise ConfigError(f"split.by must be 'recording' or 'vehicle', got {self.by!r}")
-        if not 0.0 < self.evaluation_share < 1.0:
-            raise ConfigError(
-                f"split.evaluation_share must lie between 0 and 1, got {self.evaluation_share}"
-            )
+        require_in("split", "(0, 1)", evaluation_share=self.evaluation_share)
 
     def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
         """Return the training and the evaluation profiles.

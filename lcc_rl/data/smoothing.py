@@ -23,7 +23,7 @@ from scipy.signal import savgol_filter
 from lcc_rl.data.places import find_leaders
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError, require_whole
 
 Array = NDArray[np.float64]
 
@@ -107,8 +107,7 @@ class SavitzkyGolay(Smoothing):
     order: int = 3
 
     def __post_init__(self) -> None:
-        if self.order < 2:
-            raise ConfigError(f"smoothing: 'order' must be at least 2, got {self.order}")
+        require_whole("smoothing", 2, order=self.order)
         if not FRAME * (self.order + 1) <= self.window_s < 600.0:
             raise ConfigError(
                 f"smoothing: 'window_s' must be {FRAME * (self.order + 1):g} to 600 s for order "

@@ -123,6 +123,8 @@ def _plausible(
 
 def unpacked_size(name: str) -> int:
     """Return the bytes of a file, of a compressed one those of its content; 0 for none."""
+    if not Path(name).is_file():  # a pipe would be waited for; who reads it says so
+        return 0
     with suppress(OSError), open(name, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         size = file.seek(0, os.SEEK_END)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_whole
+from lcc_rl.errors import ConfigError, require_in, require_whole
 from lcc_rl.io.memory import require_memory
 
 Objective = Callable[[Tensor], Tensor]
@@ -17,6 +17,11 @@ Progress = Callable[[int, int, str], None]
 
 SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
 _LEAST = {"population": 4, "generations": 1, "founders": 1, "tournament": 1, "patience": 1}
+_INTERVALS = {
+    **dict.fromkeys(("elites", "difference_rate", "mutation_rate"), "[0, 1]"),
+    **dict.fromkeys(("mutation_start", "mutation_end"), "(0, inf)"),
+    **dict.fromkeys(("blend", "tolerance"), "[0, inf)"),
+}
 
 
 @dataclass(frozen=True)
@@ -55,17 +60,11 @@ class GeneticSettings:
     tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
+        for name, interval in _INTERVALS.items():
+            require_in("genetic", interval, **{name: getattr(self, name)})
         for name, least in _LEAST.items():
-            require_whole(f"genetic setting {name!r}", getattr(self, name), least)
+            require_whole("genetic", least, **{name: getattr(self, name)})
         self.check_memory(1, 1)
-        for name in ("elites", "difference_rate", "mutation_rate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ConfigError(f"genetic setting {name!r} must lie in 0…1")
-        for name in ("mutation_start", "mutation_end"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"genetic setting {name!r} must be positive")
-        if self.blend < 0.0 or self.tolerance < 0.0:
-            raise ConfigError("genetic settings 'blend' and 'tolerance' must not be below 0")
 
     def check_memory(self, problems: int, dims: int, device: torch.device | str = "cpu") -> None:
         """Check that the first generation, the largest one, fits into memory.

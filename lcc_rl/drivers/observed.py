@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.data.episodes import ALIASES
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError, require_in
 
 IDENTITY = ("recording", "follower_id", "leader_id")
 NUMERIC = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
@@ -37,8 +37,9 @@ class Selection:
     min_mean_speed_mps: float = 0.5
 
     def __post_init__(self) -> None:
-        if min(self.min_gap_m, self.min_duration_s, self.min_mean_speed_mps) < 0.0:
-            raise ConfigError("limits of the selection must not be negative")
+        for name, value in vars(self).items():
+            if value is not None or name != "max_duration_s":
+                require_in("selection", "[0, inf)", **{name: value})
         if self.max_duration_s is not None and self.max_duration_s < self.min_duration_s:
             raise ConfigError("selection: max_duration_s must not be below min_duration_s")
 

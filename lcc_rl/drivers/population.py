@@ -21,7 +21,7 @@ from lcc_rl.drivers.parameters import (
     checked_bounds,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
-from lcc_rl.errors import LARGEST_SEED, ConfigError, DataError, require_whole
+from lcc_rl.errors import ConfigError, DataError, require_positive, require_whole
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.io.memory import require_memory
 
@@ -186,10 +186,10 @@ def kde(
         ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
-    require_whole("kde: 'drivers'", drivers, 1)
-    require_whole("kde: 'seed'", seed, 0, LARGEST_SEED)
-    if bandwidth is not None and not bandwidth > 0.0:
-        raise ConfigError(f"kde: 'bandwidth' must be positive, got {bandwidth}")
+    require_whole("drivers", 1, drivers=drivers)
+    require_whole("drivers", 0, seed=seed)
+    if bandwidth is not None:
+        require_positive("drivers", bandwidth=bandwidth)
     require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
     limits = checked_bounds(bounds)
     table = load_drivers(path, mode)
@@ -225,6 +225,7 @@ def fixed(
     Raises:
         ConfigError: if a parameter is not one that a driver can have.
     """
+    require_positive("drivers", desired_speed=desired_speed, time_gap=time_gap)
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
         time_gap=torch.tensor([float(time_gap)]),

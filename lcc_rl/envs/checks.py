@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
+from torch import Tensor
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, Step, entries, tick
 from lcc_rl.errors import ConfigError, LccError
@@ -22,7 +24,7 @@ REPLACING = (CBFFilter, Collision)
 def check_pieces(
     pieces: Sequence[Piece], horizon: int, actions: Mapping[NestedKey, tuple[int, ...]]
 ) -> None:
-    """Check the wiring and the shapes of pieces, by a reset and a step of two episodes.
+    """Check wiring, shapes and memory of pieces, by resets and steps of two episodes.
 
     Args:
         pieces: the pieces in the order in which they act.
@@ -34,6 +36,21 @@ def check_pieces(
     """
     _check_wiring(pieces, [as_key(key) for key in actions])
     episodes = torch.arange(BATCH).unsqueeze(-1)
+    _play(pieces, horizon, actions, episodes)
+    # What the first step computed once and for all, it may keep.
+    before = [_kept(piece) for piece in pieces]
+    _play(pieces, horizon, actions, episodes + BATCH)
+    for piece, held in zip(pieces, before, strict=True):
+        _check_forgets(piece, held)
+
+
+def _play(
+    pieces: Sequence[Piece],
+    horizon: int,
+    actions: Mapping[NestedKey, tuple[int, ...]],
+    episodes: Tensor,
+) -> None:
+    """Reset episodes by their seeds, take a step, and compare what is written with the specs."""
     moment = TensorDict(batch_size=[BATCH])
     for key, value in tick(episodes, torch.zeros_like(episodes), horizon).items():
         moment.set(key, value)
@@ -53,6 +70,46 @@ def check_pieces(
         _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
 
 
+def _kept(piece: Piece) -> dict[str, list[Any]]:
+    """Return what a piece and the modules in it hold in attributes, so that a change shows.
+
+    Of a tensor the number of changes in place belongs to it, of a list or mapping its items.
+    """
+    held = {}
+    for path, module in piece.named_modules():
+        for name, value in {**vars(module), **dict(module.named_buffers(recurse=False))}.items():
+            if name == "_buffers":
+                continue
+            parts = [value]
+            if isinstance(value, Mapping):
+                parts += value.values()
+            elif isinstance(value, (list, set, deque)):
+                parts += value
+            parts += [part._version for part in parts if isinstance(part, Tensor)]
+            held[f"{path}.{name}" if path else name] = parts
+    return held
+
+
+def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
+    """Refuse a piece that remembers in an attribute: episodes would share what it holds.
+
+    Raises:
+        ConfigError: naming the attribute, and where to remember instead.
+    """
+    after = _kept(piece)
+    for name, parts in after.items():
+        old = before.get(name, [])
+        if len(parts) != len(old) or not all(
+            new is kept or (isinstance(new, int) and new == kept)
+            for new, kept in zip(parts, old, strict=True)
+        ):
+            raise ConfigError(
+                f"{type(piece).__name__} remembers in its attribute {name!r}, which all episodes "
+                "share; what lasts from step to step must be an entry: give its key in writes=… "
+                "and reads, see docs/extend.md"
+            )
+
+
 def _attempt(piece: Piece, action: object) -> None:
     """Call a function, naming the piece where it fails."""
     try:
@@ -64,7 +121,7 @@ def _attempt(piece: Piece, action: object) -> None:
         raise ConfigError(f"{where} does not fit the string of vehicles: {error}") from error
 
 
-def _compare(piece: Piece, found: Mapping[Key, torch.Tensor], when: str) -> None:
+def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
     """Compare what a piece wrote with what its spec promises."""
     specs = piece.written_specs(torch.Size([BATCH]), None)
     for key, value in found.items():

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.step import tick
 from lcc_rl.errors import ConfigError
-from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
 
 
 class Clock(EnvBase):
@@ -89,6 +90,8 @@ class Clock(EnvBase):
         seeds = tensordict.get(SEED, None) if tensordict is not None else None
         if seeds is None:
             seeds = self._draw_seeds()
+        else:
+            require_option(SEED, seeds, 2**32)  # of which all bits count
         return self._moment(seeds, torch.zeros_like(seeds))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -101,8 +104,57 @@ class Clock(EnvBase):
         return moment
 
 
+def reset_options(env: EnvBase) -> dict[Key, Any]:
+    """Return the spec of every entry that a caller may give to ``env.reset``."""
+    specs = {as_key(key): spec for key, spec in env.state_spec.items(True, True)}
+    return {key: spec for key, spec in specs.items() if key != STEP}
+
+
 class Traffic(TransformedEnv):
     """A clock and the pieces that move the vehicles, as one environment."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **settings: Any) -> TensorDictBase:
+        if tensordict is not None:
+            self._check_options(tensordict)
+        return super()._reset(tensordict, **settings)
+
+    def _moment_keys(self) -> set[Key]:
+        """Return the keys of everything that a reset writes."""
+        specs = (self.full_observation_spec, self.full_done_spec)
+        return {as_key(key) for spec in specs for key in spec.keys(True, True)}
+
+    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
+        if tensordict.batch_size != self.batch_size:
+            raise ConfigError(
+                f"expected a TensorDict of {list(self.batch_size)} episodes, as the environment "
+                f"has, got {list(tensordict.batch_size)}"
+            )
+
+    def _check_options(self, given: TensorDictBase) -> None:
+        """Check what a caller gives to ``reset``; TorchRL would ignore what it does not know.
+
+        Raises:
+            ConfigError: naming the key, what was expected and the options that exist.
+        """
+        options = reset_options(self)
+        names = ", ".join(".".join(key) for key in options)
+        keys = set(map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)))
+        keys -= {as_key(key) for key in self.reset_keys}
+        if keys - set(options) and self._moment_keys() <= keys:
+            # TorchRL writes the first moment into what it is given; that may be given again.
+            keys &= set(options)
+        for key in sorted(keys):
+            name, value = ".".join(key), given.get(key)
+            if key not in options:
+                raise ConfigError(f"reset: {name} is no reset option; those that exist: {names}")
+            spec = options[key]
+            wanted = f"reset: {name} must be {list(spec.shape)} {spec.dtype}"
+            if not isinstance(value, torch.Tensor):
+                raise ConfigError(f"{wanted}, got {value!r}")
+            if value.shape != spec.shape or value.dtype != spec.dtype:
+                raise ConfigError(f"{wanted}, got {list(value.shape)} {value.dtype}")
+            if not bool(torch.isfinite(value).all()):
+                raise ConfigError(f"{wanted} and finite, got {value.flatten().tolist()}")
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # TorchRL looks up the shape of every reward here at every step, a twentieth of its time;

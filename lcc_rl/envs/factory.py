@@ -22,6 +22,7 @@ from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
 from lcc_rl.pieces import CBFFilter, Piece, Places, StringMotion, TotalReward
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
+from lcc_rl.schemas import check_ranges
 
 ACTION = (AUTOMATED, "action")
 
@@ -53,6 +54,7 @@ def build_env(
         ConfigError: naming the option at fault.
     """
     scenario = cfg.scenario
+    check_ranges(cfg)
     pieces = build_pieces(cfg, profiles, population, nominal)
     acts = any(key == ACTION for piece in pieces for _, key in piece.sources)
     actions: dict[NestedKey, tuple[int, ...]] = {}

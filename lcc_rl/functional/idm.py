@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require_positive
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
 
@@ -39,8 +39,8 @@ class IDMConstants:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if isinstance(value, (int, float)) and not value > 0:
-                raise ConfigError(f"IDM constant {name!r} must be positive, got {value}")
+            if not isinstance(value, Tensor):
+                require_positive("IDM", **{name: value})
 
     def with_(self, **changes: Tensor) -> IDMConstants:
         """Return a copy in which some constants vary by driver (tensors, for calibration)."""

@@ -21,6 +21,8 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from lcc_rl.errors import ConfigError
+
 Key = tuple[str, ...]
 # The entries of one moment by their full keys.
 State = dict[Key, Tensor]
@@ -45,6 +47,20 @@ def root_key(key: NestedKey) -> Key:
     """Return a key without ``"next"``."""
     key = as_key(key)
     return key[1:] if key[0] == NEXT else key
+
+
+def require_option(key: Key, values: Tensor, count: Tensor | int) -> None:
+    """Check values of a reset option: whole numbers below ``count``, which may differ by episode.
+
+    Raises:
+        ConfigError: naming the option and its range.
+    """
+    wrong = (values < 0) | (values >= count)
+    if bool(wrong.any()):
+        last = (torch.as_tensor(count, device=values.device) - 1).expand_as(values)[wrong][0]
+        raise ConfigError(
+            f"reset: {'.'.join(key)} must lie in 0…{int(last)}, got {int(values[wrong][0])}"
+        )
 
 
 class Piece(TensorDictModuleBase, Transform):

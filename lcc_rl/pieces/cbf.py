@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.braking import Braking, least_room, safe_acceleration
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.base import StepTransform
@@ -57,7 +57,8 @@ class CBFFilter(StepTransform):
         role: whose commands are filtered.
 
     Raises:
-        ConfigError: if a limit, a rate or the acceleration is not positive, or the speed negative.
+        ConfigError: if a limit, a rate or the acceleration is not positive, or another setting
+            negative.
     """
 
     def __init__(
@@ -82,8 +83,7 @@ class CBFFilter(StepTransform):
         require_positive(where, **limits)
         if time_gap is not None:
             require_positive(where, time_gap=time_gap)
-        if full_speed < 0:
-            raise ConfigError(f"{where}.full_speed must not be negative, got {full_speed}")
+        require_in(where, "[0, inf)", full_speed=full_speed, least_gap=least_gap)
         string = VehicleString((role,)) if string is None else string
         seen = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
         self.views = Views(string, role, [f"next.command.{role}", *seen])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.cacc import (
     Chain,
     Errors,
@@ -63,10 +63,7 @@ class Communication(Feature):
         headway: float = 5.0,
         delay: float = 0.005,
     ) -> None:
-        if not (headway >= 0 and delay >= 0):
-            raise ConfigError(
-                f"communication: headway {headway} and delay {delay} must not be negative"
-            )
+        require_in("scenario.pieces.communication", "[0, inf)", headway=headway, delay=delay)
         own = ("speed", "gap", "acceleration")
         leader = [] if string.ring else [(LEADER, "speed"), (LEADER, "acceleration")]
         roles = [role for role in string.names if role in connected]
@@ -134,7 +131,8 @@ class CACC(Controller):
         string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
 
     Raises:
-        ConfigError: if the closed loop is unstable, naming the condition that fails.
+        ConfigError: if a setting is out of range, or the closed loop unstable, naming the
+            condition that fails.
     """
 
     reads = tuple(f"self.{name}" for name in ERRORS)
@@ -152,6 +150,7 @@ class CACC(Controller):
     ) -> None:
         super().__init__(string, role)
         require_positive(f"scenario.controllers.{role}", max_acceleration=max_acceleration)
+        require_in(f"scenario.controllers.{role}", "(-inf, inf)", k1=k1, k2=k2, k3=k3, k4=k4)
         self.gains = Gains(k1, k2, k3, k4)
         self.gains.check_stable(time_step)
         self.time_step, self.max_acceleration = time_step, max_acceleration
@@ -175,7 +174,7 @@ class DeadBeat(Controller):
         string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
 
     Raises:
-        ConfigError: if the look-ahead is unknown.
+        ConfigError: if the look-ahead is unknown or ``max_acceleration`` not positive.
     """
 
     def __init__(
@@ -186,6 +185,7 @@ class DeadBeat(Controller):
         string: VehicleString | None = None,
         role: str = AUTOMATED,
     ) -> None:
+        require_positive(f"scenario.controllers.{role}", max_acceleration=max_acceleration)
         super().__init__(string, role, ["self.speed", *leader_names(lookahead)])
         self.lookahead = check_leader(lookahead, self)
         self.time_step, self.max_acceleration = time_step, max_acceleration

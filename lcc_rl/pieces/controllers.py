@@ -22,11 +22,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.idm import IDMConstants, idm_acceleration
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.random import choose, normal, stream_id, uniform
-from lcc_rl.pieces.base import SEED, Key, StepTransform, as_key
+from lcc_rl.pieces.base import SEED, Key, StepTransform, as_key, require_option
 from lcc_rl.pieces.views import Views
 
 # The names of the random streams: an episode's seed means the same episode under either.
@@ -131,6 +131,9 @@ class ConstantAcceleration(Controller):
     Args:
         acceleration: that acceleration [m/s²].
         string, role: see :class:`Controller`.
+
+    Raises:
+        ConfigError: if ``acceleration`` is not finite.
     """
 
     reads = ("self.speed",)
@@ -141,6 +144,7 @@ class ConstantAcceleration(Controller):
         string: VehicleString | None = None,
         role: str = AUTOMATED,
     ) -> None:
+        require_in(f"scenario.controllers.{role}", "(-inf, inf)", acceleration=acceleration)
         super().__init__(string, role)
         self.acceleration = acceleration
 
@@ -193,11 +197,8 @@ class IDM(Controller):
                 f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
                 "drivers.mode=local), got a population in which they differ by driver"
             )
-        if not (0.0 <= noise < 1.0 and wiener >= 0.0):
-            raise ConfigError(
-                f"{where}: noise must lie in [0, 1) and wiener not be negative, got {noise} and "
-                f"{wiener}"
-            )
+        require_in(where, "[0, 1)", noise=noise)
+        require_in(where, "[0, inf)", wiener=wiener)
         constants = [(role, name) for name in ("driver", "desired_speed", "desired_time_gap")]
         names = ["self.speed", "self.gap", "self.relative_speed"]
         names += [".".join(key) for key in constants[1:]] + ["episode.seed", "episode.step"]
@@ -247,8 +248,8 @@ class IDM(Controller):
         if driver is None:
             seed = start.get(SEED).unsqueeze(-2)
             driver = choose(seed, count, self.driver_stream + self.index)
-        elif bool(((driver < 0) | (driver >= count)).any()):
-            raise ConfigError(f"driver ids must lie in 0…{count - 1}, got {driver}")
+        else:
+            require_option(self.reset_options[0], driver, count)
         values = (driver, self.desired_speeds[driver], self.time_gaps[driver])
         for key, value in zip(self.constants, values, strict=True):
             start.set(as_key(key), value)

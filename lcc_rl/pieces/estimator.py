@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
 from lcc_rl.functional.pattern import HUMAN, VehicleString
 from lcc_rl.pieces.base import Key, StepTransform
@@ -32,8 +33,8 @@ class DriverEstimator(StepTransform):
     Args:
         population: the calibrated drivers.
         time_step: duration of a step [s].
-        learning_time: time before the online fit is trusted [s]; infinite for the population
-            mean throughout.
+        learning_time: time before the online fit is trusted [s]; None for the population mean
+            throughout.
         measurement_error: standard deviation of the measured acceleration [m/s²].
         string: the string of vehicles; one human driver where not given.
         role: whose acceleration is predicted.
@@ -49,15 +50,15 @@ class DriverEstimator(StepTransform):
         self,
         population: Population,
         time_step: float,
-        learning_time: float = 5.0,
+        learning_time: float | None = 5.0,
         measurement_error: float = 0.05,
         string: VehicleString | None = None,
         role: str = HUMAN,
     ) -> None:
-        if not measurement_error > 0:
-            raise ConfigError(f"measurement_error must be positive, got {measurement_error}")
-        if not learning_time >= 0:
-            raise ConfigError(f"learning_time must not be negative, got {learning_time}")
+        where = "scenario.pieces.estimator"
+        require_positive(where, measurement_error=measurement_error)
+        if learning_time is not None:
+            require_in(where, "[0, inf)", learning_time=learning_time)
         string = VehicleString((role,)) if string is None else string
         belief = [(role, "estimate"), (role, "covariance")]
         motion = [f"self.{name}" for name in ("speed", "gap", "relative_speed")]
@@ -69,7 +70,7 @@ class DriverEstimator(StepTransform):
             event_shape=(string.count(role), 1),
         )
         self.time_step, self.measurement_error = time_step, measurement_error
-        self.learning_steps = learning_time / time_step
+        self.learning_steps = inf if learning_time is None else learning_time / time_step
         self.drivers = population.constants
         self.mean = PopulationMean(
             population.desired_speed, population.time_gap, population.constants

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.safety import time_gap, time_to_collision
@@ -17,9 +18,13 @@ class TimeToCollision(Feature):
     Args:
         string: the string of vehicles.
         floor: smallest value, which a collision has too [s].
+
+    Raises:
+        ConfigError: if the floor is not positive.
     """
 
     def __init__(self, string: VehicleString, floor: float = 0.01) -> None:
+        require_positive("scenario.pieces.ttc", floor=floor)
         reads = [(VEHICLES, "gap"), (VEHICLES, "relative_speed")]
         super().__init__(reads, [(VEHICLES, "ttc")], (len(string), 1))
         self.floor = floor
@@ -35,9 +40,13 @@ class TimeGap(Feature):
     Args:
         string: the string of vehicles.
         speed_floor: speeds below this count as this; 0 is the literal rule [m/s].
+
+    Raises:
+        ConfigError: if the floor is negative.
     """
 
     def __init__(self, string: VehicleString, speed_floor: float = 1.0) -> None:
+        require_in("scenario.pieces.time_gap", "[0, inf)", speed_floor=speed_floor)
         reads = [(VEHICLES, "gap"), (VEHICLES, "speed")]
         super().__init__(reads, [(VEHICLES, "time_gap")], (len(string), 1))
         self.speed_floor = speed_floor

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Decision,
@@ -81,13 +81,11 @@ class HCFS(Controller):
     ) -> None:
         where = f"scenario.controllers.{role}"
         require_positive(where, max_acceleration=max_acceleration, jerk_bound=jerk_bound)
-        if not 0 < braking <= max_acceleration:
-            raise ConfigError(
-                f"{where}.braking must lie in (0, {max_acceleration}], which is what the vehicles "
-                f"can do, got {braking}"
-            )
-        if not margin >= 0:
-            raise ConfigError(f"{where}.margin must not be negative, got {margin}")
+        # More than the vehicles can brake would be no safe cap.
+        require_in(where, f"(0, {max_acceleration}]", braking=braking)
+        weights = {"velocity_weight": velocity_weight, "jerk_weight": jerk_weight}
+        require_in(where, "[0, inf)", margin=margin, **weights)
+        require_positive(where, speed_scale=speed_scale, jerk_scale=jerk_scale)
         own = [f"self.{name}" for name in ("speed", "acceleration", "received_gap", "speed_error")]
         state = [(HYBRID, name) for name in ("winner", *COUNTERS)]
         super().__init__(

@@ -11,13 +11,14 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_in
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import NEXT, SEED, STEP, Feature, Key, StepTransform
 from lcc_rl.pieces.views import Views
 
 KINDS = ("filtered", "stacked")
+LONGEST = 3600  # what is remembered or known ahead [s]
 
 
 class LeaderPreview(Feature):
@@ -35,7 +36,7 @@ class LeaderPreview(Feature):
         delay: age of the message: the speed of that long before is given instead [s].
 
     Raises:
-        ConfigError: if there is no horizon, or a setting is negative.
+        ConfigError: if there is no horizon, or a setting is out of range.
     """
 
     speeds: Tensor
@@ -52,12 +53,9 @@ class LeaderPreview(Feature):
         noise: float = 0.0,
         delay: float = 0.0,
     ) -> None:
-        _check_numbers("preview.horizons", horizons)
-        if not horizons or min(horizons) < 0 or noise < 0 or delay < 0:
-            raise ConfigError(
-                f"preview: horizons {list(horizons)} must be given, and horizons, noise {noise} "
-                f"and delay {delay} must not be negative"
-            )
+        _check_seconds("preview.horizons", horizons, 0)
+        require_in("preview", "[0, inf)", noise=noise)
+        require_in("preview", f"[0, {LONGEST}]", delay=delay)
         reads = [("leader", "profile"), ("leader", "start"), SEED, STEP]
         super().__init__(reads, [("preview", "speed")], (1, len(horizons)))
         self.noise, self.stream = noise, stream_id("preview.noise")
@@ -95,7 +93,7 @@ class ObservationMemory(StepTransform):
         string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
-        ConfigError: if a setting is unknown, missing or not positive.
+        ConfigError: if a setting is unknown, missing or out of range.
     """
 
     shares: Tensor
@@ -111,12 +109,9 @@ class ObservationMemory(StepTransform):
     ) -> None:
         if kind not in KINDS:
             raise ConfigError(f"memory.kind must be one of {', '.join(KINDS)}, got {kind!r}")
-        _check_numbers("memory.seconds", seconds)
-        if not sources or not seconds or min(seconds) < time_step:
-            raise ConfigError(
-                f"memory: sources {list(sources)} and seconds {list(seconds)} must be given, and "
-                f"no second be shorter than a step ({time_step})"
-            )
+        _check_seconds("memory.seconds", seconds, time_step)
+        if not sources:
+            raise ConfigError("memory.sources must name at least one entry, got none")
         string = VehicleString() if string is None else string
         ages = [round(age / time_step) for age in seconds]
         self.stacked, self.depth = kind == "stacked", max(ages) + 1
@@ -161,6 +156,10 @@ class ObservationMemory(StepTransform):
             start.set(key, now.repeat_interleave(repeat, -1))
 
 
-def _check_numbers(where: str, values: Sequence[float]) -> None:
-    if not all(isinstance(value, (int, float)) for value in values):
-        raise ConfigError(f"{where} must be numbers, got {list(values)}")
+def _check_seconds(where: str, values: Sequence[float], least: float) -> None:
+    """Check that there are times, none below the least or too long to be kept [s]."""
+    if not values:
+        raise ConfigError(f"{where} must name at least one time, got none")
+    for value in values:
+        parent, _, name = where.rpartition(".")
+        require_in(parent, f"[{least}, {LONGEST}]", **{name: value})

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles, from_trajectories
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_in
 from lcc_rl.functional.random import choose, stream_id, uniform
-from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key
+from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key, require_option
 
 PROFILE, FIRST = ("leader", "profile"), ("leader", "start")
 SPEED, ACCELERATION, NEXT_SPEED = (
@@ -73,8 +73,7 @@ class NGSIMLeader(StepTransform):
     ) -> None:
         if start not in ("random", "first"):
             raise ConfigError(f"leader start must be 'random' or 'first', got {start!r}")
-        if not perturbation >= 0:
-            raise ConfigError(f"leader.perturbation must not be negative, got {perturbation}")
+        require_in("scenario.pieces.leader", "[0, inf)", perturbation=perturbation)
         chosen = [PROFILE, FIRST]
         self.perturbation = 0.0 if nominal else perturbation
         writes = [SPEED, ACCELERATION, *([NEXT_SPEED] if foresight else [])]
@@ -160,10 +159,12 @@ class NGSIMLeader(StepTransform):
             profile = torch.full_like(seed, self.profile)
         elif profile is None:
             profile = choose(seed, len(self.offsets), self.profile_stream)
-        elif bool(((profile < 0) | (profile >= len(self.offsets))).any()):
-            raise ConfigError(f"profile ids must lie in 0…{len(self.offsets) - 1}, got {profile}")
+        else:
+            require_option(PROFILE, profile, len(self.offsets))
         if first is None:
             first = torch.zeros_like(profile)
             if self.start == "random":
                 first = choose(seed, self.starts[profile], self.start_stream)
+        else:
+            require_option(FIRST, first, self.starts[profile])
         return profile, first

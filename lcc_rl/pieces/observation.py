@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_in, require_whole
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.views import BEHIND, PRESENT, Views
 
 OBSERVATION = "observation"
+WIDEST = 10_000  # entries of one view
 
 
 class Observation(Feature):
@@ -35,7 +36,8 @@ class Observation(Feature):
         string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
-        ConfigError: if there is no entry, a scale is zero or a difference is that of no entry.
+        ConfigError: if there is no entry, a scale is zero or not finite, a width out of range, or
+            a difference that of no entry.
     """
 
     constants: Tensor
@@ -50,14 +52,17 @@ class Observation(Feature):
     ) -> None:
         string = VehicleString() if string is None else string
         flat = {(view, name): x for view, names in scales.items() for name, x in names.items()}
-        if not flat or not all(flat.values()):
-            raise ConfigError("observation.scales must name at least one entry, none with scale 0")
-        if visible < 1:
-            raise ConfigError(f"observation.visible must be at least 1, got {visible}")
+        require_in("observation.scales", "(-inf, inf)", **{".".join(k): x for k, x in flat.items()})
+        zeros = [".".join(key) for key, scale in flat.items() if not scale]
+        if not flat or zeros:
+            which = f"{zeros[0]} has scale 0" if zeros else "there is none"
+            raise ConfigError(f"observation.scales needs entries that are not 0, {which}")
+        require_whole("observation", 1, WIDEST, visible=visible)
         wide = {
             view: width if isinstance(width, int) else len(width)
             for view, width in (widths or {}).items()
         }
+        require_whole("observation.widths", 1, WIDEST, **wide)
         counts = [visible if view == BEHIND else wide.get(view, 1) for view, _ in flat]
         bases = _bases(relative_to or {}, flat, counts)
         values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]

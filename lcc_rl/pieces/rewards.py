@@ -12,14 +12,13 @@ and ``+reward.terms.comfort={_target_: mymodule.Comfort, weight: 0.1}`` on the c
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.safety import time_to_collision
 from lcc_rl.pieces.base import RewardPiece
@@ -54,8 +53,7 @@ class RewardTerm(RewardPiece):
         reads: Sequence[str] | None = None,
         string: VehicleString | None = None,
     ) -> None:
-        if not math.isfinite(weight):
-            raise ConfigError(f"reward.terms.{name}.weight must be finite, got {weight}")
+        require_in(f"reward.terms.{name}", "(-inf, inf)", weight=weight)
         string = VehicleString() if string is None else string
         self.views = Views(string, AUTOMATED, self.reads if reads is None else reads)
         self.string = string
@@ -79,6 +77,9 @@ class SafetyReward(RewardTerm):
         threshold: time-to-collision that is safe enough [s].
         floor: time-to-collision below which the term no longer falls [s].
         margin: gap that counts as contact [m].
+
+    Raises:
+        ConfigError: if a setting is out of range.
     """
 
     reads = ("self.gap", "self.relative_speed")
@@ -92,10 +93,10 @@ class SafetyReward(RewardTerm):
         margin: float = 1.0,
         string: VehicleString | None = None,
     ) -> None:
-        if not 0 < floor < threshold:
-            raise ConfigError(f"reward.terms.{name}: floor {floor} must be below {threshold}")
-        if not margin >= 0:
-            raise ConfigError(f"reward.terms.{name}.margin must not be negative, got {margin}")
+        where = f"reward.terms.{name}"
+        require_positive(where, threshold=threshold)
+        require_in(where, f"(0, {threshold})", floor=floor)
+        require_in(where, "[0, inf)", margin=margin)
         super().__init__(name, weight, string=string)
         self.threshold, self.floor, self.margin = threshold, floor, margin
 
@@ -111,6 +112,9 @@ class EfficiencyReward(RewardTerm):
     Args:
         name, weight, string: see :class:`RewardTerm`.
         threshold: time gap that is too long [s].
+
+    Raises:
+        ConfigError: if the threshold is not positive.
     """
 
     reads = ("self.time_gap",)
@@ -122,6 +126,7 @@ class EfficiencyReward(RewardTerm):
         threshold: float = 2.5,
         string: VehicleString | None = None,
     ) -> None:
+        require_positive(f"reward.terms.{name}", threshold=threshold)
         super().__init__(name, weight, string=string)
         self.threshold = threshold
 
@@ -156,8 +161,7 @@ class EnergyReward(RewardTerm):
         power: str = "vehicles.power",
         string: VehicleString | None = None,
     ) -> None:
-        if not scale > 0:
-            raise ConfigError(f"reward.terms.{name}.scale must be positive, got {scale}")
+        require_positive(f"reward.terms.{name}", scale=scale)
         if of not in ("self", "behind", "string"):
             raise ConfigError(f"reward.terms.{name}.of must be self, behind or string, got {of!r}")
         string = VehicleString() if string is None else string
@@ -216,6 +220,9 @@ class VelocityReward(RewardTerm):
     Args:
         name, weight, string: see :class:`RewardTerm`; ω1.
         speed_scale: v_max [m/s].
+
+    Raises:
+        ConfigError: if the scale is not positive.
     """
 
     reads = ("self.leader_speed_error",)
@@ -227,10 +234,7 @@ class VelocityReward(RewardTerm):
         speed_scale: float = 27.1,
         string: VehicleString | None = None,
     ) -> None:
-        if not speed_scale > 0:
-            raise ConfigError(
-                f"reward.terms.{name}.speed_scale must be positive, got {speed_scale}"
-            )
+        require_positive(f"reward.terms.{name}", speed_scale=speed_scale)
         super().__init__(name, weight, string=string)
         self.speed_scale = speed_scale
 
@@ -245,6 +249,9 @@ class JerkReward(RewardTerm):
     Args:
         name, weight, string: see :class:`RewardTerm`; ω2.
         jerk_scale: 2 a_max/T [m/s³].
+
+    Raises:
+        ConfigError: if the scale is not positive.
     """
 
     reads = ("self.jerk",)
@@ -256,8 +263,7 @@ class JerkReward(RewardTerm):
         jerk_scale: float = 30.0,
         string: VehicleString | None = None,
     ) -> None:
-        if not jerk_scale > 0:
-            raise ConfigError(f"reward.terms.{name}.jerk_scale must be positive, got {jerk_scale}")
+        require_positive(f"reward.terms.{name}", jerk_scale=jerk_scale)
         super().__init__(name, weight, string=string)
         self.jerk_scale = jerk_scale
 

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.rules import follower_stopper_speed
 from lcc_rl.pieces.base import Key
@@ -54,15 +54,16 @@ class FollowerStopper(Controller):
     ) -> None:
         where = f"scenario.controllers.{role}"
         limits = {"max_acceleration": max_acceleration, "max_deceleration": max_deceleration}
-        require_positive(where, window=window, **limits)
-        for name, values in (("gaps", gaps), ("decelerations", decelerations)):
-            if len(values) != 3 or not all(value > 0 for value in values):
-                raise ConfigError(f"{where}.{name} must be three positive numbers, got {values}")
-        if len(time_gaps) != 3 or min(time_gaps) < 0 or list(gaps) != sorted(gaps):
-            raise ConfigError(
-                f"{where}: time_gaps must be three numbers, none negative, and gaps increase; got "
-                f"{list(time_gaps)} and {list(gaps)}"
-            )
+        require_positive(where, **limits)
+        require_in(where, "(0, 3600]", window=window)
+        lists = {"gaps": gaps, "time_gaps": time_gaps, "decelerations": decelerations}
+        for name, values in lists.items():
+            interval = "[0, inf)" if name == "time_gaps" else "(0, inf)"
+            require_in(where, interval, **{f"{name}[{i}]": x for i, x in enumerate(values)})
+            if len(values) != 3:
+                raise ConfigError(f"{where}.{name} must be three numbers, got {list(values)}")
+        if list(gaps) != sorted(gaps):
+            raise ConfigError(f"{where}.gaps must increase, got {list(gaps)}")
         if desired_speed is not None:
             require_positive(where, desired_speed=desired_speed)
         history = (role, "speed_history")
@@ -119,10 +120,7 @@ class Handover(Controller):
         string: VehicleString | None = None,
         role: str = AUTOMATED,
     ) -> None:
-        if not from_s >= 0:
-            raise ConfigError(
-                f"scenario.controllers.{role}.from_s must not be negative, got {from_s}"
-            )
+        require_in(f"scenario.controllers.{role}", "[0, inf)", from_s=from_s)
         both = (before, after)
         super().__init__(
             string,

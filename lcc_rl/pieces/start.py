@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import LARGEST, ConfigError, require_in, require_positive
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
@@ -48,9 +48,8 @@ class TimeGapStart:
         role: str = AUTOMATED,
     ) -> None:
         require_positive("scenario.start", standstill_gap=standstill_gap)
-        if time_gap < 0:
-            raise ConfigError(f"scenario.start: time_gap must not be negative, got {time_gap}")
-        if len(gap_range) != 2 or not 0 < gap_range[0] <= gap_range[1]:
+        require_in("scenario.start", "[0, inf)", time_gap=time_gap)
+        if len(gap_range) != 2 or not 0 < gap_range[0] <= gap_range[1] <= LARGEST:
             raise ConfigError(
                 "scenario.start: gap_range must be two increasing positive factors, got "
                 f"{list(gap_range)}"
@@ -117,11 +116,8 @@ class HeadwayStart:
         nominal: bool = False,
     ) -> None:
         require_positive("scenario.start", headway=headway)
-        if not (0 <= gap_spread < headway and speed_spread >= 0):
-            raise ConfigError(
-                f"scenario.start: gap_spread {gap_spread} must lie in [0, {headway}) and "
-                f"speed_spread {speed_spread} must not be negative"
-            )
+        require_in("scenario.start", f"[0, {headway})", gap_spread=gap_spread)
+        require_in("scenario.start", "[0, inf)", speed_spread=speed_spread)
         self.headway = headway
         self.gap_spread, self.speed_spread = (0.0, 0.0) if nominal else (gap_spread, speed_spread)
 

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
@@ -184,6 +184,5 @@ def _ring_start(
             f"scenario.circumference={circumference} is too short for {len(string)} vehicles of "
             f"{length} m: it must exceed {len(string) * length} m"
         )
-    if not speed >= 0:
-        raise ConfigError(f"scenario.initial_speed must not be negative, got {speed}")
+    require_in("scenario", "[0, inf)", initial_speed=speed)
     return speed, gap

@@ -12,7 +12,7 @@ import math
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lcc_rl.errors import require_positive
+from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.rewards import RewardTerm
 
@@ -42,7 +42,7 @@ class SmoothSafety(RewardTerm):
         rate_width: range of approach rates over which closing begins [m/s].
 
     Raises:
-        ConfigError: if a threshold or width is not positive.
+        ConfigError: if a threshold or width is not positive or the margin negative.
     """
 
     reads = ("self.gap", "self.relative_speed")
@@ -65,6 +65,7 @@ class SmoothSafety(RewardTerm):
             gap_width=gap_width,
             rate_width=rate_width,
         )
+        require_in(f"agent.surrogates.{name}", "[0, inf)", margin=margin)
         super().__init__(name, weight, string=string)
         self.log_threshold, self.width, self.margin = math.log(threshold), width, margin
         self.gap_width, self.rate_width = gap_width, rate_width

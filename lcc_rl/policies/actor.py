@@ -37,7 +37,7 @@ def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> M
         ConfigError: if a size is no positive whole number, or the weights do not fit into memory.
     """
     for size in hidden:
-        require_whole(f"agent.hidden={list(hidden)}: every size", size, 1)
+        require_whole(f"agent.hidden={list(hidden)}", 1, size=size)
     weights = sum(a * b for a, b in pairwise([inputs, *hidden, outputs]))
     require_memory({f"agent.hidden={list(hidden)}": WEIGHT * weights})
     with torch.random.fork_rng(devices=[]):

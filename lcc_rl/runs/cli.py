@@ -21,20 +21,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
-from lcc_rl.config_errors import check_keys
-from lcc_rl.errors import (
-    LARGEST_SEED,
-    ConfigError,
-    Interrupted,
-    LccError,
-    ResultsError,
-    require_whole,
-)
+from lcc_rl.config_errors import check_keys, refused_by_hydra
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, require_whole
 from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.precision import set_precision
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
+from lcc_rl.schemas import check_ranges
 
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
@@ -62,6 +56,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             check_keys(config)
             typed = list(HydraConfig.get().overrides.task)
             check_ignored(config, typed, is_sweep())
+            check_ranges(config)
             leave_out_foreign(config, typed)
             return function(config)
 
@@ -148,7 +143,9 @@ def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
     def explained_function(*arguments: Any) -> Any:
         try:
             return function(*arguments)
-        except HydraException as error:
+        except Exception as error:
+            if isinstance(error, OmegaConfBaseException) or not refused_by_hydra(error):
+                raise
             overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
             clearer = explained(error, entry, overrides)
             if clearer is error:
@@ -244,8 +241,8 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
     Raises:
         ConfigError: if one of them is of the wrong type or impossible on this machine.
     """
-    require_whole("seed", cfg.get("seed"), 0, LARGEST_SEED)
-    require_whole("threads", cfg.get("threads"), 1, most_parallel())
+    require_whole("", 0, seed=cfg.get("seed"))
+    require_whole("", 1, most_parallel(), threads=cfg.get("threads"))
     try:
         device = torch.device(cfg.device)
         torch.empty(0, device=device)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require_in
 
 Array = NDArray[np.float64]
 
@@ -57,10 +57,7 @@ class StopAndGo:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             spread = name.endswith("spread_mps")
-            number = isinstance(value, (int, float)) and np.isfinite(value)
-            if not number or not (value >= 0 if spread else value > 0):
-                kind = "zero or more" if spread else "positive"
-                raise ConfigError(f"stop-and-go leader: {name!r} must be {kind}, got {value!r}")
+            require_in("data.leader", "[0, inf)" if spread else "(0, inf)", **{name: value})
 
     def drive(
         self, count: int, steps: int, time_step: float, generator: np.random.Generator

@@ -25,7 +25,7 @@ from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import LARGEST_SEED, ConfigError, require_whole
+from lcc_rl.errors import ConfigError, require_in, require_whole
 from lcc_rl.io.files import atomic_path, write_parquet
 from lcc_rl.io.memory import require_memory
 from lcc_rl.synthetic.lane import Stream, drive_platoons
@@ -73,22 +73,20 @@ class StreamSource:
     keep: str | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2)):
-            require_whole(f"stream: {name!r}", getattr(self, name), least)
-        require_whole("stream: 'seed'", self.seed, 0, LARGEST_SEED)
+        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2), ("seed", 0)):
+            require_whole("data", least, **{name: getattr(self, name)})
         try:
             low, high = map(float, self.duration_s)
         except (TypeError, ValueError):
             low = high = float("nan")
-        if not 1.0 <= low <= high < float("inf"):
+        if not 1.0 <= low <= high <= 36_000.0:
             raise ConfigError(
-                "stream: 'duration_s' must be two numbers, a range from 1 s up, "
+                "stream: 'duration_s' must be two numbers, a range in 1…36000 s, "
                 f"got {self.duration_s!r}"
             )
         if self.keep is not None and not str(self.keep).endswith((".csv", ".csv.gz")):
             raise ConfigError(f"data.keep must name a .csv or .csv.gz file, got {self.keep!r}")
-        if not isinstance(self.noise, (int, float)) or not 0.0 <= self.noise < 1.0:
-            raise ConfigError(f"stream: 'noise' must be in [0, 1), got {self.noise!r}")
+        require_in("data", "[0, 1)", noise=self.noise)
         count = self.recordings * self.platoons * self.vehicles
         size = f"data: recordings × platoons × vehicles = {count}, up to {high:g} s each,"
         require_memory({size: count * high / FRAME * SAMPLE})

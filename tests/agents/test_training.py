@@ -156,7 +156,7 @@ def test_every_vehicles_transition_is_learned_from() -> None:
 
 
 def test_divergence_stops_with_the_quantity_named(tmp_path) -> None:
-    trainer = make(tmp_path, "agent.critic_lr=1e12", "training.episodes=400")
+    trainer = make(tmp_path, "agent.critic_lr=1e9", "training.episodes=400")
     with pytest.raises(Diverged, match=r"\w+ became (nan|-?inf) in iteration 1 of 100"):
         trainer.run()
 

@@ -77,7 +77,7 @@ def test_a_node_of_the_wrong_kind_is_named(mine, tmp_path, node, target, words) 
         (["+logger={_target_: os.getcwd}"], "logger: expected a logger, str is none"),
         (["scenario.start.automated._target_=os.getcwd"], "start.automated: expected a start, str"),
         (["reward.terms.safety._target_=builtins.print"], "reward.terms.safety: expected a piece"),
-        (["scenario.pieces.power._target_=fractions.Fraction"], "pieces.power: expected a piece"),
+        (["scenario.pieces.ttc._target_=fractions.Fraction"], "pieces.ttc: expected a piece"),
         (["variant=cacc", "leader._target_=os.getcwd"], "leader: expected a source of leaders"),
     ],
 )

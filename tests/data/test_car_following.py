@@ -176,11 +176,11 @@ def test_nobody_follows(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ({"min_duration_s": 0.0}, "'min_duration_s' must be at least 0.1"),
-        ({"min_duration_s": -1.0}, "'min_duration_s' must be at least 0"),
-        ({"min_duration_s": float("nan")}, "'min_duration_s' must be at least 0"),
+        ({"min_duration_s": -1.0}, "min_duration_s must not be negative"),
+        ({"min_duration_s": float("nan")}, "min_duration_s must not be negative"),
         ({"max_duration_s": 14.0}, r"'min_duration_s' \(15.0\) must not be above 'max_duration_s'"),
         ({"min_gap_m": 200.0}, r"'min_gap_m' \(200.0\) must not be above 'max_gap_m' \(120.0\)"),
-        ({"max_gap_m": -1.0, "min_gap_m": None}, "'max_gap_m' must be at least 0"),
+        ({"max_gap_m": -1.0, "min_gap_m": None}, "max_gap_m must not be negative"),
         ({"lane_changes": "keep"}, "'lane_changes' must be one of split, reject, got 'keep'"),
     ],
 )

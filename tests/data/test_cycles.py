@@ -98,7 +98,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, rows, words) -> None:
         (["leader.cases.case_1.path=uds"], DataError, "no shipped cycle"),
         (["leader.cases.case_1.start_s=595"], DataError, "covers 0–600 s, not the stretch"),
         (["leader.cases.case_1.followers=0"], ConfigError, r"case_1\.followers"),
-        (["leader.training.udds.scale=0"], ConfigError, "scale of udds must be positive"),
+        (["leader.training.udds.scale=0"], ConfigError, "scale must be positive"),
         (["leader.training.udds.from_s=1369"], ConfigError, "is empty"),
         (["+leader.training.udds.start_s=3"], ConfigError, "start_s"),
         (["leader.least_variation=1e6"], DataError, "least_variation"),

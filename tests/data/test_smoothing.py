@@ -173,7 +173,7 @@ def test_ripple_at_standstill_becomes_zero_and_is_counted(tmp_path: Path) -> Non
     [
         (lambda: SavitzkyGolay(window_s=0.3, order=3), "'window_s' must be 0.4 to 600"),
         (lambda: SavitzkyGolay(window_s=float("nan")), "'window_s'"),
-        (lambda: SavitzkyGolay(order=1), "'order' must be at least 2"),
+        (lambda: SavitzkyGolay(order=1), "order must be a whole number from 2"),
         (lambda: ExponentialAverage(width_s=0.0), "'width_s' must be 0 to 100"),
     ],
 )

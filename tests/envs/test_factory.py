@@ -141,8 +141,8 @@ def test_one_profile_for_every_episode() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        (("leader", "profile"), torch.tensor([[99]]), "profile ids"),
-        (("human", "driver"), torch.tensor([[[100000]]]), "driver ids"),
+        (("leader", "profile"), torch.tensor([[99]]), "leader.profile must lie in 0…3"),
+        (("human", "driver"), torch.tensor([[[100000]]]), "human.driver must lie in"),
     ],
 )
 def test_unknown_ids_are_refused(key, value, words) -> None:

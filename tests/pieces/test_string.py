@@ -309,11 +309,11 @@ def test_follower_stopper_desires_its_own_mean_speed() -> None:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"window": 0.0}, "window must be positive"),
-        ({"gaps": [4.5, 6.0, 5.25]}, "gaps increase"),
-        ({"gaps": [4.5, 6.0]}, "gaps must be three positive numbers"),
-        ({"time_gaps": [0.1, -0.1, 0.2]}, "none negative"),
-        ({"decelerations": [1.0, 0.0, 1.0]}, "decelerations must be three positive"),
+        ({"window": 0.0}, r"window must lie in \(0, 3600\]"),
+        ({"gaps": [4.5, 6.0, 5.25]}, "gaps must increase"),
+        ({"gaps": [4.5, 6.0]}, "gaps must be three numbers"),
+        ({"time_gaps": [0.1, -0.1, 0.2]}, r"time_gaps\[1\] must not be negative"),
+        ({"decelerations": [1.0, 0.0, 1.0]}, r"decelerations\[1\] must be positive"),
         ({"desired_speed": -1.0}, "desired_speed must be positive"),
     ],
 )

@@ -216,11 +216,11 @@ def test_the_configuration_holds_the_defaults() -> None:
     ],
 )
 def test_bad_arguments_are_named(name: str, value: Any) -> None:
-    with pytest.raises(ConfigError, match=f"'{name}'"):
+    with pytest.raises(ConfigError, match=rf"data\.(leader\.)?{name}|'{name}'"):
         StreamSource(**{name: value})
 
 
 @pytest.mark.parametrize("name", ["mean_speed_mps", "wave_s", "response_s", "level_spread_mps"])
 def test_bad_leader_parameters_are_named(name: str) -> None:
-    with pytest.raises(ConfigError, match=f"'{name}'"):
+    with pytest.raises(ConfigError, match=rf"data\.(leader\.)?{name}|'{name}'"):
         StopAndGo(**{name: -1.0})

@@ -56,7 +56,7 @@ ABLATIONS = {
     "no_cav_energy": Change(("reward.terms.cav_energy.weight=0",)),
     "no_hdv_energy": Change(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
     "true_acceleration": Change(("reward.terms.hdv_energy.power=vehicles.power",), ("alcc",)),
-    "population_mean": Change(("scenario.pieces.estimator.learning_time=inf",), ("alcc",)),
+    "population_mean": Change(("scenario.pieces.estimator.learning_time=null",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.power.recuperation=false",)),
     "one_training_profile": Change(("split=single_training", "scenario.pieces.leader.start=first")),
     "constant_rate": Change(("agent.final_lr_fraction=1.0",)),

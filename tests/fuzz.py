@@ -1,0 +1,267 @@
+"""Fuzzes configurations: random overrides end in a built study or in an error of the package.
+
+The long run: ``python -m tests.fuzz --minutes 10``; a case again: ``--case SEED``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import lcc_rl.conf
+import torch
+from omegaconf import OmegaConf
+
+from lcc_rl.agents.factory import build_agent, learns
+from lcc_rl.commands import evaluation, training
+from lcc_rl.commands.checks import check_settings
+from lcc_rl.config import build, load
+from lcc_rl.config_checks import string_of_scenario
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import constant_profiles
+from lcc_rl.errors import LccError
+from lcc_rl.runs.interrupts import SIGNALS
+
+CONF = Path(lcc_rl.conf.__path__[0])
+SECONDS, GIGABYTES = 90, 6  # limits of one case
+VARIANTS = tuple(sorted(path.stem for path in (CONF / "variant").glob("*.yaml")))
+SMALL = ("experiment=smoke", "scenario.horizon=20")
+DATA = ("data.platoons=2", "data.recordings=2")
+RECIPES = (
+    *("+filter=cbf", "+knowledge=memory", "+knowledge=preview", "scenario=ring agent=none"),
+    *("agent=td3", "agent=sac", "agent=analytic", "agent=none", "drivers=fixed", "drivers=kde"),
+    *("split=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
+    *("scenario.string=automated*2", "scenario.string={size:6,penetration:0.3}"),
+    "controller@scenario.controllers.automated=handover",
+)
+GROUPS = tuple(
+    sorted(
+        path.name
+        for path in CONF.iterdir()
+        if path.is_dir() and path.name not in ("hydra", "logger")
+    )
+)
+# Sizes, whose bounds are another matter than ranges: their magnitudes are left alone.
+SIZES = (
+    *("environments", "episodes", "threads", "hidden", "buffer_size", "batch_size", "jobs"),
+    *("platoons", "recordings", "vehicles", "duration_s", "drivers", "profiles", "horizon"),
+    *("population", "generations", "founders", "tournament", "string", "updates_per_transition"),
+    *("visible", "widths", "seconds", "window", "keep_every", "sample_episodes", "followers"),
+)
+SIZED = ("0", "-1", "nan", "1.5", "abc", "null", "[]", "{}", "2")
+# Files, folders, foreign code and machines are the business of other tests.
+FOREIGN = ("_target_", "path", "policy", "resume", "sweep", "keep", "device", "compiled", "trust")
+VALUES = (
+    *("nan", "inf", "-inf", "-1", "0", "1", "0.5", "-0.0", "1e30", "-1e30", "1e-30", "1e9"),
+    *("2147483647", "99999999999999999999999", "1" + "0" * 400, "true", "false", "null", "''"),
+    *("abc", "größe", "[]", "{}", "[1]", "[1,2,3]", "[nan,1]", "[a,b]", "[[1],[2]]", "{a: 1}"),
+    *("{a: {b: nan}}", "${seed}", "${nowhere}", "${scenario}", "${oc.env:NOBODY}", "???", "'???'"),
+    *("'a b'", "random", "first", "self", "automated", "human", "vehicles", "automated*2"),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is typed, and how far it is taken: ``build``, ``train`` or ``evaluate``."""
+
+    seed: int
+    overrides: tuple[str, ...]
+    goal: str
+
+
+class TooLong(BaseException):
+    """A case took longer than its limit."""
+
+
+@cache
+def keys_of(variant: str) -> dict[str, Any]:
+    """Return the values of a variant's configuration by dotted keys, those of nodes, too."""
+    cfg = OmegaConf.to_container(load("train", [f"variant={variant}"]), resolve=False)
+    unused = ("data", "split") if "leader" in cfg and cfg["leader"] is not None else ()
+    return {
+        key: value
+        for key, value in _keys(cfg)
+        if not {*key.split(".")} & {*FOREIGN} and key.partition(".")[0] not in unused
+    }
+
+
+def _keys(node: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in node.items():
+        key = f"{place}.{name}" if place else str(name)
+        yield key, value
+        if isinstance(value, dict):
+            yield from _keys(value, key)
+
+
+def make(seed: int) -> Case:
+    """Return the case of a seed."""
+    draw = random.Random(seed)
+    variant = draw.choice(VARIANTS)
+    recipe = draw.choice(RECIPES).split() if draw.random() < 0.4 else []
+    goal = draw.choices(("build", "train", "evaluate"), (0.9, 0.05, 0.05))[0]
+    ring = "scenario=ring" in recipe
+    data = DATA if goal != "build" and not ring and "leader" not in keys_of(variant) else ()
+    typed = [_override(draw, variant) for _ in range(draw.randint(1, 3))]
+    return Case(seed, (f"variant={variant}", *SMALL, *data, *recipe, *typed), goal)
+
+
+def _override(draw: random.Random, variant: str) -> str:
+    """Return a random override of a variant's configuration."""
+    known, kind = keys_of(variant), draw.random()
+    if kind < 0.7:
+        return _number(draw, known)
+    key = draw.choice(list(known))
+    if kind < 0.75:
+        group = draw.choice(GROUPS)
+        names = [path.stem for path in (CONF / group).glob("*.yaml")]
+        at = draw.choice(("", "", "", "@scenario.controllers.automated", "@deployed"))
+        return (
+            f"{draw.choice(('', '+', '++'))}{group}{at}={draw.choice([*names, 'nobody', 'null'])}"
+        )
+    if kind < 0.79:
+        place = draw.randrange(len(key))
+        key = key[:place] + draw.choice(("x", ".", "")) + key[place + draw.randint(0, 1) :]
+    elif kind < 0.82:
+        return f"~{key}"
+    elif kind < 0.86:
+        key = f"{key}.{draw.choice(('more', 'weight', 'speed', 'x'))}"
+    sized = set(key.split(".")) & set(SIZES)
+    value = draw.choice(SIZED if sized else VALUES)
+    return f"{draw.choice(('', '', '++') if key in known else ('', '+', '++'))}{key}={value}"
+
+
+def _number(draw: random.Random, known: Mapping[str, Any]) -> str:
+    """Return an override that changes a number, little or far."""
+    numbers = {key: x for key, x in known.items() if isinstance(x, (int, float))}
+    for key in ("vehicle_length", "initial_speed"):  # of a ring
+        del numbers[f"scenario.{key}"]
+    key, value = draw.choice(list(numbers.items()))
+    if isinstance(value, bool):
+        return f"{key}={draw.choice(('true', 'false', '1', 'null'))}"
+    if set(key.split(".")) & set(SIZES):
+        return f"{key}={draw.choice((value,) * 20 + SIZED)}"
+    factor = draw.choice((-1, 0, 1e-9, 1e-3, 0.3, 0.9, 0.95, 1.05, 1.1, 2, 10, 1e4, 1e12))
+    if isinstance(value, int):
+        return f"{key}={round(value * factor)}"
+    return f"{key}={value * factor!r}"
+
+
+def attempt(case: Case) -> str:
+    """Carry out a case; return how it ended, ``works``, ``refused`` or ``refused without words``.
+
+    Raises:
+        Exception: any other than the package's own: what a fuzzer is for.
+    """
+    try:
+        if case.goal == "build":
+            build_study(case.overrides)
+        else:
+            cfg = load("train" if case.goal == "train" else "evaluate", case.overrides)
+            with tempfile.TemporaryDirectory() as folder:
+                command = training if case.goal == "train" else evaluation
+                command.run(cfg, Path(folder) / "run", quiet=True)
+    except LccError as error:
+        return "refused" if str(error).strip() else "refused without words"
+    return "works"
+
+
+def build_study(overrides: Sequence[str]) -> None:
+    """Build the environment, the agent and the inputs of a configuration."""
+    cfg = load("train", overrides)
+    with tempfile.TemporaryDirectory() as folder:
+        check_settings(cfg, Path(folder))
+    scenario = cfg.scenario
+    profiles = constant_profiles(8.0, scenario.horizon, scenario.time_step, ["one", "two"])
+    env = build_env(cfg, profiles, bootstrap(), 2)
+    if learns(cfg):
+        build_agent(cfg, bootstrap())
+    env.rollout(3)
+    for key in ("data", "split", "leader"):
+        if cfg.get(key) is not None:
+            build(cfg[key], key)
+    if cfg.get("leader") is not None:
+        followers = len(string_of_scenario(scenario))
+        build(cfg.leader, "leader").load(scenario.time_step, scenario.horizon, followers)
+
+
+@contextmanager
+def limited() -> Iterator[None]:
+    """Limit the time and the memory of what runs inside, and put back what it changes."""
+
+    def stop(*_: object) -> None:
+        raise TooLong(f"longer than {SECONDS} s")
+
+    handlers = {kind: signal.getsignal(kind) for kind in SIGNALS}
+    before, threads = resource.getrlimit(resource.RLIMIT_DATA), torch.get_num_threads()
+    alarm = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(SECONDS)
+    resource.setrlimit(resource.RLIMIT_DATA, (GIGABYTES << 30, before[1]))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, alarm)
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+        torch.set_num_threads(threads)
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
+
+
+def run(seeds: Iterator[int], deadline: float) -> tuple[Counter[str], list[tuple[Case, str]]]:
+    """Carry out the cases of some seeds until a moment of :func:`time.monotonic`.
+
+    Returns:
+        How many ended how, and those that failed with their traceback.
+    """
+    counts: Counter[str] = Counter()
+    failures = []
+    for seed in seeds:
+        if time.monotonic() > deadline:
+            break
+        case = make(seed)
+        try:
+            with limited():
+                end = attempt(case)
+        except (Exception, TooLong):
+            failures.append((case, traceback.format_exc()))
+            end = "failed"
+        counts[f"{case.goal} {end}"] += 1
+    return counts, failures
+
+
+def main() -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--first", type=int, default=10_000, help="seed of the first case")
+    parser.add_argument("--case", type=int, help="carry out the case of this seed only")
+    arguments = parser.parse_args()
+    first = arguments.first if arguments.case is None else arguments.case
+    last = sys.maxsize if arguments.case is None else first + 1
+    deadline = time.monotonic() + 60.0 * arguments.minutes
+    counts, failures = run(iter(range(first, last)), deadline)
+    for case, text in failures:
+        print(f"--- {case.goal}: {' '.join(case.overrides)}  (--case {case.seed})\n{text}")
+    print(dict(sorted(counts.items())))
+    return int(bool(failures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
