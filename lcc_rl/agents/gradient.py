@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -63,6 +64,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
         state = source.start()
         running = torch.ones(self.env.batch_size[0], 1, 1, device=self.env.device)
         played, losses, spent = [], [], [0.0, 0.0]
+        missed: list[dict[str, float]] = []
         for _ in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             state, record = source.play(state, self.agent.policy.module, self.settings.segment)
@@ -70,12 +72,16 @@ class GradientTrainer(TrainingLoop[Analytic]):
             collected = time.perf_counter()
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)
+            missed.append(self._missed(data, running))
             played.append(data.detach().select(*REPORTED))
             state = {key: value.detach() for key, value in state.items()}
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         self.iteration += 1
         self.updates += len(losses)
+        shares = _mean(missed)
+        prices = {f"price_{name}": self.agent.limits.price(name) for name in shares}
+        self.agent.limits.update(shares)
         episodes = torch.cat(played, dim=1)
         row = {
             "iteration": float(self.iteration),
@@ -84,7 +90,9 @@ class GradientTrainer(TrainingLoop[Analytic]):
             "updates": float(self.updates),
             "learning_rate": rate,
             **episode_statistics(episodes),
-            **{name: sum(float(x[name]) for x in losses) / len(losses) for name in losses[0]},
+            **_mean(losses),
+            **{f"share_{name}": share for name, share in shares.items()},
+            **prices,
         }
         self._record(row, *spent)
         return row
@@ -94,12 +102,34 @@ class GradientTrainer(TrainingLoop[Analytic]):
         crashed = data["next", "terminated"].cumsum(1) > 0
         after = running * ~crashed
         before = torch.cat([running, after[:, :-1]], 1)
-        total = torch.stack([factor * self._score(term, data) for term, factor in self.objective])
+        prices = [factor * self.agent.limits.price(term.name) for term, factor in self.objective]
+        total = torch.stack(
+            [
+                price * self._score(term, data)
+                for price, (term, _) in zip(prices, self.objective, strict=True)
+            ]
+        )
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
         return after, self.agent.update(total.sum(0) * before, after, moments)
+
+    def _missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:
+        """Return the share of a segment's time in which each limit was missed."""
+        shares = {}
+        for name in self.agent.limits.largest:
+            term: Any = self.agent.surrogates[name]
+            with torch.no_grad():
+                entries = term.views(*(data.get(next_key(key)) for _, key in term.sources))
+                missed = term.missed(*entries).squeeze(-1) * running
+            shares[name] = float(missed.double().sum() / running.sum().clamp(min=1))
+        return shares
 
     def _score(self, term: RewardTerm, data: TensorDictBase) -> Tensor:
         """Return a term of the objective at every step of a segment, ``[batch, steps, A]``."""
         entries = [data.get(next_key(key)) for _, key in term.sources]
         return term.compute(*entries).squeeze(-1)
+
+
+def _mean(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the mean of each entry."""
+    return {name: sum(float(row[name]) for row in rows) / len(rows) for name in rows[0]}

@@ -13,21 +13,23 @@ from rich.table import Table
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
-LOST = "total_acceleration_loss_kj"
+LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 BASELINES = ("idm", "reference")
 HUMANS = ("direct", "idm")  # not trained: one value, known exactly
 
 CAR_COLUMNS = (
     *(f"{v}_{kind}" for v in ("cav", "total") for kind in ("energy_kj", "net_energy_kj")),
     LOST,
+    PATH,
     "cav_distance_m",
     "min_ttc_s",
     "share_ttc_unsafe",
     "share_ttc_unpromised",
     "share_time_gap_long",
+    "share_time_gap_long_moving",
     "rms_jerk_mps3",
 )
-SHOWN = CAR_COLUMNS[-4:]  # as means
+SHOWN = CAR_COLUMNS[-5:]  # as means
 HUMAN_COLUMNS = ("hdv_energy_kj", "hdv_net_energy_kj", "hdv_distance_m")
 
 
@@ -86,7 +88,7 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = group[f"{vehicle}_{kind}"].mean()
-        row[LOST] = group[LOST].mean()
+        row |= {name: group[name].mean() for name in (PATH, LOST)}
         kilometres = group[["cav_distance_m", "hdv_distance_m"]].sum().sum() / 1e3
         energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
         row["kj_per_km"] = energy.sum() / kilometres
@@ -118,6 +120,7 @@ ROWS = (
     ("HDV energy [kJ]", "hdv_energy_kj", "{:.1f}"),
     ("total energy [kJ]", "total_energy_kj", "{:.1f}"),
     ("  net of kinetic energy [kJ]", "total_net_energy_kj", "{:.1f}"),
+    ("  path energy [kJ]", PATH, "{:.1f}"),
     ("  of it lost to accelerating [kJ]", LOST, "{:.1f}"),
     ("  per vehicle-kilometre [kJ/km]", "kj_per_km", "{:.0f}"),
     ("saving against idm", "saving_vs_idm", "{:+.1%}"),
@@ -131,6 +134,7 @@ ROWS = (
     ("time with TTC < 4 s", "share_ttc_unsafe", "{:.2%}"),
     ("  of it outside the filter's promise", "share_ttc_unpromised", "{:.2%}"),
     ("time with time gap > 2.5 s", "share_time_gap_long", "{:.2%}"),
+    ("  above 1 m/s", "share_time_gap_long_moving", "{:.2%}"),
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("episodes", "episodes", "{:d}"),
 )
