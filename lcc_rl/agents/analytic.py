@@ -17,13 +17,12 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from lcc_rl.agents.limits import Limits
 from lcc_rl.agents.loop import anneal, check_fraction
-from lcc_rl.config import build, require
+from lcc_rl.agents.objective import Objective
+from lcc_rl.config import require
 from lcc_rl.errors import require_positive
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.observation import Observation
-from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.policies.actor import seeded_mlp
 from lcc_rl.policies.rules import make_policy
 
@@ -125,10 +124,15 @@ class Analytic:
     ) -> None:
         self.settings = own = AnalyticSettings() if settings is None else settings
         self.device = device
-        given = {"time_step": time_step, "string": string}
-        self.surrogates = _terms("surrogates", own.surrogates, device, **given)
-        self.regularizers = _terms("regularizers", own.regularizers, device, **given)
-        self.limits = Limits(own.limits, own.limit_rate, self.surrogates)
+        self.objective = Objective(
+            own.surrogates,
+            own.regularizers,
+            own.limits,
+            own.limit_rate,
+            device,
+            time_step=time_step,
+            string=string,
+        )
         size = observation.event_shape[-1]
         self.policy: TensorDictModule = make_policy(
             own.policy, observation, own.hidden, seed, own.constants, max_acceleration
@@ -141,20 +145,6 @@ class Analytic:
             betas=(0.9, 0.99),
         )
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=own.value_lr)
-
-    def objective(self, terms: Sequence[RewardTerm]) -> list[tuple[RewardTerm, float]]:
-        """Return what is maximised in place of the reward's terms, and each one's factor.
-
-        A surrogate with a limit belongs to it whether the reward has such a term or not.
-        """
-        own = self.surrogates
-        chosen = [
-            (own[term.name], term.weight) if term.name in own else (term, 1.0)
-            for term in terms
-            if term.name not in self.limits.largest
-        ]
-        chosen += [(own[name], 1.0) for name in self.limits.largest]
-        return chosen + [(term, 1.0) for term in self.regularizers.values()]
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""
@@ -222,17 +212,8 @@ class Analytic:
             part.load_state_dict(state[name])
 
     def _parts(self) -> dict[str, Any]:
-        own = {"policy": self.policy, "optimizer": self.optimizer, "limits": self.limits}
+        own = {"policy": self.policy, "optimizer": self.optimizer, "limits": self.objective.limits}
         if self.settings.bootstrap:
             learned = (self.value, self.target, self.value_optimizer)
             own |= dict(zip(("value", "target", "value_optimizer"), learned, strict=True))
         return own
-
-
-def _terms(
-    where: str, nodes: Mapping[str, Any], device: str, **resources: Any
-) -> dict[str, RewardTerm]:
-    return {
-        name: build(node, f"agent.{where}.{name}", name=name, **resources).to(device)
-        for name, node in nodes.items()
-    }

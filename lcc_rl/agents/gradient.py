@@ -35,7 +35,8 @@ class GradientTrainer(TrainingLoop[Analytic]):
 
     def _prepare(self) -> None:
         self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
-        self.objective = self.agent.objective(self.terms)
+        self.objective = self.agent.objective
+        self.objective.replace(self.terms)
         if not self.agent.settings.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
@@ -52,7 +53,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
         return DifferentiableRollout(
             self.env,
-            wanted=[key for term, _ in self.objective for _, key in term.sources],
+            wanted=self.objective.wanted(),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=compiled,
         )
@@ -72,7 +73,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
             collected = time.perf_counter()
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)
-            missed.append(self._missed(data, running))
+            missed.append(self.objective.missed(data, running))
             played.append(data.detach().select(*REPORTED))
             state = {key: value.detach() for key, value in state.items()}
             spent[0] += collected - begun
@@ -80,8 +81,9 @@ class GradientTrainer(TrainingLoop[Analytic]):
         self.iteration += 1
         self.updates += len(losses)
         shares = _mean(missed)
-        prices = {f"price_{name}": self.agent.limits.price(name) for name in shares}
-        self.agent.limits.update(shares)
+        limits = self.objective.limits
+        prices = {f"price_{name}": limits.price(name) for name in shares}
+        limits.update(shares)
         episodes = torch.cat(played, dim=1)
         row = {
             "iteration": float(self.iteration),
@@ -102,32 +104,9 @@ class GradientTrainer(TrainingLoop[Analytic]):
         crashed = data["next", "terminated"].cumsum(1) > 0
         after = running * ~crashed
         before = torch.cat([running, after[:, :-1]], 1)
-        prices = [factor * self.agent.limits.price(term.name) for term, factor in self.objective]
-        total = torch.stack(
-            [
-                price * self._score(term, data)
-                for price, (term, _) in zip(prices, self.objective, strict=True)
-            ]
-        )
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
-        return after, self.agent.update(total.sum(0) * before, after, moments)
-
-    def _missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:
-        """Return the share of a segment's time in which each limit was missed."""
-        shares = {}
-        for name in self.agent.limits.largest:
-            term: Any = self.agent.surrogates[name]
-            with torch.no_grad():
-                entries = term.views(*(data.get(next_key(key)) for _, key in term.sources))
-                missed = term.missed(*entries).squeeze(-1) * running
-            shares[name] = float(missed.double().sum() / running.sum().clamp(min=1))
-        return shares
-
-    def _score(self, term: RewardTerm, data: TensorDictBase) -> Tensor:
-        """Return a term of the objective at every step of a segment, ``[batch, steps, A]``."""
-        entries = [data.get(next_key(key)) for _, key in term.sources]
-        return term.compute(*entries).squeeze(-1)
+        return after, self.agent.update(self.objective.score(data) * before, after, moments)
 
 
 def _mean(rows: list[dict[str, Any]]) -> dict[str, float]:

@@ -26,7 +26,13 @@ from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
-SUMMED = ("energy_kj", "net_energy_kj", "steady_energy_kj", "acceleration_loss_kj", "path_energy_kj")
+SUMMED = (
+    "energy_kj",
+    "net_energy_kj",
+    "steady_energy_kj",
+    "acceleration_loss_kj",
+    "path_energy_kj",
+)
 # What a step of a sample episode says of its episode.
 SAMPLED = (
     "strategy",

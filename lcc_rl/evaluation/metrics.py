@@ -60,8 +60,8 @@ def safety_measures(
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
-            each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first; behind a safety filter, for which steps it answers,
-            ``promised``.
+            each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first one;
+            behind a safety filter, for which steps it answers, ``promised``.
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 

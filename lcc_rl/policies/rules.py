@@ -124,9 +124,7 @@ class Residual(nn.Module):
         seed: seed of its initial weights.
     """
 
-    def __init__(
-        self, rule: Rule, observation_size: int, hidden: Sequence[int], seed: int
-    ) -> None:
+    def __init__(self, rule: Rule, observation_size: int, hidden: Sequence[int], seed: int) -> None:
         super().__init__()
         self.rule = rule.requires_grad_(False)
         self.network = seeded_mlp(observation_size, 1, hidden, seed)

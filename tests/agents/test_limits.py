@@ -10,7 +10,7 @@ from test_analytic import make
 from lcc_rl.agents.limits import Limits
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import acceleration_loss, steady_power
-from lcc_rl.pieces import PathEnergy, SmoothEfficiency, SmoothSafety, Smoothness
+from lcc_rl.pieces import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
 
 KNOWN = {"safety": SmoothSafety(), "efficiency": SmoothEfficiency(), "smoothness": Smoothness()}
 
@@ -52,7 +52,7 @@ def test_what_is_no_limit_is_refused(largest, words) -> None:
 
 def test_a_limit_that_is_null_is_a_fixed_price() -> None:
     agent = make_agent(compose("alcc", "agent=analytic", "agent.limits.safety=null"))
-    assert set(agent.limits.largest) == {"efficiency"}
+    assert set(agent.objective.limits.largest) == {"efficiency"}
 
 
 def test_where_a_limit_is_missed() -> None:
@@ -90,7 +90,9 @@ def test_path_energy_is_a2_without_what_the_motion_stores() -> None:
     assert (term.reward(speed, -3.0 * acceleration) < 0.0).all()
 
 
-@pytest.mark.parametrize(("settings", "words"), [({"of": "all"}, "of must be"), ({"scale": 0.0}, "scale")])
+@pytest.mark.parametrize(
+    ("settings", "words"), [({"of": "all"}, "of must be"), ({"scale": 0.0}, "scale")]
+)
 def test_settings_of_path_energy(settings, words) -> None:
     with pytest.raises(ConfigError, match=words):
         PathEnergy(0.1, **settings)
