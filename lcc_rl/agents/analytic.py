@@ -18,11 +18,13 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.agents.loop import anneal, check_fraction
-from lcc_rl.config import build, require
+from lcc_rl.agents.objective import Objective
+from lcc_rl.config import require
 from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.pieces.rewards import RewardTerm
-from lcc_rl.policies.actor import make_actor, seeded_mlp
+from lcc_rl.pieces.observation import Observation
+from lcc_rl.policies.actor import seeded_mlp
+from lcc_rl.policies.rules import make_policy
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,9 @@ class AnalyticSettings:
     """Settings of the analytic agent; conf/agent holds their values.
 
     Args:
+        policy: what learns: ``"network"``, a rule with learned constants (``"idm"``, ``"acc"``), or
+            a network on top of a rule (``"residual_idm"``, ``"residual_acc"``).
+        constants: constants of a rule at the start; those left out have its own values.
         hidden: sizes of the ReLU layers of policy and value network.
         learning_rate: of the policy at the start; it falls along half a cosine.
         final_lr_fraction: of it that is left at the end.
@@ -39,6 +44,9 @@ class AnalyticSettings:
         surrogates: nodes of reward terms that take the place of those of the same name in the
             objective; their weights multiply the terms' own. Those of terms that the reward
             lacks are ignored.
+        limits: largest share of the time in which a surrogate's limit may be missed, by its name;
+            its weight is then the price at the start, see :class:`lcc_rl.agents.limits.Limits`.
+        limit_rate: largest change of the logarithm of such a price per batch of episodes.
         regularizers: nodes of reward terms that belong to the objective only.
         bootstrap: learn a value and add it at the end of every segment; without it the segment is
             all that counts, and should be the whole episode.
@@ -52,12 +60,16 @@ class AnalyticSettings:
         ConfigError: if a setting is out of range or contradicts another.
     """
 
+    policy: str = "network"
+    constants: Mapping[str, float] | None = None
     hidden: Sequence[int] = (200, 100, 50)
     learning_rate: float = 3e-3
     final_lr_fraction: float = 0.05
     clip_norm: float = 1.0
     gamma: float = 0.998
     surrogates: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, float | None] = field(default_factory=dict)
+    limit_rate: float = 0.05
     regularizers: Mapping[str, Any] = field(default_factory=dict)
     bootstrap: bool = True
     value_lr: float = 1e-3
@@ -82,10 +94,10 @@ class Analytic:
     """A policy, its optimizer, the objective's stand-ins and, where asked for, a value.
 
     Args:
-        observation_size: entries of the observation.
-        action_size: entries of the action.
+        observation: what the policy sees.
         seed: seed of the initial weights.
         time_step: duration of a step [s], for terms of the objective that need it.
+        max_acceleration: acceleration of action 1 [m/s²], for rules.
         string: the string of vehicles, for terms of the objective.
         settings: see :class:`AnalyticSettings`; None for its defaults.
         device: where the networks live.
@@ -98,36 +110,37 @@ class Analytic:
 
     def __init__(
         self,
-        observation_size: int,
-        action_size: int,
+        observation: Observation,
         seed: int,
         time_step: float,
+        max_acceleration: float = 3.0,
         string: VehicleString | None = None,
         settings: AnalyticSettings | None = None,
         device: str = "cpu",
     ) -> None:
         self.settings = own = AnalyticSettings() if settings is None else settings
         self.device = device
-        given = {"time_step": time_step, "string": string}
-        self.surrogates = _terms("surrogates", own.surrogates, device, **given)
-        self.regularizers = _terms("regularizers", own.regularizers, device, **given)
-        self.policy: TensorDictModule = make_actor(
-            observation_size, action_size, own.hidden, seed
+        self.objective = Objective(
+            own.surrogates,
+            own.regularizers,
+            own.limits,
+            own.limit_rate,
+            device,
+            time_step=time_step,
+            string=string,
+        )
+        size = observation.event_shape[-1]
+        self.policy: TensorDictModule = make_policy(
+            own.policy, observation, own.hidden, seed, own.constants, max_acceleration
         ).to(device)
-        self.value = seeded_mlp(observation_size, 1, own.hidden, seed + 1).to(device)
-        self.target = seeded_mlp(observation_size, 1, own.hidden, seed + 1).to(device)
+        self.value = seeded_mlp(size, 1, own.hidden, seed + 1).to(device)
+        self.target = seeded_mlp(size, 1, own.hidden, seed + 1).to(device)
         self.optimizer = torch.optim.Adam(
-            self.policy.parameters(), lr=own.learning_rate, betas=(0.9, 0.99)
+            [entry for entry in self.policy.parameters() if entry.requires_grad],
+            lr=own.learning_rate,
+            betas=(0.9, 0.99),
         )
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=own.value_lr)
-
-    def objective(self, terms: Sequence[RewardTerm]) -> list[tuple[RewardTerm, float]]:
-        """Return what is maximised in place of the reward's terms, and each one's factor."""
-        own = self.surrogates
-        chosen = [
-            (own[term.name], term.weight) if term.name in own else (term, 1.0) for term in terms
-        ]
-        return chosen + [(term, 1.0) for term in self.regularizers.values()]
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""
@@ -195,17 +208,8 @@ class Analytic:
             part.load_state_dict(state[name])
 
     def _parts(self) -> dict[str, Any]:
-        own = {"policy": self.policy, "optimizer": self.optimizer}
+        own = {"policy": self.policy, "optimizer": self.optimizer, "limits": self.objective.limits}
         if self.settings.bootstrap:
             learned = (self.value, self.target, self.value_optimizer)
             own |= dict(zip(("value", "target", "value_optimizer"), learned, strict=True))
         return own
-
-
-def _terms(
-    where: str, nodes: Mapping[str, Any], device: str, **resources: Any
-) -> dict[str, RewardTerm]:
-    return {
-        name: build(node, f"agent.{where}.{name}", name=name, **resources).to(device)
-        for name, node in nodes.items()
-    }

@@ -49,6 +49,8 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         cfg.agent,
         "agent",
         population=population,
+        observation=observation,
+        max_acceleration=cfg.scenario.controllers.automated.get("max_acceleration", 3.0),
         observation_size=observation.event_shape[-1],
         action_size=1,
         seed=cfg.seed,

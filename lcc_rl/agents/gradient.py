@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,8 +16,6 @@ from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_sta
 from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import Diverged
-from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import State, next_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
 
@@ -38,7 +37,8 @@ class GradientTrainer(TrainingLoop[Analytic]):
 
     def _prepare(self) -> None:
         self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
-        self.objective = self.agent.objective(self.terms)
+        self.objective = self.agent.objective
+        self.objective.replace(self.terms)
         if not self.agent.settings.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
@@ -58,7 +58,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
     def _rollout(self, compiled: bool) -> DifferentiableRollout:
         return DifferentiableRollout(
             self.env,
-            wanted=[key for term, _ in self.objective for _, key in term.sources],
+            wanted=self.objective.wanted(),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=compiled,
         )
@@ -92,8 +92,8 @@ class GradientTrainer(TrainingLoop[Analytic]):
             state, record = source.play(source.start(), self.agent.policy.module, steps)
             data = source.assemble(record)
             # Kept until all are counted: what is freed would give its place to another.
-            total = [self._score(term, data) for term, _ in self.objective]
-        assert total
+            total = self.objective.score(data)
+        assert total.requires_grad
         return sum(held.values()), data.detach(), state
 
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
@@ -103,6 +103,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
         state = source.start()
         running = torch.ones(self.env.batch_size[0], 1, 1, device=self.env.device)
         played, losses, spent = [], [], [0.0, 0.0]
+        missed: list[dict[str, float]] = []
         for _ in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             state, record = source.play(state, self.agent.policy.module, self.settings.segment)
@@ -111,12 +112,17 @@ class GradientTrainer(TrainingLoop[Analytic]):
             collected = time.perf_counter()
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)
+            missed.append(self.objective.missed(data, running))
             played.append(data.detach().select(*REPORTED))
             state = {key: value.detach() for key, value in state.items()}
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         self.iteration += 1
         self.updates += len(losses)
+        shares = _mean(missed)
+        limits = self.objective.limits
+        prices = {f"price_{name}": limits.price(name) for name in shares}
+        limits.update(shares)
         episodes = torch.cat(played, dim=1)
         row = {
             "iteration": float(self.iteration),
@@ -125,7 +131,9 @@ class GradientTrainer(TrainingLoop[Analytic]):
             "updates": float(self.updates),
             "learning_rate": rate,
             **episode_statistics(episodes),
-            **{name: sum(float(x[name]) for x in losses) / len(losses) for name in losses[0]},
+            **_mean(losses),
+            **{f"share_{name}": share for name, share in shares.items()},
+            **prices,
         }
         self._record(row, *spent)
         return row
@@ -135,16 +143,11 @@ class GradientTrainer(TrainingLoop[Analytic]):
         crashed = data["next", "terminated"].cumsum(1) > 0
         after = running * ~crashed
         before = torch.cat([running, after[:, :-1]], 1)
-        scores = [factor * self._score(term, data) for term, factor in self.objective]
-        for (term, _), score in zip(self.objective, scores, strict=True):
-            if any_lost([score]):
-                raise Diverged(f"the objective's term {term.name} ({type(term).__name__}) is nan")
-        total = torch.stack(scores)
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
-        return after, self.agent.update(total.sum(0) * before, after, moments)
+        return after, self.agent.update(self.objective.score(data) * before, after, moments)
 
-    def _score(self, term: RewardTerm, data: TensorDictBase) -> Tensor:
-        """Return a term of the objective at every step of a segment, ``[batch, steps, A]``."""
-        entries = [data.get(next_key(key)) for _, key in term.sources]
-        return term.compute(*entries).squeeze(-1)
+
+def _mean(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the mean of each entry."""
+    return {name: sum(float(row[name]) for row in rows) / len(rows) for name in rows[0]}

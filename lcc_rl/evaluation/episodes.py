@@ -29,7 +29,13 @@ from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.tables import FASTER
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
-SUMMED = ("energy_kj", "net_energy_kj", "steady_energy_kj", "acceleration_loss_kj")
+SUMMED = (
+    "energy_kj",
+    "net_energy_kj",
+    "steady_energy_kj",
+    "acceleration_loss_kj",
+    "path_energy_kj",
+)
 # What a step of a sample episode says of its episode.
 SAMPLED = (
     "strategy",

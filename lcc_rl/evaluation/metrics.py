@@ -13,6 +13,7 @@ from lcc_rl.functional.safety import NEVER
 KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
 LONG_TIME_GAP = 2.5  # [s] (A13)
+PACE = 1.0  # below it a long time gap is a matter of metres [m/s]
 
 
 def energy_measures(
@@ -30,23 +31,25 @@ def energy_measures(
         ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
         that it did not draw), what the speeds driven take without accelerating
         (``steady_energy_kj``), what accelerating loses (``acceleration_loss_kj``, see
-        :func:`lcc_rl.functional.power.acceleration_loss`) and ``distance_m``, each
+        :func:`lcc_rl.functional.power.acceleration_loss`), both together
+        (``path_energy_kj``: A2 without what the motion stores) and ``distance_m``, each
         ``[*batch, n, 1]``.
     """
 
     def total(rate: Tensor) -> Tensor:
         return (rate * alive).sum(0) * time_step
 
-    energy = total(power) * KILO
+    energy, steady = total(power) * KILO, total(steady_power(speed[:-1])) * KILO
     steps = alive.sum(0, keepdim=True).long().expand(1, *speed.shape[1:])
     last = speed.gather(0, steps).squeeze(0)
     stored = (kinetic_energy(last) - kinetic_energy(speed[0])) * KILO
-    acceleration = speed.diff(dim=0) / time_step
+    lost = total(acceleration_loss(speed[:-1], speed.diff(dim=0) / time_step)) * KILO
     return {
         "energy_kj": energy,
         "net_energy_kj": energy - stored,
-        "steady_energy_kj": total(steady_power(speed[:-1])) * KILO,
-        "acceleration_loss_kj": total(acceleration_loss(speed[:-1], acceleration)) * KILO,
+        "steady_energy_kj": steady,
+        "acceleration_loss_kj": lost,
+        "path_energy_kj": steady + lost,
         "distance_m": total(0.5 * (speed[:-1] + speed[1:])),
     }
 
@@ -63,8 +66,8 @@ def safety_measures(
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
-            each ``[time, *batch, A, 1]``; behind a safety filter, for which steps it answers,
-            ``promised``.
+            each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first one;
+            behind a safety filter, for which steps it answers, ``promised``.
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
@@ -84,13 +87,14 @@ def safety_measures(
     def highest(entry: Tensor) -> Tensor:
         return torch.where(alive, entry, -torch.inf).amax(0).amax(-2)
 
-    unsafe = series["ttc"] < UNSAFE_TTC
+    unsafe, long = series["ttc"] < UNSAFE_TTC, series["time_gap"] > LONG_TIME_GAP
     found = {
         "min_gap_m": lowest(series["gap"]),
         "min_ttc_s": measured_ttc(lowest(series["ttc"])),
         "max_time_gap_s": highest(series["time_gap"]),
         "share_ttc_unsafe": average(unsafe),
-        "share_time_gap_long": average(series["time_gap"] > LONG_TIME_GAP),
+        "share_time_gap_long": average(long),
+        "share_time_gap_long_moving": average(long & (series["speed"][1:] > PACE)),
         "rms_jerk_mps3": average(series["jerk"] ** 2).sqrt(),
         "duration_s": alive.sum(0).squeeze(-2) * time_step,
     }

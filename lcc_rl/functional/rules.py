@@ -46,3 +46,36 @@ def follower_stopper_speed(
     commanded = torch.where(gap < far, freeing, desired_speed)
     commanded = torch.where(gap < middle, rising, commanded)
     return torch.where(gap < near, torch.zeros_like(commanded), commanded)
+
+
+def linear_acc(
+    speed: Tensor,
+    gap: Tensor,
+    relative_speed: Tensor,
+    desired_speed: Tensor | float,
+    time_gap: Tensor | float,
+    min_gap: Tensor | float,
+    gap_gain: Tensor | float,
+    speed_gain: Tensor | float,
+) -> Tensor:
+    """Return the acceleration of linear adaptive cruise control (constant time gap policy).
+
+    k_d (gap − s0 − T v) + k_v (v_ahead − v), or k_v (v_d − v) where that is less: the usual form,
+    e.g. Milanés and Shladover, "Modeling cooperative and autonomous adaptive cruise control
+    dynamic responses using experimental data", Transportation Research C 48 (2014).
+
+    Args:
+        speed: own speed v [m/s].
+        gap: bumper-to-bumper gap [m].
+        relative_speed: v_ahead − v [m/s].
+        desired_speed: v_d [m/s].
+        time_gap: T [s].
+        min_gap: gap s0 at standstill [m].
+        gap_gain: k_d [1/s²].
+        speed_gain: k_v [1/s].
+
+    Returns:
+        Acceleration [m/s²], of the arguments' shape.
+    """
+    following = gap_gain * (gap - min_gap - time_gap * speed) + speed_gain * relative_speed
+    return torch.minimum(following, speed_gain * (desired_speed - speed))

@@ -24,7 +24,7 @@ from lcc_rl.pieces.rewards import (
 from lcc_rl.pieces.rules import FollowerStopper, Handover
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
-from lcc_rl.pieces.surrogates import SmoothEfficiency, Smoothness, SmoothSafety
+from lcc_rl.pieces.surrogates import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
 from lcc_rl.pieces.termination import Collision
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "NGSIMLeader",
     "Observation",
     "ObservationMemory",
+    "PathEnergy",
     "Piece",
     "Places",
     "RewardPiece",

@@ -79,9 +79,26 @@ class Observation(Feature):
             [(AUTOMATED, OBSERVATION)],
             (string.count(AUTOMATED), len(values)),
         )
+        firsts = [sum(counts[:place]) for place in range(len(counts))]
+        # Of entries seen as they are: the (first) column of each.
+        self.layout = {
+            ".".join(key): first
+            for key, first, base in zip(seen, firsts, bases, strict=True)
+            if not base
+        }
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
         self.register_buffer("constants", torch.tensor(values))
+
+    def column(self, name: str) -> int:
+        """Return the column of an entry, e.g. ``"self.gap"``.
+
+        Raises:
+            ConfigError: if it is not observed, or as a difference only.
+        """
+        if name not in self.layout:
+            raise ConfigError(f"a rule needs {name}, which observation.scales does not name")
+        return self.layout[name]
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the scaled observation, ``[*batch, A, entries]``."""

@@ -2,7 +2,8 @@
 
 The literal terms have no slope where it matters: an indicator has none at all, a penalty that
 begins at a threshold has none before it. Each stand-in takes a ``threshold`` of its own, to be
-set a little on the safe side of the term's, and a ``width`` over which it bends.
+set a little on the safe side of the term's, and a ``width`` over which it bends. Where a limit is
+to be kept and not a price to be paid, ``missed`` says where it is not.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import math
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lcc_rl.errors import require_in, require_positive
+from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces.rewards import RewardTerm
+from lcc_rl.pieces.sections import Sections
+from lcc_rl.pieces.views import VEHICLES
 
 
 def excess(value: Tensor, width: float) -> Tensor:
@@ -40,6 +44,7 @@ class SmoothSafety(RewardTerm):
         margin: gap that counts as contact [m].
         gap_width: range of gaps over which contact bends [m].
         rate_width: range of approach rates over which closing begins [m/s].
+        limit: time-to-collision below which the limit is missed [s].
 
     Raises:
         ConfigError: if a threshold or width is not positive or the margin negative.
@@ -56,6 +61,7 @@ class SmoothSafety(RewardTerm):
         margin: float = 1.0,
         gap_width: float = 0.2,
         rate_width: float = 0.1,
+        limit: float = 4.0,
         string: VehicleString | None = None,
     ) -> None:
         require_positive(
@@ -64,17 +70,22 @@ class SmoothSafety(RewardTerm):
             width=width,
             gap_width=gap_width,
             rate_width=rate_width,
+            limit=limit,
         )
         require_in(f"agent.surrogates.{name}", "[0, inf)", margin=margin)
         super().__init__(name, weight, string=string)
         self.log_threshold, self.width, self.margin = math.log(threshold), width, margin
-        self.gap_width, self.rate_width = gap_width, rate_width
+        self.gap_width, self.rate_width, self.limit = gap_width, rate_width, limit
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the unweighted term."""
         room = _log_softplus((gap - self.margin) / self.gap_width) + math.log(self.gap_width)
         rate = _log_softplus(-relative_speed / self.rate_width) + math.log(self.rate_width)
         return -excess(self.log_threshold + rate - room, self.width)
+
+    def missed(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
+        """Return where the limit is missed, ``[*batch, A, 1]``."""
+        return gap < -self.limit * relative_speed
 
 
 class SmoothEfficiency(RewardTerm):
@@ -85,6 +96,7 @@ class SmoothEfficiency(RewardTerm):
         threshold: time gap that is too long [s].
         width: range over which the logarithm bends.
         speed_floor: speeds below this count as this [m/s].
+        limit: time gap above which the limit is missed, by vehicles faster than the floor [s].
 
     Raises:
         ConfigError: if a setting is not positive.
@@ -99,19 +111,29 @@ class SmoothEfficiency(RewardTerm):
         threshold: float = 2.3,
         width: float = 0.05,
         speed_floor: float = 1.0,
+        limit: float = 2.5,
         string: VehicleString | None = None,
     ) -> None:
         require_positive(
-            f"agent.surrogates.{name}", threshold=threshold, width=width, speed_floor=speed_floor
+            f"agent.surrogates.{name}",
+            threshold=threshold,
+            width=width,
+            speed_floor=speed_floor,
+            limit=limit,
         )
         super().__init__(name, weight, string=string)
-        self.threshold, self.width, self.speed_floor = threshold, width, speed_floor
+        self.threshold, self.width = threshold, width
+        self.speed_floor, self.limit = speed_floor, limit
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the unweighted term."""
         longest = self.threshold * speed.clamp(min=self.speed_floor)
         # Behind contact nothing is too long.
         return -excess((gap / longest).clamp(min=1e-3).log(), self.width)
+
+    def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
+        """Return where the limit is missed, ``[*batch, A, 1]``."""
+        return (gap > self.limit * speed) & (speed > self.speed_floor)
 
 
 class Smoothness(RewardTerm):
@@ -137,6 +159,51 @@ class Smoothness(RewardTerm):
     def reward(self, jerk: Tensor) -> Tensor:
         """Return the unweighted term."""
         return -jerk.square()
+
+
+class PathEnergy(RewardTerm):
+    """−P/scale · T of the energy that a path takes: A2 without what the motion stores.
+
+    Of A2's three parts (:func:`lcc_rl.functional.power.acceleration_loss`) the steady power of the
+    speeds driven and what accelerating loses; who ends slower than he began gains nothing by it.
+
+    Args:
+        time_step: duration of a step [s].
+        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
+        scale: power that costs 1 per second [W].
+        of: ``"self"``, or ``"behind"``: all vehicles behind, back to the next automated one.
+
+    Raises:
+        ConfigError: if the scale is not positive, or ``of`` is unknown.
+    """
+
+    def __init__(
+        self,
+        time_step: float,
+        name: str = "energy",
+        weight: float = 1.0,
+        scale: float = 20000.0,
+        of: str = "self",
+        string: VehicleString | None = None,
+    ) -> None:
+        require_positive(f"agent.surrogates.{name}", scale=scale)
+        if of not in ("self", "behind"):
+            raise ConfigError(f"agent.surrogates.{name}.of must be self or behind, got {of!r}")
+        string = VehicleString() if string is None else string
+        self.sections, self.behind = Sections(string, VEHICLES), of == "behind"
+        space = VEHICLES if self.behind else "self"
+        reads = [f"{space}.speed", f"{space}.acceleration"]
+        reads += [".".join(key) for key in self.sections.keys if self.behind]
+        super().__init__(name, weight, reads, string)
+        self.time_step, self.factor = time_step, time_step / scale
+
+    def reward(self, speed: Tensor, acceleration: Tensor, *indices: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        before = speed - acceleration * self.time_step
+        power = steady_power(before) + acceleration_loss(before, acceleration)
+        if self.behind:
+            power = self.sections.sum(power, *indices)
+        return power * -self.factor
 
 
 def _log_softplus(value: Tensor) -> Tensor:

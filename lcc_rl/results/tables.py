@@ -13,7 +13,7 @@ from rich.table import Table
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
-LOST = "total_acceleration_loss_kj"
+LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 BASELINES = ("idm", "reference")
 HUMANS = ("direct", "idm")  # not trained: one value, known exactly
 FASTER = "share_leader_faster"
@@ -22,11 +22,13 @@ MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02,
 CAR_COLUMNS = (
     *(f"{v}_{kind}" for v in ("cav", "total") for kind in ("energy_kj", "net_energy_kj")),
     LOST,
+    PATH,
     "cav_distance_m",
     "min_ttc_s",
     "share_ttc_unsafe",
     "share_ttc_unpromised",
     "share_time_gap_long",
+    "share_time_gap_long_moving",
     "rms_jerk_mps3",
     FASTER,
 )
@@ -89,7 +91,7 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = group[f"{vehicle}_{kind}"].mean()
-        row[LOST] = group[LOST].mean()
+        row |= {name: group[name].mean() for name in (PATH, LOST)}
         kilometres = group[["cav_distance_m", "hdv_distance_m"]].sum().sum() / 1e3
         energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
         row["kj_per_km"] = energy.sum() / kilometres
@@ -121,6 +123,7 @@ ROWS = (
     ("HDV energy [kJ]", "hdv_energy_kj", "{:.1f}"),
     ("total energy [kJ]", "total_energy_kj", "{:.1f}"),
     ("  net of kinetic energy [kJ]", "total_net_energy_kj", "{:.1f}"),
+    ("  path energy [kJ]", PATH, "{:.1f}"),
     ("  of it lost to accelerating [kJ]", LOST, "{:.1f}"),
     ("  per vehicle-kilometre [kJ/km]", "kj_per_km", "{:.0f}"),
     ("saving against idm", "saving_vs_idm", "{:+.1%}"),
@@ -134,6 +137,7 @@ ROWS = (
     ("time with TTC < 4 s", "share_ttc_unsafe", "{:.2%}"),
     ("  of it outside the filter's promise", "share_ttc_unpromised", "{:.2%}"),
     ("time with time gap > 2.5 s", "share_time_gap_long", "{:.2%}"),
+    ("  above 1 m/s", "share_time_gap_long_moving", "{:.2%}"),
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
     ("episodes", "episodes", "{:d}"),

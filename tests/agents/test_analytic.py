@@ -91,7 +91,7 @@ def test_the_record_is_that_of_the_literal_reward(tmp_path) -> None:
 
 
 def test_a_removed_term_is_not_optimised(tmp_path) -> None:
-    names = {term.name for term, _ in make(tmp_path).objective}
+    names = {term.name for term, _ in make(tmp_path).objective.terms}
     assert names == {
         "safety",
         "efficiency",
@@ -101,7 +101,7 @@ def test_a_removed_term_is_not_optimised(tmp_path) -> None:
         "smoothness",
     }
     trainer = make(tmp_path, "~reward.terms.efficiency", "reward.terms.safety.weight=3")
-    factors = {term.name: factor for term, factor in trainer.objective}
+    factors = {term.name: factor for term, factor in trainer.objective.terms}
     assert "efficiency" not in factors
     assert factors["safety"] == 3.0
 

@@ -34,6 +34,8 @@ def test_safety() -> None:
         "jerk": torch.tensor([[3.0, 2.0], [4.0, 50.0]]),
     }
     series = {name: value.view(2, 2, 1, 1) for name, value in series.items()}
+    # Before the first step, and after each: the long time gap is one of a crawling vehicle.
+    series["speed"] = torch.tensor([[9.0, 9.0], [0.5, 9.0], [9.0, 9.0]]).view(3, 2, 1, 1)
     measures = safety_measures(series, ALIVE.view(2, 2, 1, 1), 0.1)
     expected = {
         "min_gap_m": [7.0, 3.0],
@@ -41,6 +43,7 @@ def test_safety() -> None:
         "max_time_gap_s": [2.6, 1.0],
         "share_ttc_unsafe": [0.5, 0.0],
         "share_time_gap_long": [0.5, 0.0],
+        "share_time_gap_long_moving": [0.0, 0.0],
         "rms_jerk_mps3": [12.5**0.5, 2.0],  # √((9 + 16)/2)
         "duration_s": [0.2, 0.1],
     }
@@ -65,6 +68,7 @@ def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> 
         "jerk": torch.tensor([[3.0, 0.0], [4.0, 0.0]]),
     }
     series = {name: value.view(2, 1, 2, 1) for name, value in series.items()}
+    series["speed"] = torch.full((3, 1, 2, 1), 9.0)
     measures = safety_measures(series, torch.ones(2, 1, 1, 1, dtype=torch.bool), 0.1)
     found = {name: float(value) for name, value in measures.items()}
     assert found["min_gap_m"] == 3.0
@@ -73,3 +77,4 @@ def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> 
     # Unsafe in half of the time each; too long in half of one's time.
     assert found["share_ttc_unsafe"] == pytest.approx(0.5)
     assert found["share_time_gap_long"] == pytest.approx(0.25)
+    assert found["share_time_gap_long_moving"] == pytest.approx(0.25)

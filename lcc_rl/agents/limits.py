@@ -1,0 +1,73 @@
+"""Limits of a training: their prices are learned until they are kept, no dearer than needed.
+
+A limit is a share of the time that must not be exceeded. Its smooth stand-in, which has a gradient,
+is priced by a multiplier; the multiplier follows the share that is really missed (a proxy
+Lagrangian: Cotter, Jiang and Sridharan, "Two-player games for efficient non-convex constrained
+optimization", ALT 2019). Where something else keeps the limit, such as a safety filter, its price
+falls towards nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError, require_in, require_positive
+
+LEAST = 1e-3  # a limit of zero is approached as if it were this share
+
+
+class Limits:
+    """The multipliers of all limits.
+
+    Args:
+        largest: largest share of the time of each limit, by name.
+        rate: how much the logarithm of a multiplier changes at most per update.
+        known: the names that there are.
+
+    Raises:
+        ConfigError: if a name is unknown, a share lies outside 0…1 or the rate is not positive.
+    """
+
+    def __init__(
+        self, largest: Mapping[str, float | None], rate: float, known: Mapping[str, object]
+    ) -> None:
+        self.largest = {name: share for name, share in largest.items() if share is not None}
+        for name, share in self.largest.items():
+            if name not in known:
+                raise ConfigError(f"agent.limits.{name}: there is no agent.surrogates.{name}")
+            if not hasattr(known[name], "missed"):
+                kind = type(known[name]).__name__
+                raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")
+            require_in("agent.limits", "[0, 1)", **{name: share})
+        require_positive("agent", limit_rate=rate)
+        self.rate = rate
+        self.logarithms = dict.fromkeys(self.largest, 0.0)
+
+    def price(self, name: str) -> float:
+        """Return the multiplier of a limit; 1 for what is none."""
+        return math.exp(self.logarithms.get(name, 0.0))
+
+    def update(self, shares: Mapping[str, float]) -> None:
+        """Raise the multipliers of limits that are missed, lower those of others.
+
+        Args:
+            shares: share of the time in which each limit was missed.
+        """
+        for name, share in shares.items():
+            over = share / max(self.largest[name], LEAST) - 1.0
+            self.logarithms[name] += self.rate * min(max(over, -1.0), 1.0)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the multipliers."""
+        names = sorted(self.logarithms)
+        values = [self.logarithms[name] for name in names]
+        return {"logarithms": torch.tensor(values, dtype=torch.float64)}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        names = sorted(self.logarithms)
+        self.logarithms = dict(zip(names, state["logarithms"].tolist(), strict=True))

@@ -1,0 +1,104 @@
+"""What a training through the simulator maximises: the reward's terms, their stand-ins, limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from lcc_rl.agents.limits import Limits
+from lcc_rl.config import build
+from lcc_rl.errors import Diverged
+from lcc_rl.functional.finite import any_lost
+from lcc_rl.pieces.base import Key, next_key
+from lcc_rl.pieces.rewards import RewardTerm
+
+
+class Objective:
+    """The terms of an objective and the prices of its limits.
+
+    Args:
+        surrogates: nodes of reward terms that take the place of those of the same name; their
+            weights multiply the terms' own. Those of terms that the reward lacks are ignored, and
+            so are their limits.
+        regularizers: nodes of further terms.
+        limits, limit_rate: see :class:`lcc_rl.agents.limits.Limits`.
+        device: where the terms compute.
+        **resources: what terms may need: ``time_step``, ``string``.
+
+    Raises:
+        ConfigError: if a node or a limit is wrong.
+    """
+
+    def __init__(
+        self,
+        surrogates: Mapping[str, Any],
+        regularizers: Mapping[str, Any],
+        limits: Mapping[str, float | None],
+        limit_rate: float,
+        device: str,
+        **resources: Any,
+    ) -> None:
+        def made(where: str, nodes: Mapping[str, Any]) -> dict[str, RewardTerm]:
+            return {
+                name: build(node, f"agent.{where}.{name}", name=name, **resources).to(device)
+                for name, node in nodes.items()
+                if node is not None
+            }
+
+        self.surrogates = made("surrogates", surrogates)
+        self.regularizers = made("regularizers", regularizers)
+        self.limits = Limits(limits, limit_rate, self.surrogates)
+        self.terms: list[tuple[RewardTerm, float]] = []
+
+    def replace(self, terms: Sequence[RewardTerm]) -> list[tuple[RewardTerm, float]]:
+        """Set and return what is maximised in place of the reward's terms, with factors."""
+        own = self.surrogates
+        chosen = [
+            (own[term.name], term.weight) if term.name in own else (term, 1.0) for term in terms
+        ]
+        self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
+        return self.terms
+
+    def wanted(self) -> list[Key]:
+        """Return the entries of the moment reached that the terms read."""
+        return [key for term, _ in self.terms for _, key in term.sources]
+
+    def score(self, data: TensorDictBase) -> Tensor:
+        """Return the objective at every step of a rollout, ``[batch, steps, A]``.
+
+        Raises:
+            Diverged: naming the first term that is no finite number.
+        """
+        parts = [
+            factor * self.limits.price(term.name) * term.compute(*_entries(term, data)).squeeze(-1)
+            for term, factor in self.terms
+        ]
+        for (term, _), part in zip(self.terms, parts, strict=True):
+            if any_lost([part]):
+                raise Diverged(f"the objective's term {term.name} ({type(term).__name__}) is nan")
+        return torch.stack(parts).sum(0)
+
+    def missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:
+        """Return the share of a rollout's time in which each limit was missed.
+
+        Args:
+            data: the rollout, ``[batch, steps]``.
+            running: which steps count, ``[batch, steps, 1]``.
+        """
+        shares = {}
+        terms: list[Any] = [term for term, _ in self.terms if term.name in self.limits.largest]
+        with torch.no_grad():
+            for term in terms:
+                missed = term.missed(*term.views(*_entries(term, data))).squeeze(-1)
+                counted = running.expand_as(missed)
+                total = (missed * counted).double().sum() / counted.sum().clamp(min=1)
+                shares[term.name] = float(total)
+        return shares
+
+
+def _entries(term: RewardTerm, data: TensorDictBase) -> list[Tensor]:
+    return [data.get(next_key(key)) for _, key in term.sources]

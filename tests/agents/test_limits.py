@@ -1,0 +1,98 @@
+"""Limits whose prices are learned."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import compose, make_agent
+from test_analytic import make
+
+from lcc_rl.agents.limits import Limits
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.power import acceleration_loss, steady_power
+from lcc_rl.pieces import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
+
+KNOWN = {"safety": SmoothSafety(), "efficiency": SmoothEfficiency(), "smoothness": Smoothness()}
+
+
+def test_a_price_rises_until_its_limit_is_kept() -> None:
+    limits = Limits({"efficiency": 0.01, "safety": 0.0}, 0.1, KNOWN)
+    price = [limits.price("efficiency")]
+    for share in (0.5, 0.02, 0.01, 0.0):
+        limits.update({"efficiency": share, "safety": 0.0})
+        price.append(limits.price("efficiency"))
+    assert price[0] == 1.0
+    rates = torch.tensor(price).log().diff()
+    assert torch.allclose(rates, torch.tensor([0.1, 0.1, 0.0, -0.1]), atol=1e-6)
+    # Kept by something else: its price falls.
+    assert limits.price("safety") == pytest.approx(2.718281828**-0.4)
+    assert limits.price("cav_energy") == 1.0
+
+
+def test_a_price_is_resumed() -> None:
+    one, two = (Limits({"safety": 0.0, "efficiency": 0.01}, 0.1, KNOWN) for _ in range(2))
+    one.update({"efficiency": 0.5, "safety": 0.0})
+    two.load_state_dict(one.state_dict())
+    assert two.logarithms == one.logarithms
+
+
+@pytest.mark.parametrize(
+    ("largest", "words"),
+    [
+        ({"saftey": 0.0}, "agent.limits.saftey: there is no agent.surrogates.saftey"),
+        ({"smoothness": 0.0}, "agent.limits.smoothness: Smoothness has no limit to keep"),
+        ({"safety": 1.0}, r"agent.limits.safety must lie in \[0, 1\), got 1.0"),
+        ({"safety": -0.1}, "agent.limits.safety must lie"),
+    ],
+)
+def test_what_is_no_limit_is_refused(largest, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Limits(largest, 0.1, KNOWN)
+
+
+def test_a_limit_that_is_null_is_a_fixed_price() -> None:
+    agent = make_agent(compose("alcc", "agent=analytic", "agent.limits.safety=null"))
+    assert set(agent.objective.limits.largest) == {"efficiency"}
+
+
+def test_where_a_limit_is_missed() -> None:
+    def column(*values: float) -> torch.Tensor:
+        return torch.tensor(values).unsqueeze(-1)
+
+    gap, speed = column(26.0, 24.0, 4.0), column(10.0, 10.0, 0.5)
+    assert SmoothEfficiency().missed(gap, speed).flatten().tolist() == [True, False, False]
+    relative = column(-7.0, -5.0, 1.0)
+    assert SmoothSafety().missed(gap, relative).flatten().tolist() == [True, False, False]
+
+
+def test_the_record_says_shares_and_prices(tmp_path) -> None:
+    trainer = make(tmp_path, "training.episodes=32", "agent.limit_rate=0.5")
+    rows = trainer.run()
+    for name in ("safety", "efficiency"):
+        assert rows[f"share_{name}"].between(0.0, 1.0).all()
+        assert rows[f"price_{name}"].iloc[0] == 1.0
+    over = rows["share_efficiency"] / 0.01 - 1.0
+    expected = 0.5 * over.clip(-1.0, 1.0).shift(fill_value=0.0).cumsum()
+    assert torch.allclose(
+        torch.tensor(rows["price_efficiency"].to_numpy()).log(),
+        torch.tensor(expected.to_numpy()),
+        atol=1e-6,
+    )
+
+
+def test_path_energy_is_a2_without_what_the_motion_stores() -> None:
+    term = PathEnergy(time_step=0.1)
+    speed, acceleration = torch.tensor([[[10.0]]]), torch.tensor([[[1.0]]])
+    before = speed - 0.1
+    expected = steady_power(before) + acceleration_loss(before, acceleration)
+    assert torch.allclose(term.reward(speed, acceleration), -expected * 0.1 / 20000.0)
+    # Braking is never paid for.
+    assert (term.reward(speed, -3.0 * acceleration) < 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"), [({"of": "all"}, "of must be"), ({"scale": 0.0}, "scale")]
+)
+def test_settings_of_path_energy(settings, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        PathEnergy(0.1, **settings)
