@@ -11,12 +11,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import DictConfig, OmegaConf
 
 import lcc_rl
+import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import build, config_hash, load
 from lcc_rl.envs import build_env
@@ -75,6 +75,7 @@ def test_every_option_of_a_group_builds(group) -> None:
                 files()[x] for x in ("data/stream.yaml", "split/single.yaml")
             )
         given = {"time_step": 0.1, "observation_size": 7, "action_size": 1, "seed": 0}
+        given["observation"] = build(load("train").observation, "observation")
         assert build(node, group, population=POPULATION, **given) is not None
 
 
@@ -150,7 +151,8 @@ def as_lists(value: Any) -> Any:
 # A class that the files describe more than once has the defaults of its first use.
 EXCEPTIONS = {
     "agent/analytic.yaml": "nodes of pieces, of which a constructor has none",
-    "agent/analytic.yaml.surrogates.hdv_energy": "second use of EnergyReward",
+    "agent/tuned.yaml": "likewise",
+    "surrogates/limits.yaml.surrogates.hdv_energy": "second use of PathEnergy",
     "calibration/base.yaml": "which mode, and nodes, are the choice of a file",
     "calibration/base.yaml.global_genetic": "second use of GeneticSettings",
     "controller/idm.yaml": "one driver without noise; the class is that of drivers who differ",
@@ -193,7 +195,8 @@ def select(root: DictConfig, key: str) -> Any:
 
 
 OFFERED = {"profiles", "population", "time_step", "horizon", "string", "nominal", "name", "role"}
-OFFERED |= {"observation_size", "action_size", "seed", "settings", "device"}
+OFFERED |= {"observation_size", "action_size", "seed", "settings", "device", "observation"}
+OFFERED |= {"max_acceleration"}
 # Arguments that name entries, and those that only some files choose to give.
 OPTIONAL = {"reads", "widths", "relative_to", "visible", "vehicles", "acceleration", "power"}
 
@@ -213,7 +216,10 @@ def test_every_setting_of_a_constructor_is_in_its_file() -> None:
 
 
 PARTIAL = {
-    "agent/analytic.yaml.surrogates.hdv_energy": "weight and scale are those of the reward",
+    "agent/analytic.yaml": "terms and limits are of its defaults list",
+    "agent/tuned.yaml": "terms and limits are of its defaults list",
+    "surrogates/limits.yaml.surrogates.cav_energy": "the weight is that of the reward",
+    "surrogates/limits.yaml.surrogates.hdv_energy": "the weight is that of the reward",
     "controller/handover.yaml": "before and after are of its defaults list",
 }
 

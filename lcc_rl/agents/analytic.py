@@ -69,7 +69,7 @@ class AnalyticSettings:
     gamma: float = 0.998
     surrogates: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, float | None] = field(default_factory=dict)
-    limit_rate: float = 0.05
+    limit_rate: float = 0.1
     regularizers: Mapping[str, Any] = field(default_factory=dict)
     bootstrap: bool = True
     value_lr: float = 1e-3

@@ -12,6 +12,7 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import Agent, TrainingLoop
 from lcc_rl.agents.replay import Trainer
+from lcc_rl.agents.tuned import SearchLoop, Tuned
 from lcc_rl.config import build_as, identity, short_name
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
@@ -76,6 +77,7 @@ def make_trainer(
             f"scenario.controllers.automated ({kind}) takes no action of a policy, so nothing can "
             "be learned; say agent=none, or leave the controller out"
         )
-    loop: Any = GradientTrainer if isinstance(agent, Analytic) else Trainer
+    loops: dict[type, Any] = {Analytic: GradientTrainer, Tuned: SearchLoop}
+    loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
     return trained

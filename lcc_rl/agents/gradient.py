@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.objective import Objective
 from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
@@ -53,18 +56,10 @@ class GradientTrainer(TrainingLoop[Analytic]):
             compiled = self.settings.compiled
         if compiled is None:
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
-        return self._rollout(compiled)
-
-    def _rollout(self, compiled: bool) -> DifferentiableRollout:
-        return DifferentiableRollout(
-            self.env,
-            wanted=self.objective.wanted(),
-            observed=[REWARD, *(term.targets[0] for term in self.terms)],
-            compiled=compiled,
-        )
+        return rollout_of(self.env, self.objective, self.terms, compiled)
 
     def footprint(self) -> Footprint:
-        source, own = self._rollout(False), self.agent.settings
+        source, own = rollout_of(self.env, self.objective, self.terms, False), self.agent.settings
         # The first steps lack the gradient that reaches the later ones through the motion.
         (less, _, _), (more, data, state) = (self._played(source, steps) for steps in (2, 3))
         count = self.env.batch_size.numel()
@@ -146,6 +141,25 @@ class GradientTrainer(TrainingLoop[Analytic]):
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
         return after, self.agent.update(self.objective.score(data) * before, after, moments)
+
+
+def rollout_of(
+    env: TransformedEnv, objective: Objective, terms: Sequence[RewardTerm], compiled: bool
+) -> DifferentiableRollout:
+    """Return what plays episodes for an objective, and records the reward's terms.
+
+    Args:
+        env: the training environment.
+        objective: what is learned from.
+        terms: the reward's terms.
+        compiled: compile the simulator's step.
+    """
+    return DifferentiableRollout(
+        env,
+        wanted=objective.wanted(),
+        observed=[REWARD, *(term.targets[0] for term in terms)],
+        compiled=compiled,
+    )
 
 
 def _mean(rows: list[dict[str, Any]]) -> dict[str, float]:

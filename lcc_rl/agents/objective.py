@@ -82,6 +82,10 @@ class Objective:
                 raise Diverged(f"the objective's term {term.name} ({type(term).__name__}) is nan")
         return torch.stack(parts).sum(0)
 
+    def limited(self) -> list[str]:
+        """Return the names of the terms that have a limit to keep."""
+        return [term.name for term, _ in self.terms if term.name in self.limits.largest]
+
     def missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:
         """Return the share of a rollout's time in which each limit was missed.
 

@@ -55,6 +55,7 @@ def test_safety() -> None:
 def test_a_gap_that_never_closes_has_no_least_ttc() -> None:
     series = dict.fromkeys(("time_gap", "gap", "jerk"), torch.ones(2, 1, 1, 1))
     series["ttc"] = torch.full((2, 1, 1, 1), NEVER)
+    series["speed"] = torch.ones(3, 1, 1, 1)
     measures = safety_measures(series, torch.ones(2, 1, 1, 1, dtype=torch.bool), 0.1)
     assert measures["min_ttc_s"].isnan().all()
     assert measures["share_ttc_unsafe"] == 0.0

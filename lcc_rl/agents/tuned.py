@@ -1,0 +1,233 @@
+"""Tuning without gradients: CMA-ES over the weights of a policy, most of use for rules.
+
+Every candidate drives the same episodes; how well is the objective without a discount, so that
+nothing need be smooth (Hansen, "The CMA evolution strategy: a tutorial", arXiv 1604.00772; the
+search itself is the package cmaes').
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModule
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from lcc_rl.agents.checks import check_batch
+from lcc_rl.agents.gradient import rollout_of
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.objective import Objective
+from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
+from lcc_rl.envs.rollout import DifferentiableRollout
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import ConfigError, require_positive, require_whole
+from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.pieces.observation import Observation
+from lcc_rl.pieces.rewards import RewardTerm
+from lcc_rl.policies.rules import make_policy
+
+MOST_WEIGHTS = 500  # beyond, the covariance of a generation's candidates says too little
+
+
+@dataclass(frozen=True)
+class TunedSettings:
+    """Settings of the tuner; conf/agent holds their values.
+
+    Args:
+        policy, constants, hidden: see :class:`lcc_rl.agents.analytic.AnalyticSettings`.
+        candidates: weights tried on the same episodes before the search moves.
+        sigma: standard deviation of the candidates at the start; of a rule's constants that of
+            their logarithms.
+        surrogates, limits, limit_rate, regularizers: likewise.
+
+    Raises:
+        ConfigError: if a setting is out of range.
+    """
+
+    policy: str = "idm"
+    constants: Mapping[str, float] | None = None
+    hidden: Sequence[int] = ()
+    candidates: int = 10
+    sigma: float = 0.3
+    surrogates: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, float | None] = field(default_factory=dict)
+    limit_rate: float = 0.2
+    regularizers: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_positive("agent", sigma=self.sigma)
+        require_whole("agent", 4, 1000, candidates=self.candidates)
+
+
+class Tuned:
+    """A policy whose weights are tuned by search.
+
+    Args:
+        observation, seed, time_step, max_acceleration, string, device: see
+            :class:`lcc_rl.agents.analytic.Analytic`.
+        settings: see :class:`TunedSettings`; None for its defaults.
+
+    Raises:
+        ConfigError: if a setting is out of range, or there are too many weights to search.
+    """
+
+    Settings: ClassVar[type[TunedSettings]] = TunedSettings
+
+    def __init__(
+        self,
+        observation: Observation,
+        seed: int,
+        time_step: float,
+        max_acceleration: float = 3.0,
+        string: VehicleString | None = None,
+        settings: TunedSettings | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.settings = own = TunedSettings() if settings is None else settings
+        self.seed = seed
+        self.objective = Objective(
+            own.surrogates,
+            own.regularizers,
+            own.limits,
+            own.limit_rate,
+            device,
+            time_step=time_step,
+            string=string,
+        )
+        self.policy: TensorDictModule = make_policy(
+            own.policy, observation, own.hidden, seed, own.constants, max_acceleration
+        ).to(device)
+        self.weights = [entry for entry in self.policy.parameters() if entry.requires_grad]
+        count = sum(entry.numel() for entry in self.weights)
+        if count > MOST_WEIGHTS:
+            raise ConfigError(
+                f"agent.policy={own.policy} has {count} weights, a search can tune "
+                f"{MOST_WEIGHTS}: say agent.policy=idm or acc, or a smaller agent.hidden"
+            )
+        self.start = parameters_to_vector(self.weights).detach().double().cpu().numpy()
+        self.search = self._search()
+        # Of every candidate so far: its cost, and its share of each limit, by name.
+        self.costs: list[float] = []
+        self.missed: list[list[float]] = []
+        self.asked: list[np.ndarray] = []
+        self.center = self.start
+
+    def _search(self) -> Any:
+        try:
+            from cmaes import CMA
+        except ImportError as error:
+            raise ConfigError("agent=tuned needs cmaes: pip install -e '.[tune]'") from error
+        size, seed = self.settings.candidates, derived_seed(self.seed, "search")
+        return CMA(self.start, self.settings.sigma, seed=seed, population_size=size)
+
+    def anneal(self, share: float) -> float:
+        """Return the first step size of the search, which has no learning rate."""
+        return self.settings.sigma
+
+    def ask(self) -> None:
+        """Give the policy the weights of the next candidate."""
+        self.asked.append(self.search.ask())
+        self._drive(self.asked[-1])
+
+    def tell(self, cost: float, shares: Mapping[str, float]) -> None:
+        """Say how dear the last candidate was, and how often it missed each limit.
+
+        After the last candidate of a generation the search moves, and the prices with it.
+        """
+        self.costs.append(cost)
+        self.missed.append([share for _, share in sorted(shares.items())])
+        count = self.settings.candidates
+        if len(self.costs) % count == 0:
+            self.search.tell(list(zip(self.asked, self.costs[-count:], strict=True)))
+            self.asked, self.center = [], self.search.mean
+            means = np.mean(self.missed[-count:], axis=0)
+            self.objective.limits.update(dict(zip(sorted(shares), means.tolist(), strict=True)))
+
+    def settle(self) -> None:
+        """Give the policy the weights around which the search looks."""
+        self._drive(self.center)
+
+    def _drive(self, weights: np.ndarray) -> None:
+        vector_to_parameters(torch.as_tensor(weights).to(self.weights[0]), self.weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
+        return {
+            "policy": self.policy.state_dict(),
+            "costs": torch.tensor(self.costs, dtype=torch.float64),
+            "missed": torch.tensor(self.missed, dtype=torch.float64),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned, by making the same search again."""
+        limits = self.objective.limits
+        limits.logarithms = dict.fromkeys(limits.logarithms, 0.0)
+        self.search, self.costs, self.missed = self._search(), [], []
+        self.asked, self.center = [], self.start
+        names = sorted(self.objective.limited())
+        for cost, shares in zip(state["costs"].tolist(), state["missed"].tolist(), strict=True):
+            self.ask()
+            self.tell(cost, dict(zip(names, shares, strict=True)))
+        self.policy.load_state_dict(state["policy"])
+
+
+class SearchLoop(TrainingLoop[Tuned]):
+    """Tunes by search, one candidate an iteration; arguments as of :class:`TrainingLoop`."""
+
+    advice = "Lower agent.sigma"
+    watched = "cost"
+
+    def _prepare(self) -> None:
+        self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
+        self.objective = self.agent.objective
+        self.objective.replace(self.terms)
+
+    def _source(self) -> DifferentiableRollout:
+        return rollout_of(self.env, self.objective, self.terms, False)
+
+    def footprint(self) -> Footprint:
+        with torch.no_grad():
+            source = self._source()
+            state, record = source.play(source.start(), self.agent.policy.module, 2)
+            data = source.assemble(record)
+        count = self.env.batch_size.numel()
+        step = COPIES * data.bytes() / 2 / count
+        return Footprint(step, step, nbytes(state.values()) / count, {})
+
+    def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
+        """Let a candidate drive a batch of episodes."""
+        begun = time.perf_counter()
+        generation = self.iteration // self.agent.settings.candidates
+        self.env.set_seed(derived_seed(self.seed, generation, "episodes"))
+        self.agent.ask()
+        with torch.no_grad():
+            network = self.agent.policy.module
+            _, record = source.play(source.start(), network, self.horizon)
+            data = source.assemble(record)
+            check_batch(data, pieces_of(self.env))
+            running = 1.0 - (data["next", "terminated"].cumsum(1) > 0).double()
+            objective = self.objective.score(data) * running
+        shares = self.objective.missed(data, running)
+        limits = self.objective.limits
+        prices = {f"price_{name}": limits.price(name) for name in shares}
+        cost = -float(objective.sum(1).mean())
+        self.agent.tell(cost, shares)
+        self.agent.settle()
+        self.iteration += 1
+        self.updates = self.iteration // self.agent.settings.candidates
+        row = {
+            "iteration": float(self.iteration),
+            "episodes": float(self.iteration * self.env.batch_size[0]),
+            "transitions": float(self.iteration * data.numel()),
+            "updates": float(self.updates),
+            **episode_statistics(data.select(*REPORTED)),
+            "cost": cost,
+            **{f"share_{name}": share for name, share in shares.items()},
+            **prices,
+        }
+        self._record(row, time.perf_counter() - begun, 0.0)
+        return row
