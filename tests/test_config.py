@@ -151,7 +151,6 @@ def as_lists(value: Any) -> Any:
 # A class that the files describe more than once has the defaults of its first use.
 EXCEPTIONS = {
     "agent/analytic.yaml": "nodes of pieces, of which a constructor has none",
-    "agent/tuned.yaml": "likewise",
     "surrogates/limits.yaml.surrogates.hdv_energy": "second use of PathEnergy",
     "calibration/base.yaml": "which mode, and nodes, are the choice of a file",
     "calibration/base.yaml.global_genetic": "second use of GeneticSettings",
