@@ -241,7 +241,7 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
         raise ConfigError(f"{where}: missing {', '.join(missing)} of {called}")
     try:
         return target(**arguments, **offered)
-    except LccError:
+    except (LccError, OSError):  # of a file: its name says more than the node's
         raise
     except Exception as error:  # whatever a constructor of the user's own raises
         words = f"{type(error).__name__}: {error}"

@@ -33,6 +33,8 @@ def refused_key(error: Exception) -> str | None:
 
 def refused_by_hydra(error: BaseException) -> bool:
     """Whether an error comes from Hydra or OmegaConf, which say some by ValueError or TypeError."""
+    if isinstance(error, OSError):  # of a file that Hydra writes
+        return False
     trail = error.__traceback__
     while trail is not None and trail.tb_next is not None:
         trail = trail.tb_next

@@ -33,8 +33,8 @@ def check_numbers(value: Any, where: str) -> None:
         raise ConfigError(
             f"{where} must be a finite number of size {LARGEST:g} at most, got {value}"
         )
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        raise ConfigError(f"{where} must be a number of 64 bits, got one of {value.bit_length()}")
+    if isinstance(value, int) and not abs(value) < 2**63:
+        raise ConfigError(f"{where} must be a number of 63 bits, got one of {value.bit_length()}")
     if isinstance(value, Mapping):
         for key, item in value.items():
             check_numbers(item, f"{where}.{key}" if where else str(key))

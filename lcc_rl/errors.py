@@ -43,7 +43,8 @@ class Diverged(LccError):
 
 # Far beyond every quantity of traffic and learning; its square is a number in single precision.
 LARGEST = 1e9
-LAST_WHOLE = 2**31 - 1
+# Far beyond what fits into memory, which is said with what is needed; and seeds.
+LARGEST_SIZE, LAST_SEED = 10**15, 2**31 - 1
 WORDS = {
     "(-inf, inf)": "be a number",
     "(0, inf)": "be positive",
@@ -93,13 +94,13 @@ def require_whole(where: str, least: int, most: int | None = None, **settings: A
 
     Args:
         where: what has the settings; empty for options that belong to nothing.
-        least, most: the range; without ``most`` up to what 31 bits hold.
+        least, most: the range; without ``most`` up to :data:`LARGEST_SIZE`.
         **settings: the values by name.
 
     Raises:
         ConfigError: naming the first that is not, as ``where.setting``.
     """
-    last = LAST_WHOLE if most is None else most
+    last = LARGEST_SIZE if most is None else most
     for name, value in settings.items():
         whole = isinstance(value, Integral) and not isinstance(value, bool)
         if not (whole and least <= value <= last):

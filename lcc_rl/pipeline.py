@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.runs import save_config
+from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.cli import entry_point, root_key, run_folder
 
 log = logging.getLogger("lcc_rl")
@@ -35,6 +35,8 @@ def main(cfg: DictConfig) -> None:
         overrides = stored_overrides(folder / OVERRIDES, trust)
         cfg = load("pipeline", overrides)
         cfg.trust = trust
+    else:
+        check_folder(cfg, folder)
     save_config(cfg, folder)
     run(cfg, folder, overrides)
     log.info("results in %s", folder)

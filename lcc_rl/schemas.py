@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_types import check_numbers
-from lcc_rl.errors import ConfigError, require_in, require_whole
+from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
 
 
 @dataclass
@@ -127,16 +128,17 @@ RANGES = {
     "scenario.vehicle_length": "(0, inf)",
     "scenario.initial_speed": "[0, inf)",
 }
+MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
 WHOLE: dict[str, tuple[int, ...]] = {
-    "seed": (0,),
-    "threads": (1,),
-    "jobs": (1,),
+    **dict.fromkeys(("seed", "evaluation.seed"), (0, LAST_SEED)),
+    **dict.fromkeys(("threads", "jobs"), (1, MOST_PARALLEL)),
     "scenario.horizon": (1, 1_000_000),
-    # What is too large for the machine is said with what it needs.
-    **{f"training.{name}": (1, 10**15) for name in ("episodes", "environments")},
-    **{f"training.{name}": (1,) for name in ("segment", "checkpoint_every", "keep_every")},
+    **{
+        f"training.{name}": (1,)
+        for name in ("episodes", "environments", "segment", "checkpoint_every", "keep_every")
+    },
     **{f"evaluation.{name}": (1,) for name in ("profiles", "drivers", "batch_size")},
-    **{f"evaluation.{name}": (0,) for name in ("seed", "sample_episodes")},
+    "evaluation.sample_episodes": (0,),
 }
 
 
@@ -150,7 +152,7 @@ def check_ranges(cfg: Any) -> None:
         ConfigError: naming the first key at fault.
     """
     try:
-        check_numbers(OmegaConf.to_container(cfg, resolve=True), "")
+        everything = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
     for key in (*RANGES, *WHOLE):
@@ -162,6 +164,7 @@ def check_ranges(cfg: Any) -> None:
             require_in(where, RANGES[key], **{name: value})
         else:
             require_whole(where, *WHOLE[key], **{name: value})
+    check_numbers(everything, "")
 
 
 def register_schemas() -> None:

@@ -1,52 +1,95 @@
-"""Kill a small sweep at random moments and check its files each time.
+"""Kill small sweeps, evaluations and pipelines at random moments and check their files each time.
 
     python tools/kill_test.py --kills 200
 
-After every kill each file must be readable and no finished run may be lost; the final rows must
-equal those of an undisturbed sweep. Prints the counts; the exit code is 1 if a check fails.
+A kill counts if it ended a process at work. After each, every file must be readable and no finished
+run may be lost or written again; the final rows must equal those of commands never killed. Prints
+the counts; the exit code is 1 if a check fails or the time is over before the last kill.
 """
 
 from __future__ import annotations
 
 import argparse
 import faulthandler
+import hashlib
 import os
 import random
 import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 import torch
+from matplotlib.image import imread
 
-from lcc_rl import results, train
-from lcc_rl.commands.training import EPISODES
+from lcc_rl import evaluate, pipeline, train
+from lcc_rl.commands.pipeline import OVERRIDES
 from lcc_rl.config import load
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet, read_torch
+from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import read_settings
-from lcc_rl.runs.states import read_progress, survey
+from lcc_rl.runs.interrupts import INTERRUPTED
+from lcc_rl.runs.states import RESULTS, read_progress
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-TABLES = ("training", "episodes", "steps")
-TINY = (
-    "experiment=smoke",
-    "scenario.horizon=40",
-    "agent.batch_size=64",
-    "agent.hidden=[16,16]",
-    "training.episodes=48",
-    "seed=0,1",
-)
+UNTIMED = "timing.parquet"  # seconds, which differ
+WAITED = os.WEXITED | os.WNOHANG | os.WNOWAIT
+PATIENCE = 60.0  # for a process to react to a signal, or to leave its folder [s]
+SMALL = ("experiment=smoke", "scenario.horizon=40")
+AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]", "training.episodes=48")
+QUICK = "calibration.local_genetic.generations=2"
+
+
+@dataclass
+class Job:
+    """A command, where it writes, and what is known of the runs it finished.
+
+    Args:
+        main: the entry point.
+        words: what is typed.
+        where: the setting of the folder.
+        share: of the kills that meet this command.
+    """
+
+    main: Callable[[], None]
+    words: list[str]
+    where: str
+    share: float
+    length: float = 0.0  # seconds of the command never killed
+    completed: int = 0
+
+    def typed(self, folder: Path) -> list[str]:
+        """Return the words that begin the command, or that resume it where that takes others."""
+        if (folder / OVERRIDES).exists():
+            return [f"resume={folder}"]
+        return [*self.words, f"{self.where}={folder}"]
+
+
+def jobs(data: Path) -> dict[str, Job]:
+    """Return the commands that are killed."""
+    read = ["data=episodes", f"data.path={data}"]
+    sweep = ["-m", *SMALL, *AGENT, "seed=0,1", *read]
+    one = [*SMALL, "policy=pretrained", "compare=[pretrained/reference]", *read]
+    whole = [*SMALL, *AGENT, QUICK, "jobs=1", "training.checkpoint_every=1", *read]
+    return {
+        "sweep": Job(train.main, sweep, "hydra.sweep.dir", 0.5),
+        "evaluation": Job(evaluate.main, one, "hydra.run.dir", 0.25),
+        "pipeline": Job(pipeline.main, whole, "hydra.run.dir", 0.25),
+    }
 
 
 def tiny_data(folder: Path) -> Path:
-    """Write the episodes that every sweep here reads."""
+    """Write the episodes that every command here reads."""
     from lcc_rl.config import build
 
     cfg = load("train", ["data.platoons=4", "data.recordings=2"])
@@ -56,31 +99,35 @@ def tiny_data(folder: Path) -> Path:
     return path
 
 
-def start(words: Sequence[str], log: Path) -> int:
-    """Start the sweep in a process of its own, as the command line would; return its id."""
-    child = os.fork()  # importing torch again would take longer than the sweep
+def start(job: Job, folder: Path, log: Path) -> int:
+    """Start a command in a process of its own, as the command line would; return its id."""
+    child = os.fork()  # importing torch again would take longer than the command
     if child:
         return child
+    os.setsid()
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(output, 1)
     os.dup2(output, 2)
     faulthandler.register(signal.SIGUSR1)
     # A shell that starts this in the background makes it, and all below it, deaf to SIGINT.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.argv = ["train", "-m", *words]
+    sys.argv = [job.main.__module__, *job.typed(folder)]
     code = 0
     try:
-        train.main()
+        job.main()
     except SystemExit as stop:
         code = int(stop.code or 0)
+    except BaseException:
+        code = 1
+        traceback.print_exc()
     finally:
         os._exit(code)
 
 
-def unreadable(sweep: Path) -> list[str]:
-    """Return the files of a sweep that cannot be read, with the reason."""
+def unreadable(root: Path) -> list[str]:
+    """Return the files of a folder that cannot be read, with the reason."""
     wrong = []
-    for path in sweep.rglob("*"):
+    for path in root.rglob("*"):
         if path.name.startswith(".") or ".hydra" in path.parts:
             continue
         try:
@@ -88,91 +135,156 @@ def unreadable(sweep: Path) -> list[str]:
                 read_parquet(path)
             elif path.suffix == ".pt":
                 read_torch(path)
+            elif path.suffix == ".png":
+                imread(path)
             elif path.name == "config.yaml":
                 read_settings(path)
             elif path.name == "progress.json" and read_progress(path.parent) is None:
                 raise ResultsError(f"{path}: damaged")
-        except ResultsError as error:
-            wrong.append(str(error))
+            elif path.suffix == ".json":
+                read_json(path)
+        except (ResultsError, OSError, SyntaxError) as error:  # the last two: of a figure
+            wrong.append(f"{path}: {error}")
     return wrong
 
 
-def finished(sweep: Path) -> dict[str, int]:
-    """Return the finished runs and when their table was written."""
-    names = [state.name for state in survey(sweep) if state.state == "finished"]
-    return {name: (sweep / name / EPISODES).stat().st_mtime_ns for name in names}
+def finished(root: Path) -> dict[str, str]:
+    """Return the tables of finished runs, with the hash of each."""
+    tables = [path for name in RESULTS for path in root.rglob(name)]
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in tables}
 
 
 def tail(log: Path, lines: int = 100) -> list[str]:
-    """Return the last lines of what a sweep said."""
+    """Return the last lines of what a command said."""
     return log.read_text(errors="replace").splitlines()[-lines:]
 
 
-def disturb(words: Sequence[str], sweep: Path, log: Path, delay: float, kind: int) -> str:
-    """Start the sweep, send it a signal after a delay, and say what that did."""
-    child = start(words, log)
+def at_work(group: int) -> bool:
+    """Whether a process of a group lives; one that nobody waited for does not."""
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, own = path.read_text().rpartition(")")[2].split()[:3]
+            if int(own) == group and state != "Z":
+                return True
+    return False
+
+
+def disturb(job: Job, folder: Path, log: Path, delay: float, kind: int, all_: bool) -> str:
+    """Start a command, send it a signal after a delay, and say what ended it.
+
+    Args:
+        job: the command.
+        folder: where it writes.
+        log: where its output goes.
+        delay: seconds until the signal.
+        kind: the signal.
+        all_: send it to the command's own processes, too.
+
+    Returns:
+        The name of the signal; ``"was done"`` if the command came to its end nevertheless.
+    """
+    child = start(job, folder, log)
     deadline = time.monotonic() + delay
-    while time.monotonic() < deadline:
-        if os.waitpid(child, os.WNOHANG)[0]:
-            return "was done"
+    while time.monotonic() < deadline and os.waitid(os.P_PID, child, WAITED) is None:
         time.sleep(0.002)
-    os.kill(child, kind)
-    patience = time.monotonic() + 60
-    while not os.waitpid(child, os.WNOHANG)[0]:
+    (os.killpg if all_ else os.kill)(child, kind)  # which does nothing to one that has ended
+    patience = time.monotonic() + PATIENCE
+    while os.waitid(os.P_PID, child, WAITED) is None or at_work(child):
         if time.monotonic() > patience:
-            os.kill(child, signal.SIGUSR1)  # where it hangs
+            os.killpg(child, signal.SIGUSR1)  # where it hangs
             time.sleep(1.0)
-            os.kill(child, signal.SIGKILL)
+            os.killpg(child, signal.SIGKILL)
             os.waitpid(child, 0)
             print(f"hung after {signal.Signals(kind).name}:", *tail(log), sep="\n", flush=True)
             return "hung"
-        time.sleep(0.002)
+        time.sleep(0.01)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code == 0:
+        return "was done"
+    assert code in (-kind, INTERRUPTED), "\n".join([f"exit code {code}", *tail(log)])
     return signal.Signals(kind).name
 
 
-def compare(whole: Path, sweep: Path) -> None:
-    """Check that two sweeps hold the same runs with the same rows."""
-    for table in TABLES:
-        expected, found = (results.load(folder, table, strict=True) for folder in (whole, sweep))
-        pd.testing.assert_frame_equal(found, expected, check_exact=True)
+def compare(whole: Path, killed: Path) -> None:
+    """Check that two folders hold the same files and their tables the same rows."""
+    names, others = (
+        {str(path.relative_to(root)) for path in content(root)} for root in (whole, killed)
+    )
+    assert names == others, f"files differ: {names ^ others}"
+    for name in sorted(names):
+        if name.endswith(".parquet") and not name.endswith(UNTIMED):
+            expected, found = (read_parquet(root / name) for root in (whole, killed))
+            pd.testing.assert_frame_equal(found, expected, check_exact=True, obj=name)
 
 
-def run(kills: int, seed: int, folder: Path, limit: float) -> Counter[str]:
-    """Do the whole test; return what the kills did.
+def content(root: Path) -> list[Path]:
+    """Return the files of a folder that a command leaves, without its logs."""
+    return [path for path in root.rglob("*") if path.is_file() and path.suffix != ".log"]
 
-    Raises:
-        AssertionError: saying what was lost, damaged or different.
+
+def complete(job: Job, folder: Path, log: Path) -> None:
+    """Let a command do what is left of its work."""
+    code = os.waitstatus_to_exitcode(os.waitpid(start(job, folder, log), 0)[1])
+    assert code == 0, "\n".join(tail(log))
+
+
+class Test:
+    """Kills of the commands of one folder.
+
+    Args:
+        folder: where everything goes.
+        seed: of the moments and signals.
     """
-    data = tiny_data(folder)
-    whole, sweep = folder / "whole", folder / "killed"
-    words = [*TINY, "data=episodes", f"data.path={data}"]
-    begun = time.monotonic()
-    os.waitpid(start([*words, f"hydra.sweep.dir={whole}"], folder / "whole.log"), 0)
-    assert len(finished(whole)) == 2, "\n".join(tail(folder / "whole.log"))
-    length, chance = time.monotonic() - begun, random.Random(seed)
-    seen: Counter[str] = Counter()
-    words.append(f"hydra.sweep.dir={sweep}")
-    known: dict[str, int] = {}
-    for number in range(kills):
-        if time.monotonic() - begun > limit:
-            break
-        if len(known) == 2:  # all is done: begin anew
-            sweep.rename(folder / f"done{number}")
-            compare(whole, folder / f"done{number}")
-            known = {}
-            seen["sweeps completed"] += 1
-        delay = chance.uniform(0.0, 0.6 * length)
-        seen[disturb(words, sweep, folder / "killed.log", delay, chance.choice(SIGNALS))] += 1
-        now = finished(sweep) if sweep.exists() else {}
-        assert known.items() <= now.items(), f"lost or written again: {known} became {now}"
-        known = now
-        wrong = unreadable(sweep)
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder, self.chance, self.seen = folder, random.Random(seed), Counter[str]()
+        self.jobs = jobs(tiny_data(folder))
+        for name, job in self.jobs.items():
+            begun = time.monotonic()
+            complete(job, self.whole(name), self.log(name))
+            job.length = time.monotonic() - begun
+
+    def whole(self, name: str) -> Path:
+        """Return the folder of a command never killed."""
+        return self.folder / "whole" / name
+
+    def killed(self, name: str) -> Path:
+        """Return the folder of a command that is killed; another one once that came to its end."""
+        return self.folder / f"killed{self.jobs[name].completed}" / name
+
+    def log(self, name: str) -> Path:
+        """Return where a command's output goes."""
+        return self.folder / f"{name}.log"
+
+    def kill(self) -> bool:
+        """Kill a command once, check its files, and say whether the kill met one at work.
+
+        Raises:
+            AssertionError: saying what was lost, damaged or different.
+        """
+        names = list(self.jobs)
+        shares = [job.share for job in self.jobs.values()]
+        name = self.chance.choices(names, shares)[0]
+        job, folder = self.jobs[name], self.killed(name)
+        before, kind = finished(folder), self.chance.choice(SIGNALS)
+        all_ = kind == signal.SIGINT or self.chance.random() < 0.5  # as a terminal does
+        delay = self.chance.uniform(0.0, job.length)
+        what = disturb(job, folder, self.log(name), delay, kind, all_)
+        assert what != "hung", "a process did not react to its signal within a minute"
+        now, wrong = finished(folder), unreadable(folder)
+        assert before.items() <= now.items(), f"lost or changed: {before} became {now}"
         assert not wrong, "\n".join(wrong)
-    os.waitpid(start(words, folder / "killed.log"), 0)
-    compare(whole, sweep)
-    seen["sweeps completed"] += 1
-    assert not seen["hung"], "a process did not react to its signal within a minute"
-    return seen
+        if what == "was done":
+            self.end(name)
+            return False
+        self.seen[f"{what} of a {name}"] += 1
+        return True
+
+    def end(self, name: str) -> None:
+        """Check what a command left that came to its end, and begin another one."""
+        compare(self.whole(name), self.killed(name))
+        self.jobs[name].completed += 1
+        self.seen[f"{name}s completed"] += 1
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -180,14 +292,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop killing then")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="at most, of killing")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
+        test, done = Test(Path(folder), options.seed), 0
         begun = time.monotonic()
-        seen = run(options.kills, options.seed, Path(folder), options.seconds)
-    told = ", ".join(f"{count} {name}" for name, count in sorted(seen.items()))
-    print(f"{told}; {time.monotonic() - begun:.0f} s; nothing lost, all readable, rows identical")
+        while done < options.kills and time.monotonic() - begun < options.seconds:
+            done += test.kill()
+        for name, job in test.jobs.items():
+            complete(job, test.killed(name), test.log(name))
+            test.end(name)
+    told = ", ".join(f"{count} {name}" for name, count in sorted(test.seen.items()))
+    print(f"{done} kills: {told}; {time.monotonic() - begun:.0f} s", flush=True)
+    if done < options.kills:
+        sys.exit(f"too few: {done} of {options.kills} kills met a command at work")
+    print("nothing lost, all readable, rows identical")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from lcc_rl.config import require
-from lcc_rl.errors import require_whole
 from lcc_rl.schemas import TrainingConfig
 
 # Bytes of an iteration's row in the record: some twenty numbers under their names, twice.
@@ -46,13 +45,11 @@ class Footprint:
 
 
 def check_length(settings: TrainingConfig, horizon: int) -> None:
-    """Check the length of a training and of its parts.
+    """Check that the length of a training and those of its parts go together.
 
     Raises:
-        ConfigError: if a number is too small or the settings contradict each other.
+        ConfigError: if the settings contradict each other.
     """
-    for name in ("environments", "checkpoint_every"):
-        require_whole("training", 1, **{name: getattr(settings, name)})
     episodes, environments = settings.episodes, settings.environments
     require(
         episodes >= environments,
@@ -64,12 +61,8 @@ def check_length(settings: TrainingConfig, horizon: int) -> None:
         f"training.environments ({environments})",
     )
     require(
-        settings.segment >= 1 and horizon % settings.segment == 0,
+        horizon % settings.segment == 0,
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})",
-    )
-    keep = settings.keep_every
-    require(
-        keep is None or keep >= 1, f"training.keep_every must be at least 1, or null, got {keep}"
     )
 
 

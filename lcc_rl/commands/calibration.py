@@ -26,7 +26,7 @@ from lcc_rl.io.files import write_parquet
 from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 from lcc_rl.results.drawing import save
 from lcc_rl.results.report import MISSING
-from lcc_rl.results.runs import save_config
+from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.cli import prepare_torch
 from lcc_rl.runs.states import claim
 
@@ -50,6 +50,7 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
         ResultsError: if a file cannot be written.
     """
     with claim(Path(folder)):
+        check_folder(cfg, Path(folder))
         return _run(cfg, Path(folder), console or Console(highlight=False))
 
 

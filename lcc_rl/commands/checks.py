@@ -23,7 +23,7 @@ from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
-from lcc_rl.schemas import TrainConfig, check_ranges
+from lcc_rl.schemas import TrainConfig
 from lcc_rl.targets import TARGET
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
@@ -43,7 +43,6 @@ OBJECTIVES = {
     # Of the table of windows; it has no energies, the default is read as the first.
     "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
 }
-MOMENT = 64  # bytes of a moment of the one record that settings are tried on
 MEASURED = ("ttc", "time_gap", "power")
 
 
@@ -146,9 +145,6 @@ def check_sizes(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    check_ranges(cfg)
-    horizon = cfg.scenario.horizon
-    require_memory({f"scenario.horizon={horizon}": MOMENT * horizon})
     pieces = cfg.scenario.pieces
     measured = [name for name in MEASURED if pieces.get(name) is None]
     require(

@@ -25,7 +25,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.figures import write_study_figures
-from lcc_rl.results.runs import PRETRAINED, load_policy, save_config
+from lcc_rl.results.runs import PRETRAINED, check_folder, load_policy, save_config
 from lcc_rl.results.string_figures import write_platoon_figures
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
@@ -39,7 +39,13 @@ EPISODES, STEPS = "episodes.parquet", "steps.parquet"
 ROWS = ("episodes", "vehicles")
 
 
-def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = False) -> pd.DataFrame:
+def run(
+    cfg: DictConfig,
+    folder: str | Path,
+    own: bool = True,
+    quiet: bool = False,
+    replace: bool = False,
+) -> pd.DataFrame:
     """Evaluate a policy or rule, those it is compared with, and the baselines.
 
     All meet the same profiles, drivers and noise. Writes config.yaml, steps.parquet,
@@ -50,6 +56,7 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
         folder: where the files go.
         own: evaluate the configuration's own variant, not only what it is compared with.
         quiet: write the rows only: print no table, draw no figures.
+        replace: write over an evaluation of other settings.
 
     Returns:
         The rows of episodes.parquet.
@@ -58,10 +65,12 @@ def run(cfg: DictConfig, folder: str | Path, own: bool = True, quiet: bool = Fal
         LccError: one clear error for whatever is wrong with settings, data or files.
     """
     with claim(Path(folder)):
-        return _run(cfg, Path(folder), own, quiet)
+        if not replace:
+            check_folder(cfg, Path(folder))
+        return _run(cfg, Path(folder), own, quiet, replace)
 
 
-def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool) -> pd.DataFrame:
+def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> pd.DataFrame:
     prepare_torch(cfg)
     check_sizes(cfg)
     if own:
@@ -69,8 +78,8 @@ def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool) -> pd.DataFrame:
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     strategies, inputs = _strategies(cfg, own)
-    # The rows of an earlier evaluation must never stand beside the configuration of this one.
-    (folder / EPISODES).unlink(missing_ok=True)
+    if replace:  # rows of other settings must never stand beside this configuration
+        (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet:

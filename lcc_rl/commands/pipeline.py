@@ -20,13 +20,13 @@ from lcc_rl.commands.checks import check_settings, check_sizes
 from lcc_rl.config import load, plain, require
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source
-from lcc_rl.errors import Interrupted, ResultsError, require_whole
+from lcc_rl.errors import Interrupted, ResultsError
 from lcc_rl.io.files import atomic_path
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.drawing import save
 from lcc_rl.results.figures import learning_curve
 from lcc_rl.results.trust import check_targets
-from lcc_rl.runs.cli import most_parallel, prepare_torch, root_key
+from lcc_rl.runs.cli import prepare_torch, root_key
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
 from lcc_rl.targets import forget_places
@@ -64,7 +64,6 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
 def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> pd.DataFrame:
     prepare_torch(cfg)
     require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
-    require_whole("", 1, most_parallel(), jobs=cfg.jobs)
     shared = [item for item in overrides if root_key(item) not in OWN]
     # Every part is composed before the first one runs: a typo must not cost an hour.
     parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}

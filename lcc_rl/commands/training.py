@@ -21,7 +21,13 @@ from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import load_config, load_policy, save_config, save_policy
+from lcc_rl.results.runs import (
+    check_folder,
+    load_config,
+    load_policy,
+    save_config,
+    save_policy,
+)
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.cli import prepare_torch
@@ -66,6 +72,8 @@ def run(
             f"{folder} already holds a training; resume it with resume={folder} or choose another "
             "hydra.run.dir"
         )
+    elif not resume:
+        check_folder(cfg, folder)
     with working(folder):
         return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
 
@@ -153,6 +161,8 @@ def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
     if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return read_parquet(table)
+    if table.exists():
+        check_folder(cfg, folder)
     return run(cfg, folder, quiet=True, resume=True)
 
 

@@ -15,8 +15,9 @@ from lcc_rl.io.memory import require_memory
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
+DRAWN = 12  # bytes of an individual that takes part in a tournament: its number and fitness
 SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
-_LEAST = {"population": 4, "generations": 1, "founders": 1, "tournament": 1, "patience": 1}
+_LEAST = {"population": 4, "generations": 1, "founders": 1, "patience": 1}
 _INTERVALS = {
     **dict.fromkeys(("elites", "difference_rate", "mutation_rate"), "[0, 1]"),
     **dict.fromkeys(("mutation_start", "mutation_end"), "(0, inf)"),
@@ -64,6 +65,7 @@ class GeneticSettings:
             require_in("genetic", interval, **{name: getattr(self, name)})
         for name, least in _LEAST.items():
             require_whole("genetic", least, **{name: getattr(self, name)})
+        require_whole("genetic", 1, self.population, tournament=self.tournament)
         self.check_memory(1, 1)
 
     def check_memory(self, problems: int, dims: int, device: torch.device | str = "cpu") -> None:
@@ -74,7 +76,12 @@ class GeneticSettings:
         """
         largest = self.founders * self.population
         what = f"a genetic search of {problems} × {largest} (founders × population) individuals"
-        require_memory({what: problems * largest * (4 * dims + SIMULATED) * 4}, device)
+        drawn = f"genetic.tournament={self.tournament}"
+        needs = {
+            what: problems * largest * (4 * dims + SIMULATED) * 4,
+            drawn: problems * self.population * self.tournament * DRAWN,
+        }
+        require_memory(needs, device)
 
 
 @dataclass(frozen=True)

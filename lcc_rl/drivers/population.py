@@ -21,7 +21,7 @@ from lcc_rl.drivers.parameters import (
     checked_bounds,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
-from lcc_rl.errors import ConfigError, DataError, require_positive, require_whole
+from lcc_rl.errors import LAST_SEED, ConfigError, DataError, require_positive, require_whole
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.io.memory import require_memory
 
@@ -187,7 +187,7 @@ def kde(
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
     require_whole("drivers", 1, drivers=drivers)
-    require_whole("drivers", 0, seed=seed)
+    require_whole("drivers", 0, LAST_SEED, seed=seed)
     if bandwidth is not None:
         require_positive("drivers", bandwidth=bandwidth)
     require_memory({f"kde: drivers={drivers}": drivers * DRAWN})

@@ -30,12 +30,37 @@ POLICY_KEYS = (
     "scenario.filters",
 )
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
+# What no command of other settings may replace: results, and what a stopped run resumes from.
+KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "overrides.json")
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
     """Write the resolved configuration of a run into its folder."""
     with atomic_path(folder / CONFIG) as temporary:
-        temporary.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
+        temporary.write_text(_as_text(cfg))
+
+
+def check_folder(cfg: DictConfig, folder: Path) -> None:
+    """Refuse to write into a folder that holds results, or a stopped run, of other settings.
+
+    Raises:
+        ResultsError: naming what is there and the settings that differ.
+    """
+    kept = [name for name in KEPT if (folder / name).exists()]
+    if not kept:
+        return
+    stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
+    keys = differing(dict(flatten(stored)), dict(flatten(parse_yaml(_as_text(cfg), CONFIG))))
+    if keys:
+        names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
+        raise ResultsError(
+            f"{folder} already holds {kept[0]} of other settings ({names}); choose another "
+            "hydra.run.dir, or remove the folder"
+        )
+
+
+def _as_text(cfg: DictConfig) -> str:
+    return OmegaConf.to_yaml(OmegaConf.create(plain(cfg)))
 
 
 def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:

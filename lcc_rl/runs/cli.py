@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys, refused_by_hydra
-from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, require_whole
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.precision import set_precision
@@ -35,7 +35,6 @@ INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 DEVICES = ("cpu", "cuda")
 # Threads, or processes: more of them than this on any machine are a mistake, and can crash it.
-MOST_PARALLEL = 64
 NO_BEST = "No trials are completed"  # message of Optuna
 
 
@@ -230,19 +229,13 @@ def run_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def most_parallel() -> int:
-    """Return the largest number of threads or processes that a command starts here."""
-    return max(MOST_PARALLEL, 4 * (os.cpu_count() or 1))
-
-
 def prepare_torch(cfg: DictConfig) -> torch.device:
-    """Check ``seed``, ``threads`` and ``device``, set up torch and return the device.
+    """Check the numbers of a configuration and its device, set up torch and return the device.
 
     Raises:
-        ConfigError: if one of them is of the wrong type or impossible on this machine.
+        ConfigError: if a number is out of range or the device impossible on this machine.
     """
-    require_whole("", 0, seed=cfg.get("seed"))
-    require_whole("", 1, most_parallel(), threads=cfg.get("threads"))
+    check_ranges(cfg)
     try:
         device = torch.device(cfg.device)
         torch.empty(0, device=device)

@@ -25,7 +25,7 @@ from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import ConfigError, require_in, require_whole
+from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
 from lcc_rl.io.files import atomic_path, write_parquet
 from lcc_rl.io.memory import require_memory
 from lcc_rl.synthetic.lane import Stream, drive_platoons
@@ -73,7 +73,8 @@ class StreamSource:
     keep: str | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2), ("seed", 0)):
+        require_whole("data", 0, LAST_SEED, seed=self.seed)
+        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2)):
             require_whole("data", least, **{name: getattr(self, name)})
         try:
             low, high = map(float, self.duration_s)

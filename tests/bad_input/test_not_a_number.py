@@ -209,7 +209,9 @@ def test_a_training_names_what_it_would_have_learned_from(
     agent, overrides, words, value, tmp_path
 ) -> None:
     own = ("training.collector=torchrl",) if agent == "torchrl" else ()
-    words = words.format(value) + f" {EPISODE} in iteration 1 of .*; nothing is saved$"
+    words = words.format(value) + f" {EPISODE}"
+    if not (agent == "torchrl" and overrides is POWER):  # seen when the settings are tried
+        words += " in iteration 1 of .*; nothing is saved$"
     with pytest.raises(Diverged, match=words):
         train(tmp_path / "run", *own, *overrides)
     assert not (tmp_path / "run" / "policy.pt").exists()
@@ -342,7 +344,7 @@ def test_no_table_shows_what_is_no_number(number, tmp_path) -> None:
 
 
 def test_no_logger_is_told_what_is_no_number(tmp_path) -> None:
-    cfg = compose("alcc", *SMALL_TRAINING, "agent.critic_lr=1e12")
+    cfg = compose("alcc", *SMALL_TRAINING, "agent.critic_lr=1e9")
     trainer = make_trainer(cfg, make_agent(cfg), wavy_profiles(), POPULATION, tmp_path)
     told = []
     trainer.on_row = told.append

@@ -207,7 +207,7 @@ def evaluate_all(
     cfg.compare = [str(path) for path in runs]
     if not up_to_date(cfg, folder, runs):
         log.info("evaluating %d policies into %s", len(runs), folder)
-        evaluation.run(cfg, folder, own=own, quiet=True)
+        evaluation.run(cfg, folder, own=own, quiet=True, replace=True)
 
 
 PARTS = {
