@@ -152,6 +152,8 @@ def as_lists(value: Any) -> Any:
 EXCEPTIONS = {
     "agent/analytic.yaml": "nodes of pieces, of which a constructor has none",
     "surrogates/limits.yaml.surrogates.hdv_energy": "second use of PathEnergy",
+    "surrogates/limits.yaml.surrogates.efficiency": "second use of SmoothEfficiency",
+    "surrogates/prices.yaml.surrogates.hdv_energy": "second use of EnergyReward",
     "calibration/base.yaml": "which mode, and nodes, are the choice of a file",
     "calibration/base.yaml.global_genetic": "second use of GeneticSettings",
     "controller/idm.yaml": "one driver without noise; the class is that of drivers who differ",
@@ -219,6 +221,7 @@ PARTIAL = {
     "agent/tuned.yaml": "terms and limits are of its defaults list",
     "surrogates/limits.yaml.surrogates.cav_energy": "the weight is that of the reward",
     "surrogates/limits.yaml.surrogates.hdv_energy": "the weight is that of the reward",
+    "surrogates/prices.yaml.surrogates.hdv_energy": "weight and scale are those of the reward",
     "controller/handover.yaml": "before and after are of its defaults list",
 }
 

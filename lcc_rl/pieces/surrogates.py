@@ -107,8 +107,8 @@ class SmoothEfficiency(RewardTerm):
     def __init__(
         self,
         name: str = "efficiency",
-        weight: float = 4.0,
-        threshold: float = 2.4,
+        weight: float = 2.0,
+        threshold: float = 2.3,
         width: float = 0.05,
         speed_floor: float = 1.0,
         limit: float = 2.5,

@@ -51,7 +51,9 @@ def test_what_is_no_limit_is_refused(largest, words) -> None:
 
 
 def test_a_limit_that_is_null_is_a_fixed_price() -> None:
-    agent = make_agent(compose("alcc", "agent=analytic", "agent.limits.safety=null"))
+    agent = make_agent(
+        compose("alcc", "agent=analytic", "surrogates@agent=limits", "agent.limits.safety=null")
+    )
     assert set(agent.objective.limits.largest) == {"efficiency"}
 
 
@@ -66,7 +68,9 @@ def test_where_a_limit_is_missed() -> None:
 
 
 def test_the_record_says_shares_and_prices(tmp_path) -> None:
-    trainer = make(tmp_path, "training.episodes=32", "agent.limit_rate=0.5")
+    trainer = make(
+        tmp_path, "surrogates@agent=limits", "training.episodes=32", "agent.limit_rate=0.5"
+    )
     rows = trainer.run()
     for name in ("safety", "efficiency"):
         assert rows[f"share_{name}"].between(0.0, 1.0).all()

@@ -21,16 +21,6 @@ OPTIONS = {
     "controller.lookahead=oracle": "deployed.lookahead=oracle",
     "controller.jerk_bound=10": "deployed.jerk_bound=10",
 }
-# What the analytic agent maximised before its limits had learned prices.
-FIXED_PRICES = (
-    "agent.limits.safety=null",
-    "agent.limits.efficiency=null",
-    "agent.surrogates.efficiency.weight=2",
-    "agent.surrogates.efficiency.threshold=2.3",
-    "agent.surrogates.cav_energy=null",
-    "agent.surrogates.hdv_energy._target_=lcc_rl.pieces.EnergyReward",
-    "+agent.surrogates.hdv_energy.power=vehicles.power",
-)
 
 
 def renamed(overrides: Sequence[str]) -> list[str]:
@@ -43,4 +33,4 @@ def renamed(overrides: Sequence[str]) -> list[str]:
             continue
         new = OPTIONS.get(item, item)
         found += new.split(",") if ",scenario." in new else [new]
-    return [*found, *(FIXED_PRICES if "agent=analytic" in overrides else ())]
+    return found
