@@ -232,6 +232,7 @@ WITH = {
     "gains": ["variant=cacc"],
     "plausible": ["data=ngsim", "data.path=x"],
     "leader": ["variant=ddpg"],
+    "surrogates": ["agent=analytic"],
     "data/ngsim": ["data.path=x"],
     "data/episodes": ["data.path=x"],
     "leader/paper": ["leader.path=x"],
@@ -242,6 +243,7 @@ TYPED = {
     "filter": "+filter",
     "knowledge": "+knowledge",
     "plausible": "plausible@data.plausible",
+    "surrogates": "surrogates@agent",
     "controller": "controller@scenario.controllers.automated",
 }
 CHOICES = [name.removesuffix(".yaml") for name in files() if "/" in name]

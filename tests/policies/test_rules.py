@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from commands import tiny
 from helpers import compose, make_agent
 
+from lcc_rl.commands import evaluation, training
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, idm_acceleration
 from lcc_rl.functional.rules import linear_acc
@@ -83,3 +85,15 @@ def test_a_rule_must_see_what_it_needs() -> None:
 def test_the_agent_learns_the_constants_alone() -> None:
     agent = make_agent(compose("alcc", "agent=analytic", "agent.policy=idm"))
     assert [tuple(entry.shape) for entry in agent.policy.parameters()] == [(5,)]
+
+
+def test_a_rule_is_trained_stored_and_evaluated_like_a_network(tmp_path) -> None:
+    words = ("agent=analytic", "agent.policy=residual_idm", "surrogates@agent=limits")
+    small = ("agent.hidden=[8]", "training.segment=20", "training.environments=4")
+    folder = tmp_path / "run"
+    cfg = tiny("train", *words, *small, "training.episodes=8", agent=False)
+    training.run(cfg, folder, quiet=True)
+    cfg = tiny("evaluate", f"policy={folder}", "+filter=cbf", agent=False)
+    rows = evaluation.run(cfg, tmp_path / "evaluated", quiet=True)
+    assert set(rows["strategy"]) >= {"idm", "alcc"}
+    assert rows.loc[rows["strategy"] == "alcc", "total_path_energy_kj"].notna().all()
