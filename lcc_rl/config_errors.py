@@ -33,15 +33,15 @@ def refused_key(error: Exception) -> str | None:
 
 def refused_by_hydra(error: BaseException) -> bool:
     """Whether an error comes from Hydra or OmegaConf, which say some by ValueError or TypeError."""
-    if isinstance(error, OSError):  # of a file that Hydra writes
-        return False
     trail = error.__traceback__
     while trail is not None and trail.tb_next is not None:
         trail = trail.tb_next
     module = "" if trail is None else str(trail.tb_frame.f_globals.get("__name__"))
-    return isinstance(error, (HydraException, OmegaConfBaseException)) or (
-        isinstance(error, Exception) and module.partition(".")[0] in ("hydra", "omegaconf")
-    )
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return True
+    # An OSError is of a file that Hydra writes, and no fault of the options.
+    named = isinstance(error, Exception) and not isinstance(error, OSError)
+    return named and module.partition(".")[0] in ("hydra", "omegaconf")
 
 
 def explain(error: Exception, valid: Any) -> Exception:

@@ -30,7 +30,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.runs.interrupts import SIGNALS
 
 # Data that take a fraction of a second to generate; enough for every entry point.
-DATA = ("data.platoons=2", "data.recordings=2")
+DATA = ("data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]")
 HORIZON = "scenario.horizon=40"
 QUICK = "calibration.local_genetic.generations=2"
 AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")

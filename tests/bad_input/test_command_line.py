@@ -53,17 +53,20 @@ def mine(tmp_path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
-@pytest.mark.parametrize("node", ["data", "split", "drivers", "observation", "agent", AUTO])
+KINDS = (
+    ("foreign_pieces.Raises", "Raises cannot be built: KeyError: 'inside'"),
+    ("foreign_pieces.Other", "expected an? .*, Other is none"),
+    ("foreign_broken.X", "cannot find 'foreign_broken.X': on import"),
+    ("os.getcwd", "expected an? .*, str is none"),
+    ("os.sep", "'os.sep' is no class or function"),
+    ("builtins.dict", "cannot be built from settings"),
+)
+NODES = ("data", "split", "drivers", "observation", "agent", AUTO)
+
+
 @pytest.mark.parametrize(
-    ("target", "words"),
-    [
-        ("foreign_pieces.Raises", "Raises cannot be built: KeyError: 'inside'"),
-        ("foreign_pieces.Other", "expected an? .*, Other is none"),
-        ("foreign_broken.X", "cannot find 'foreign_broken.X': on import"),
-        ("os.getcwd", "expected an? .*, str is none"),
-        ("os.sep", "'os.sep' is no class or function"),
-        ("builtins.dict", "cannot be built from settings"),
-    ],
+    ("node", "target", "words"),
+    [*(("split", *kind) for kind in KINDS), *((node, *KINDS[1]) for node in NODES[:1] + NODES[2:])],
 )
 def test_a_node_of_the_wrong_kind_is_named(mine, tmp_path, node, target, words) -> None:
     cfg = load("train", ["experiment=smoke", "variant=alcc", f"{node}._target_={target}"])

@@ -71,8 +71,9 @@ def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path
     for path in (victim, other):
         change(run, data__keep=str(path))
         with caplog.at_level("WARNING", logger="lcc_rl"):
-            training.run(load("train", [f"resume={run}"]), run, quiet=True)
+            assert load_config(run).data.keep is None
         assert f"data.keep={path} names a place to write and is left out" in caplog.text
+    training.run(load("train", [f"resume={run}"]), run, quiet=True)
     assert victim.read_text() == "mine"
     assert not other.exists()
 
@@ -364,7 +365,10 @@ def test_an_action_that_means_another_acceleration(trained, tmp_path) -> None:
     assert "alcc" in set(rows["strategy"])
 
 
-@pytest.mark.parametrize("change", ["missing", "agent", "list", "policy"])
+@pytest.mark.parametrize(
+    "change",
+    ["missing", "policy", *(pytest.param(x, marks=pytest.mark.slow) for x in ("agent", "list"))],
+)
 def test_a_checkpoint_that_does_not_fit(run, change) -> None:
     path = run / "checkpoint.pt"
     state = torch.load(path, weights_only=True)

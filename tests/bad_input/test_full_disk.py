@@ -16,6 +16,9 @@ import pandas as pd
 import pytest
 import torch
 from commands import (
+    DATA,
+    NO_AGENT,
+    QUICK,
     TINY,
     assert_same_tables,
     jobs_in_threads,
@@ -39,8 +42,8 @@ from lcc_rl.runs.states import claim, is_claimed
 TRAIN = ("variant=alcc", *TINY)
 COMMANDS = {
     "train": TRAIN,
-    "evaluate": ("variant=idm", *TINY[:4]),
-    "calibrate": ("data.platoons=2", "data.recordings=2"),
+    "evaluate": ("variant=idm", *NO_AGENT),
+    "calibrate": (*DATA, QUICK),
     "pipeline": ("variants=[alcc]", *TINY),
 }
 

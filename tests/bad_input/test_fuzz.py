@@ -11,11 +11,9 @@ import torch
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 
-SEVEN = 7.0  # seconds of the short run
-
 
 def test_random_overrides_work_or_are_refused() -> None:
-    counts, failures = fuzz.run(iter(range(20)), time.monotonic() + SEVEN)
+    counts, failures = fuzz.run(iter(range(10)), time.monotonic() + 300.0)
     text = "\n".join(f"{case.overrides}: {trail}" for case, trail in failures)
     assert not failures, f"python -m tests.fuzz --case {failures[0][0].seed}\n{text}"
     assert {end.partition(" ")[2] for end in counts} <= {"works", "refused"}

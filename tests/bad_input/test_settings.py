@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import cache
 from math import inf, nan
 
 import pytest
@@ -176,27 +177,31 @@ def cases() -> Iterator[tuple[str, str, str, object]]:
             yield from ((override, place, key, value) for value in values)
 
 
+@cache
+def node_of(override: str, place: str) -> dict:
+    return plain(OmegaConf.select(composed(*filter(None, [override])), place))
+
+
 @pytest.mark.parametrize(("override", "place", "key", "value"), list(cases()))
 def test_a_bad_number_is_one_error_that_names_the_setting(override, place, key, value) -> None:
-    node = OmegaConf.select(composed(*filter(None, [override])), place).copy()
-    refused(node, place, key, value, RESOURCES)
+    refused(node_of(override, place), place, key, value, RESOURCES)
 
 
 @pytest.mark.parametrize(("override", "place"), sorted({node[:2] for node in NODES}))
 def test_the_rest_of_each_node_is_right(override, place) -> None:
-    build(OmegaConf.select(composed(*filter(None, [override])), place), place, **RESOURCES)
+    build(node_of(override, place), place, **RESOURCES)
 
 
 @pytest.mark.parametrize(("key", "value"), [(k, v) for k, vs in CALIBRATION.items() for v in vs])
 def test_a_bad_setting_of_the_calibration_is_named(key, value) -> None:
-    refused(CALIBRATE.copy(), "calibration", key, value, {})
+    refused(CALIBRATE, "calibration", key, value, {})
 
 
-CALIBRATE = load("calibrate").calibration
+CALIBRATE = plain(load("calibrate").calibration)
 
 
 def refused(node, place, key, value, resources) -> None:
-    node = OmegaConf.create(plain(node))
+    node = OmegaConf.create(node)
     OmegaConf.update(node, key, value, merge=False)
     with pytest.raises(ConfigError) as caught:
         build(node, place, **resources)
