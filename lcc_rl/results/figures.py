@@ -170,7 +170,7 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     found = savings(episodes, "hdv_path_energy_kj", strategy, "direct")
     figure.suptitle(
         f"Human driver's path energy with and without the controlled car ahead "
-        f"(n = {len(saving)} drivers)\nmean saving {_with_interval(found)}",
+        f"(n = {len(saving)} drivers)\nmean saving {_with_interval(found, episodes, strategy)}",
         fontsize=10,
     )
     return figure
@@ -185,7 +185,7 @@ def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> 
     found = savings(episodes, column, strategy, baseline)
     pairs = worse_off(paired(episodes, column), strategy, baseline)["pairs"]
     figure.suptitle(
-        f"{strategy} against {baseline}: saving of path energy {_with_interval(found)}\n"
+        f"{strategy} against {baseline}: saving of path energy {_with_interval(found, episodes, strategy)}\n"
         f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %; worse off: "
         f"{int((saving < 0).sum())} of {len(saving)} drivers, "
         f"{100 * pairs:.0f} % of (window, driver) pairs",
@@ -225,12 +225,14 @@ def _by_driver(
     return saving
 
 
-def _with_interval(found: Estimate) -> str:
+def _with_interval(found: Estimate, episodes: pd.DataFrame, strategy: str) -> str:
     """Return a share and its interval, in words."""
+    seeds = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
     if np.isnan(found.low):
         return f"{100 * found.value:+.1f} % (1 window, 1 training seed: no interval)"
     bounds = f"{100 * found.low:+.1f} … {100 * found.high:+.1f} %"
-    return f"{100 * found.value:+.1f} % (95 % interval {bounds})"
+    over = "windows; 1 training seed" if seeds == 1 else "windows and seeds"
+    return f"{100 * found.value:+.1f} % (95 % interval over {over}: {bounds})"
 
 
 def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:

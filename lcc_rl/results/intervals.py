@@ -58,7 +58,9 @@ def saving(values: ArrayLike, baseline: ArrayLike) -> Estimate:
     A clustered bootstrap: held-out windows and training seeds are resampled crosswise (the
     pigeonhole bootstrap, Owen 2007). Both sides meet the same windows; the seeds of two trainings
     are independent. Of n windows or seeds n − 1 are drawn, which makes the variance of a mean
-    unbiased (Rao and Wu 1988). With fewer than about five seeds the interval is too narrow.
+    unbiased (Rao and Wu 1988). Of synthetic data with 20 windows, 95 % intervals of eight seeds
+    hold the truth in 90 to 97 % of cases, of four in 80 to 91 %, of two in 61 to 84 %: the fewer
+    seeds, and the more they matter, the narrower it is by mistake.
 
     Args:
         values: mean energy over all drivers, ``[windows, seeds]``.

@@ -125,8 +125,9 @@ def generalization_row(
     """Distribution of the savings over held-out profiles, beside the paper's four profiles.
 
     Returns:
-        Rows for this study's path energy and energy as drawn and for the paper: ``together_pct``, the saving
-        of the energy of all profiles, and the least, median and largest of a profile.
+        Rows for this study's path energy and energy as drawn and for the paper:
+        ``together_pct``, the saving of the energy of all profiles, and the least, median and
+        largest of a profile.
     """
     table = generalization(episodes, strategy, baseline)
     rows = []

@@ -60,8 +60,7 @@ def _headline(page: Page, episodes: pd.DataFrame) -> None:
         "over all seeds; savings are positive where energy is saved. Path energy is what the "
         "speeds driven take and accelerating loses; energy as drawn (the paper's) also counts what "
         "the last speed stores more than the first, and so rewards ending slower than one began. "
-        f"{sure}"
-        + "".join(f"\n\nWarning: {line}." for line in leader_too_fast(episodes))
+        f"{sure}" + "".join(f"\n\nWarning: {line}." for line in leader_too_fast(episodes))
     )
     drawn = [
         (
@@ -126,7 +125,8 @@ def _generalization(page: Page, episodes: pd.DataFrame) -> None:
     text = (
         "The paper tries its controller on four profiles it was not trained on. Here every profile "
         "is held out: no recording is in both training and evaluation. A percentage of a profile's "
-        "small energy as drawn, as in a jam, says little; together is the saving of all profiles' energy."
+        "small energy as drawn, as in a jam, says little; together is the saving of all profiles' "
+        "energy."
     )
     caption = "Saving of alcc against reference over profiles, beside the paper's 4"
     table = paper_tables.generalization(episodes)
@@ -150,8 +150,8 @@ def _human(page: Page, episodes: pd.DataFrame) -> None:
     drawn = [
         (
             f"human_energy_{name}",
-            f"Counterpart of Fig. 9: human driver's path energy behind {name}, and the saving of every "
-            "driver, mean over profiles and seeds.",
+            f"Counterpart of Fig. 9: human driver's path energy behind {name}, and the saving of "
+            "every driver, mean over profiles and seeds.",
             run_figures.human_energy(episodes, name),
         )
         for name in ("alcc", "reference")

@@ -38,8 +38,8 @@ def energies(episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         One row per strategy: seeds, path energy of both vehicles and energy as drawn, the path's
-        parts at constant speed and lost by accelerating, and what CAV and HDV draw [kJ]. Intervals are over
-        seeds only: they say how much trainings differ on these windows.
+        parts at constant speed and lost by accelerating, and what CAV and HDV draw [kJ].
+        Intervals are over seeds only: they say how much trainings differ on these windows.
     """
     rows = []
     for strategy in dict.fromkeys(episodes["strategy"]):
