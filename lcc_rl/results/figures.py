@@ -137,7 +137,7 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
         known = label != "idm" and "idm" in totals
         saving = f"\n({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
         right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
-    right.set_ylim(0.0, 1.2 * totals.max())
+    right.set_ylim(0.0, 1.3 * totals.max())
     style(right, "", "path energy [kJ per episode]")
     right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
     right.set_title(
@@ -170,7 +170,8 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     found = savings(episodes, "hdv_path_energy_kj", strategy, "direct")
     figure.suptitle(
         f"Human driver's path energy with and without the controlled car ahead "
-        f"(n = {len(saving)} drivers)\nmean saving {_with_interval(found, episodes, strategy)}",
+        f"(n = {len(saving)} drivers)\n"
+        f"mean saving {_with_interval(found, episodes, strategy)}",
         fontsize=10,
     )
     return figure
@@ -184,8 +185,9 @@ def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> 
     saving = _by_driver(figure, episodes, column, names, "both vehicles")
     found = savings(episodes, column, strategy, baseline)
     pairs = worse_off(paired(episodes, column), strategy, baseline)["pairs"]
+    share = _with_interval(found, episodes, strategy)
     figure.suptitle(
-        f"{strategy} against {baseline}: saving of path energy {_with_interval(found, episodes, strategy)}\n"
+        f"{strategy} against {baseline}: saving of path energy {share}\n"
         f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %; worse off: "
         f"{int((saving < 0).sum())} of {len(saving)} drivers, "
         f"{100 * pairs:.0f} % of (window, driver) pairs",
@@ -221,7 +223,7 @@ def _by_driver(
     baseline, strategy = names
     saving = share_saved(energy[strategy], energy[baseline])
     against = " against ".join(label.split(":")[0] for label in (names[strategy], names[baseline]))
-    _paired_bars(right, saving, f"path energy saved, {against} [%]", colour(strategy))
+    _paired_bars(right, saving, f"path energy saved\n{against} [%]", colour(strategy))
     return saving
 
 

@@ -94,22 +94,22 @@ def _against(
 def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
     name = f"saving_vs_{baseline}"
     return (
-        (f"saving of path energy against {baseline}", f"path_{name}", "{:+.1%}"),
-        ("  95 % interval, from", f"path_{name}_low", "{:+.1%}"),
-        ("  … to", f"path_{name}_high", "{:+.1%}"),
-        ("  of energy as drawn", name, "{:+.1%}"),
-        ("  worse off: (window, driver) pairs", f"pairs_worse_than_{baseline}", "{:.0%}"),
-        ("  worse off: drivers", f"drivers_worse_than_{baseline}", "{:.0%}"),
+        (f"path energy saved against {baseline}", f"path_{name}", "{:+.1%}"),
+        ("  95 % interval, low", f"path_{name}_low", "{:+.1%}"),
+        ("    high", f"path_{name}_high", "{:+.1%}"),
+        ("  energy as drawn", name, "{:+.1%}"),
+        ("  pairs worse off", f"pairs_worse_than_{baseline}", "{:.0%}"),
+        ("  drivers worse off", f"drivers_worse_than_{baseline}", "{:.0%}"),
     )
 
 
 ROWS = (
     ("path energy [kJ]", PATH, "{:.1f}"),
-    ("  of it lost to accelerating [kJ]", LOST, "{:.1f}"),
+    ("  lost to accelerating [kJ]", LOST, "{:.1f}"),
     ("energy as drawn [kJ]", "total_energy_kj", "{:.1f}"),
     ("  CAV [kJ]", "cav_energy_kj", "{:.1f}"),
     ("  HDV [kJ]", "hdv_energy_kj", "{:.1f}"),
-    ("  per vehicle-kilometre [kJ/km]", "kj_per_km", "{:.0f}"),
+    ("  per vehicle and km [kJ]", "kj_per_km", "{:.0f}"),
     *(row for baseline in BASELINES for row in _rows_against(baseline)),
     ("collisions", "collisions", "{:d}"),
     ("minimum time-to-collision [s]", "min_ttc_s", "{:.2f}"),
@@ -151,7 +151,8 @@ def as_rich(table: pd.DataFrame, title: str) -> Table:
     """Return a summary as a table for the terminal, a column per strategy."""
     caption = (
         "energies: mean per episode; direct: no controlled car; path energy: without what the "
-        "motion stores; intervals: over held-out windows and training seeds"
+        "motion stores; intervals: over held-out windows and training seeds; pairs: of a window "
+        "and a driver"
     )
     return strategies_side_by_side(table, ROWS, title, caption)
 

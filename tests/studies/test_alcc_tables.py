@@ -11,6 +11,7 @@ from lcc_rl.studies.alcc import tables as alcc_tables
 
 # Mean energy of the human driver: + 2 kJ per driver number, + 5 kJ for the second of two profiles.
 SHIFT = 2.0 + 5.0
+ENERGY, SPEED = "leader path energy [kJ]", "leader speed [m/s]"
 
 
 def test_seeds_are_kept_apart() -> None:
@@ -65,14 +66,14 @@ def test_savings_in_thirds_of_the_windows() -> None:
     assert set(table["against"]) == {"idm", "reference"}
     rows = table[table["against"] == "idm"].set_index(["by", "tercile"])
     assert rows["windows"].tolist() == [2] * 6
-    high, slow = rows.loc[("leader_path_energy_kj", "upper")], rows.loc["leader_speed_mps", "lower"]
+    high, slow = rows.loc[(ENERGY, "upper")], rows.loc[SPEED, "lower"]
     assert (high["least"], high["most"], slow["least"]) == (70.0, 80.0, 4.0)
     assert high["saving_pct"] == pytest.approx(slow["saving_pct"])
     # Windows 4 and 5: the follower behind idm draws 50 + 2 + 45 kJ; idm 100 and the paths 20 less.
     human = 40.0 + 2.0 + 45.0 + 20.0 / 3
     assert high["saving_pct"] == pytest.approx(100 * (1 - (86.0 + human - 50.0) / (197.0 - 20.0)))
     assert (rows["saving_pct_low"] <= rows["saving_pct"]).all()
-    assert high["saving_pct_low"] > rows.loc["leader_path_energy_kj"]["saving_pct"].min()
+    assert high["saving_pct_low"] > rows.loc[ENERGY]["saving_pct"].min()
 
 
 def test_energies_cover_every_strategy() -> None:

@@ -157,9 +157,8 @@ def _energies_by_profile(
         rows = episodes[episodes["strategy"] == name].groupby("profile_id")[columns].mean()
         car, human = (rows.loc[order, column].to_numpy(float) for column in columns)
         axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{name}: car")
-        axis.bar(
-            places + offset, human, 0.4, car, color=colour(name), alpha=0.45, label="human driver"
-        )
+        label = f"{name}: human driver"
+        axis.bar(places + offset, human, 0.4, car, color=colour(name), alpha=0.45, label=label)
     axis.set_ylim(top=1.3 * axis.get_ylim()[1])
     axis.legend(frameon=False, loc="upper left", ncols=4, fontsize=9)
     style(axis, "", "path energy\n[kJ per episode]")

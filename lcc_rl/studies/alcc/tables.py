@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.results.intervals import mean, share_saved
+from lcc_rl.results.report import heading
 from lcc_rl.results.savings import (
     BASELINES,
     HUMANS,
@@ -103,6 +104,7 @@ def strata(episodes: pd.DataFrame) -> pd.DataFrame:
         if baseline != name and (episodes["strategy"] == baseline).any()
     ]
     table = pd.concat(parts, ignore_index=True)
+    table["by"] = table["by"].map(heading)
     return table[["strategy", "against", *table.columns.drop(["strategy", "against"])]]
 
 
