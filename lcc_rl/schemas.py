@@ -99,7 +99,7 @@ class TrainConfig(StudyConfig):
 
     resume: str | None = None
     sweep: str | None = None
-    objective: Any = "total_net_energy_kj"
+    objective: Any = "total_path_energy_kj"
     policy: str | None = None
     logger: Any = MISSING
 

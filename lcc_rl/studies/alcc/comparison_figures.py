@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 
 from lcc_rl.results.drawing import new_figure
 from lcc_rl.results.figures import colour, style
-from lcc_rl.results.tables import HUMANS, per_seed
+from lcc_rl.results.savings import HUMANS, per_seed
 from lcc_rl.studies.alcc.tables import comparison
 
 INK, SOFT = "#222222", "#8a8a8a"
 PANELS = {
-    "saving_against_idm_pct": ("total energy saved\nagainst idm [%]", 0.0),
+    "path_saving_against_idm_pct": ("path energy saved\nagainst idm [%]", 0.0),
     "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
     "long_time_gap_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
 }
@@ -98,7 +98,7 @@ def followers_figure(episodes: pd.DataFrame) -> Figure:
     """
     table = comparison(episodes, "followers")
     table = table[table["strategy"] != "reference"]
-    column = "saving_against_reference_pct"
+    column = "path_saving_against_reference_pct"
     figure = new_figure(6.5, 3.8)
     axis = figure.subplots()
     names = list(dict.fromkeys(table["strategy"]))
@@ -110,7 +110,7 @@ def followers_figure(episodes: pd.DataFrame) -> Figure:
         whiskers(axis, places, part, column, colour(name), upright=True)
     axis.axhline(0.0, color=INK, lw=0.8)
     axis.legend(frameon=False, loc="lower left")
-    words = "total energy saved\nagainst reference [%]"
+    words = "path energy saved\nagainst reference [%]"
     style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
     return figure
 

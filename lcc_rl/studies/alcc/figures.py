@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.drawing import new_figure
 from lcc_rl.results.figures import colour, draw_curve, style
-from lcc_rl.results.tables import by_driver, savings
+from lcc_rl.results.savings import by_driver, savings
 from lcc_rl.studies.alcc.comparison_figures import INK, SOFT, whiskers
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 
@@ -77,7 +77,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
 
 
 def distributions(episodes: pd.DataFrame) -> Figure:
-    """Energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
+    """Path energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
 
     A driver's value is its mean over the held-out profiles and seeds. Boxes span the quartiles,
     whiskers the 5th to 95th percentile; a diamond marks the mean.
@@ -87,14 +87,14 @@ def distributions(episodes: pd.DataFrame) -> Figure:
     axes = figure.subplots(1, 2)
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
     for axis, vehicle in zip(axes, ("cav", "hdv"), strict=True):
-        energy = by_driver(episodes, f"{vehicle}_energy_kj")
+        energy = by_driver(episodes, f"{vehicle}_path_energy_kj")
         for place, name in enumerate(names):
             if name in energy:
                 _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
         axis.set_yticks(range(len(names)), names if vehicle == "cav" else [""] * len(names))
         axis.set_ylim(len(names) - 0.4, -0.6)
         axis.margins(x=0.12)
-        style(axis, "energy [kJ per episode]", "")
+        style(axis, "path energy [kJ per episode]", "")
         axis.set_title(f"{titles[vehicle]}, n = {len(energy)} drivers", fontsize=10)
     note = "box: quartiles; whiskers: 5th to 95th percentile; diamond and number: mean"
     figure.supxlabel(note, fontsize=8, color=SOFT)
@@ -121,28 +121,47 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
 def generalization_figure(
     episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> Figure:
-    """Saving of total energy on every held-out profile, beside the paper's four (Fig. 12)."""
-    table = generalization(episodes, strategy, baseline).sort_values("saving_pct")
-    values, places = table["saving_pct"].to_numpy(float), np.arange(len(table))
-    figure = new_figure(9.0, 4.0)
-    axis = figure.subplots()
-    whiskers(axis, places, table, "saving_pct", colour(strategy), upright=True)
-    axis.plot(places, values, "o", color=colour(strategy), label=_label(episodes, strategy))
+    """Path energy of both vehicles on every held-out profile, and its saving (Fig. 12)."""
+    table = generalization(episodes, strategy, baseline).sort_values("path_saving_pct")
+    figure = new_figure(9.0, 6.5)
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
+    _energies_by_profile(above, episodes, table["profile_id"].tolist(), (baseline, strategy))
+    values, places = table["path_saving_pct"].to_numpy(float), np.arange(len(table))
+    whiskers(below, places, table, "path_saving_pct", colour(strategy), upright=True)
+    below.plot(places, values, "o", color=colour(strategy), label=_label(episodes, strategy))
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
-    axis.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label="paper, 4 profiles")
-    axis.axhline(0.0, color=INK, lw=0.8)
-    together = 100 * savings(episodes, "total_energy_kj", strategy, baseline).value
+    label = "paper, 4 profiles, energy as drawn"
+    below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
+    below.axhline(0.0, color=INK, lw=0.8)
+    together = 100 * savings(episodes, "total_path_energy_kj", strategy, baseline).value
     line = f"all profiles together {together:+.1f} %"
-    axis.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
-    _cut_outliers(axis, places, values)
-    axis.set_xticks([])
+    below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
+    _cut_outliers(below, places, values)
+    below.set_xticks([])
     style(
-        axis,
-        f"held-out profiles, sorted (n = {len(table)}); right: the paper's",
-        f"total energy saved by {strategy}\nagainst {baseline} [%]",
+        below,
+        f"held-out profiles, sorted by the saving (n = {len(table)}); right: the paper's",
+        f"path energy saved by {strategy}\nagainst {baseline} [%]",
     )
-    axis.legend(frameon=False, loc="upper left")
+    below.legend(frameon=False, loc="upper left", fontsize=9)
     return figure
+
+
+def _energies_by_profile(
+    axis: Axes, episodes: pd.DataFrame, order: list[object], names: tuple[str, str]
+) -> None:
+    """Draw the path energy of car and human driver on every profile under two strategies."""
+    places = np.arange(len(order))
+    for name, offset in zip(names, (-0.21, 0.21), strict=True):
+        columns = [f"{vehicle}_path_energy_kj" for vehicle in ("cav", "hdv")]
+        rows = episodes[episodes["strategy"] == name].groupby("profile_id")[columns].mean()
+        car, human = (rows.loc[order, column].to_numpy(float) for column in columns)
+        axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{name}: car")
+        label = f"{name}: human driver"
+        axis.bar(places + offset, human, 0.4, car, color=colour(name), alpha=0.45, label=label)
+    axis.set_ylim(top=1.3 * axis.get_ylim()[1])
+    axis.legend(frameon=False, loc="upper left", ncols=4, fontsize=9)
+    style(axis, "", "path energy\n[kJ per episode]")
 
 
 def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:

@@ -9,13 +9,20 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.results.intervals import share_saved
-from lcc_rl.results.tables import by_driver, driver_savings, per_seed, savings
-from lcc_rl.studies.alcc.tables import KINDS
+from lcc_rl.results.savings import KINDS, by_driver, driver_savings, per_seed, savings
 
 PAPER, OURS = "paper", "this study"
-NAMES = {"": "raw", "net_": "net of kinetic energy"}  # of the keys of KINDS
+NAMES = {"path_": "path energy", "": "as drawn"}  # of the keys of KINDS
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
-PAPER_TABLE_IV = {"reference": (214.85, 193.89, 408.74), "alcc": (226.46, 164.38, 390.84)}
+# CAV, HDV and total energy [kJ].
+PAPER_TABLE_IV = {
+    ("mean", "reference"): (214.85, 193.89, 408.74),
+    ("mean", "alcc"): (226.46, 164.38, 390.84),
+    ("best", "reference"): (214.85, 201.91, 416.76),
+    ("best", "alcc"): (221.03, 135.59, 356.62),
+    ("worst", "reference"): (214.85, 202.52, 417.37),
+    ("worst", "alcc"): (227.11, 210.81, 437.92),
+}
 PAPER_IMPROVEMENT = {"mean": 4.38, "best": 14.43, "worst": -4.92}
 PAPER_WORSE = (138, 923)
 PAPER_GENERALIZATION = (7.00, 8.04, 9.35, 4.62)
@@ -32,7 +39,8 @@ def table_iv(
 
     Returns:
         Rows for both controllers and each driver, this study's and the paper's: CAV, HDV and
-        total energy [kJ], and the total saved [%], raw and net of kinetic energy.
+        total energy [kJ], and the total saved [%], of the path and as drawn. The paper's are as
+        drawn.
     """
     columns = [f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in KINDS.values()]
     energies = {column: by_driver(episodes, column) for column in columns}
@@ -53,14 +61,15 @@ def table_iv(
 
 
 def _paper_row(driver: str, name: str, strategy: str) -> list[dict[str, object]]:
-    """Return the paper's row: energies of the mean driver, savings only of the others."""
+    """Return the paper's row, where it prints one."""
+    if (driver, name) not in PAPER_TABLE_IV:
+        return []
     row: dict[str, object] = {"driver": driver, "strategy": name, "from": PAPER}
-    if driver == "mean" and name in PAPER_TABLE_IV:
-        keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
-        row |= dict(zip(keys, PAPER_TABLE_IV[name], strict=True))
-    if name == strategy == "alcc":
+    keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
+    row |= dict(zip(keys, PAPER_TABLE_IV[driver, name], strict=True))
+    if name == strategy:
         row["saving_pct"] = PAPER_IMPROVEMENT[driver]
-    return [row] if len(row) > 3 else []
+    return [row]
 
 
 def holistic(
@@ -89,21 +98,24 @@ def holistic(
 def generalization(
     episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
-    """Saving of the total energy on every held-out profile, with its interval over seeds.
+    """Energies and savings on every held-out profile, with intervals over seeds (Fig. 12).
 
     Returns:
-        One row per profile: the baseline's mean energy [kJ], ``saving_pct`` and
-        ``net_saving_pct`` of the strategy against the baseline, and ``saving_against_idm_pct``.
+        One row per profile: path energy of both vehicles under the baseline and the strategy
+        [kJ], ``path_saving_pct`` and, as drawn, ``saving_pct`` of the strategy against the
+        baseline, and ``path_saving_against_idm_pct``.
     """
+    path = "total_path_energy_kj"
     rows = []
     for profile, part in episodes.groupby("profile_id", sort=True):
         row: dict[str, object] = {"profile_id": profile, "profile": part["profile"].iloc[0]}
-        row[f"{baseline}_energy_kj"] = per_seed(part, "total_energy_kj")[baseline].mean()
+        energy = per_seed(part, path)
+        row |= {f"{name}_path_energy_kj": energy[name].mean() for name in (baseline, strategy)}
         for kind, column in KINDS.items():
             found = savings(part, f"total_{column}", strategy, baseline)
             row |= found.columns(f"{kind}saving_pct", 100.0)
-        against = savings(part, "total_energy_kj", strategy, "idm")
-        rows.append(row | against.columns("saving_against_idm_pct", 100.0))
+        against = savings(part, path, strategy, "idm")
+        rows.append(row | against.columns("path_saving_against_idm_pct", 100.0))
     return pd.DataFrame(rows)
 
 
@@ -113,8 +125,9 @@ def generalization_row(
     """Distribution of the savings over held-out profiles, beside the paper's four profiles.
 
     Returns:
-        Rows for this study's raw and net energy and for the paper: ``together_pct``, the saving
-        of the energy of all profiles, and the least, median and largest of a profile.
+        Rows for this study's path energy and energy as drawn and for the paper:
+        ``together_pct``, the saving of the energy of all profiles, and the least, median and
+        largest of a profile.
     """
     table = generalization(episodes, strategy, baseline)
     rows = []
@@ -142,7 +155,7 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         One row per strategy and kind of energy: both means [kJ], the saving of A [%] with its
-        interval over seeds, and the least and largest saving of a driver.
+        interval over windows and seeds, and the least and largest saving of a driver.
     """
     rows: list[dict[str, object]] = []
     for strategy in per_seed(episodes, "total_energy_kj"):
@@ -165,7 +178,7 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
     rows.append(
         {
             "behind": f"alcc ({PAPER})",
-            "energy": "raw",
+            "energy": NAMES[""],
             "scenario_A_kj": PAPER_HUMAN["A"],
             "scenario_B_kj": PAPER_HUMAN["B"],
             "saving_pct": PAPER_HUMAN_SAVING["mean"],

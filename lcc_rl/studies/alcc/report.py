@@ -71,7 +71,7 @@ def _filter(page: Page) -> None:
     caption = f"Without and with the filter, {size(first)}"
     shown = [
         ("filter", caption, tables.comparison(episodes, "filter")),
-        ("filter_headline", "Total energy saved", tables.headline(first)),
+        ("filter_headline", "Energy of both saved", tables.headline(first)),
         ("filter_constraints", "All episodes", tables.constraints(first)),
         ("filter_by_seed", "Every seed", tables.constraints_by_seed(first)),
         ("filter_human", "Human driver's energy", human_energy(first)),
@@ -106,7 +106,7 @@ def _ablations(page: Page) -> None:
     episodes = _beside_main(page, frames, ablation=ITSELF)
     text = (
         "Each line changes one thing of the recipe by an override and trains anew; savings are "
-        "against the human in the same scenario, so that a change of the scenario (no "
+        "against the humans in the same scenario, so that a change of the scenario (no "
         "recuperation) is compared with itself."
     )
     caption = "Energy, safety and efficiency under each change."
@@ -134,7 +134,7 @@ def _followers(page: Page) -> None:
     if episodes is None:
         return
     text = (
-        "Total energy is that of the controlled car and of all human drivers behind it. Unless "
+        "Energies are those of the controlled car and of all human drivers behind it. Unless "
         "the study's overrides say otherwise, the controllers learn by the gradient through the "
         "simulator (agent=analytic), which is more precise than DDPG, and are evaluated on every "
         f"held-out window ({size(episodes)}). Time gaps and times-to-collision tell "

@@ -1,18 +1,34 @@
-"""Tables of energy, safety and learning in the ALCC study, with 95 % intervals over seeds."""
+"""Tables of energy, safety and learning in the ALCC study, with 95 % intervals."""
 
 from __future__ import annotations
 
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.intervals import Estimate, mean, share_saved
-from lcc_rl.results.tables import BASELINES, HUMANS, per_seed, savings
+from lcc_rl.results.intervals import mean, share_saved
+from lcc_rl.results.report import heading
+from lcc_rl.results.savings import (
+    BASELINES,
+    HUMANS,
+    KINDS,
+    NOTHING,
+    paired,
+    per_seed,
+    per_window,
+    savings,
+    stratified,
+    worse_off,
+)
 
-KINDS = {"": "energy_kj", "net_": "net_energy_kj"}  # raw; net of the change in kinetic energy
-PARTS = ("steady_energy_kj", "acceleration_loss_kj")
+PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
 COMPARED = (*BASELINES, "own_energy")
-SHARES = {"unsafe_ttc_pct": "share_ttc_unsafe", "long_time_gap_pct": "share_time_gap_long"}
-LIMITS = {"unsafe_ttc_pct": 0.1, "long_time_gap_pct": 1.0}  # share of time [%], for every seed
+LONG, MOVING = "long_time_gap_pct", "long_time_gap_above_1_mps_pct"
+SHARES = {
+    "unsafe_ttc_pct": "share_ttc_unsafe",
+    LONG: "share_time_gap_long",
+    MOVING: "share_time_gap_long_moving",
+}
+LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # share of time [%], for every seed
 
 
 def energies(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -22,33 +38,37 @@ def energies(episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of an evaluation: every strategy on the same profiles and drivers.
 
     Returns:
-        One row per strategy: seeds, energy of CAV, HDV and both [kJ], the latter also net of the
-        change in kinetic energy, with intervals over seeds; and its parts at constant speed and
-        lost by accelerating.
+        One row per strategy: seeds, path energy of both vehicles and energy as drawn, the path's
+        parts at constant speed and lost by accelerating, and what CAV and HDV draw [kJ].
+        Intervals are over seeds only: they say how much trainings differ on these windows.
     """
     rows = []
     for strategy in dict.fromkeys(episodes["strategy"]):
         part = episodes[episodes["strategy"] == strategy]
         row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(episodes, strategy)}
+        for column in (f"total_{name}" for name in KINDS.values()):
+            energy = part.groupby("training_seed", dropna=False)[column].mean()
+            row |= mean(energy).columns(column)
+        row |= part[list(PARTS)].mean().to_dict()
         row |= {f"{v}_energy_kj": part[f"{v}_energy_kj"].mean() for v in ("cav", "hdv")}
-        for kind, column in KINDS.items():
-            energy = part.groupby("training_seed", dropna=False)[f"total_{column}"].mean()
-            row |= mean(energy).columns(f"total_{kind}energy_kj")
-        rows.append(row | part[[f"total_{name}" for name in PARTS]].mean().to_dict())
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
 def headline(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Savings of the total energy, raw and net of the change in kinetic energy.
+    """Savings of the total energy: of its path, and as drawn.
 
     Args:
         episodes: rows of an evaluation: every strategy on the same profiles and drivers.
 
     Returns:
         One row per trained strategy and baseline: the share saved [%] with its interval over
-        seeds, and that of the worst seed.
+        windows and seeds, that of the worst seed, and the (window, driver) pairs whose path takes
+        more [%].
     """
-    found = per_seed(episodes, "total_energy_kj")
+    columns = [f"total_{column}" for column in KINDS.values()]
+    windows, path = per_window(episodes, columns), paired(episodes, columns[0])
+    found = per_seed(episodes, columns[0])
     learned = [name for name in found if name not in HUMANS]
     rows = []
     for strategy in learned:
@@ -56,13 +76,36 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
             row["seeds"] = _seeds(episodes, strategy)
             for kind, column in KINDS.items():
-                share = savings(episodes, f"total_{column}", strategy, baseline)
+                share = savings(windows, f"total_{column}", strategy, baseline)
                 row |= share.columns(f"{kind}saving_pct", 100.0)
-                values = per_seed(episodes, f"total_{column}")
+                values = per_seed(windows, f"total_{column}")
                 worst = share_saved(values[strategy].max(), values[baseline].mean())
                 row[f"worst_seed_{kind}saving_pct"] = 100.0 * worst
+            row["pairs_worse_off_pct"] = 100.0 * worse_off(path, strategy, baseline)["pairs"]
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def strata(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Savings of path energy in the terciles of windows by what their leader does.
+
+    Returns:
+        The rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained
+        strategy without it, against each baseline.
+    """
+    names = [name for name in per_seed(episodes, "total_path_energy_kj") if name not in HUMANS]
+    kept = ["alcc"] if "alcc" in names else names
+    parts = [
+        stratified(episodes, "total_path_energy_kj", name, baseline).assign(
+            strategy=name, against=baseline
+        )
+        for name in kept
+        for baseline in COMPARED
+        if baseline != name and (episodes["strategy"] == baseline).any()
+    ]
+    table = pd.concat(parts, ignore_index=True)
+    table["by"] = table["by"].map(heading)
+    return table[["strategy", "against", *table.columns.drop(["strategy", "against"])]]
 
 
 def _seeds(episodes: pd.DataFrame, strategy: str) -> str:
@@ -155,30 +198,33 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
         by: the column that names the change.
 
     Returns:
-        One row per change and trained strategy: total energy [kJ], savings against each of
-        :data:`COMPARED` [%] with intervals over seeds, collisions, shares of time [%], and RMS
-        jerk [m/s³]; energy and jerk also of the worst seed.
+        One row per change and trained strategy: path energy [kJ], its savings against each of
+        :data:`COMPARED` [%] with intervals over windows and seeds, energy as drawn [kJ],
+        collisions, shares of time [%], and RMS jerk [m/s³]; path energy and jerk also of the
+        worst seed. Intervals of other than savings are over seeds only.
     """
     baselines = [name for name in COMPARED if (episodes["strategy"] == name).any()]
+    path = "total_path_energy_kj"
     rows = []
     for change, part in episodes.groupby(by, sort=False):
-        for strategy, energy in per_seed(part, "total_energy_kj").items():
+        windows = per_window(part, [path, "total_energy_kj", *SHARES.values(), "rms_jerk_mps3"])
+        for strategy, energy in per_seed(windows, path).items():
             if strategy in HUMANS:
                 continue
-            own = part[part["strategy"] == strategy]
+            own = windows[windows["strategy"] == strategy]
             row: dict[str, object] = {by: change, "strategy": strategy}
             row["seeds"] = _seeds(part, strategy)
-            row |= mean(energy).columns("total_energy_kj")
-            row["worst_seed_energy_kj"] = energy.max()
+            row |= mean(energy).columns("path_energy_kj")
+            row["worst_seed_path_energy_kj"] = energy.max()
             for baseline in baselines:
-                found = savings(part, "total_energy_kj", strategy, baseline)
-                if baseline == strategy:
-                    found = Estimate(np.nan, np.nan, np.nan)
-                row |= found.columns(f"saving_against_{baseline}_pct", 100.0)
-            row["collisions"] = int(own["collided"].sum())
+                known = baseline != strategy
+                found = savings(windows, path, strategy, baseline) if known else NOTHING
+                row |= found.columns(f"path_saving_against_{baseline}_pct", 100.0)
+            row["total_energy_kj"] = own["total_energy_kj"].mean()
+            row["collisions"] = int(part.loc[part["strategy"] == strategy, "collided"].sum())
             for name, column in SHARES.items():
-                row |= mean(per_seed(part, column)[strategy]).columns(name, 100.0)
-            jerk = per_seed(part, "rms_jerk_mps3")[strategy]
+                row |= mean(per_seed(own, column)[strategy]).columns(name, 100.0)
+            jerk = per_seed(own, "rms_jerk_mps3")[strategy]
             row["rms_jerk_mps3"], row["worst_seed_rms_jerk_mps3"] = jerk.mean(), jerk.max()
             rows.append(row)
     return pd.DataFrame(rows)
@@ -191,8 +237,9 @@ def single_profile(episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of the evaluations, with the column ``study_profile``.
 
     Returns:
-        Total energy [kJ] of ``idm``, ``reference`` and ``alcc`` with intervals over seeds, the
-        saving of ``alcc`` against both [%], and how many seeds of either beat the human.
+        Total energy as drawn [kJ], the paper's measure, of ``idm``, ``reference`` and ``alcc``
+        with intervals over seeds, the saving of ``alcc`` against both, also of path energy [%],
+        and how many seeds of either beat the human.
     """
     rows = []
     for profile, part in episodes.groupby("study_profile", sort=True):
@@ -206,8 +253,9 @@ def single_profile(episodes: pd.DataFrame) -> pd.DataFrame:
             better = int((energy[strategy] < energy["idm"].mean()).sum())
             row[f"{strategy}_seeds_below_idm"] = f"{better} of {len(energy[strategy])}"
         for baseline in ("reference", "idm"):
-            found = savings(part, "total_energy_kj", "alcc", baseline)
-            row |= found.columns(f"alcc_saving_against_{baseline}_pct", 100.0)
+            for kind, column in KINDS.items():
+                found = savings(part, f"total_{column}", "alcc", baseline)
+                row |= found.columns(f"alcc_{kind}saving_against_{baseline}_pct", 100.0)
         row["collisions"] = int(part.loc[part["training_seed"].notna(), "collided"].sum())
         rows.append(row)
     return pd.DataFrame(rows)

@@ -1,0 +1,130 @@
+"""Savings of a strategy against a baseline, from the rows of episodes.parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from lcc_rl.results.intervals import Estimate, saving, share_saved
+
+KEYS = ["profile_id", "driver_id"]
+BASELINES = ("idm", "human", "reference")
+HUMANS = ("direct", "idm", "human")  # not trained
+NOTHING = Estimate(np.nan, np.nan, np.nan)
+# Prefix of a saving, and of which energy: the path's, which leaves out what the motion stores
+# and with it what ending slower saves; and as drawn (A2).
+KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
+LEADER = ("leader_path_energy_kj", "leader_speed_mps")
+TERCILES = ("lower", "middle", "upper")
+
+
+def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return a column per strategy and a row per (profile, driver), the mean over seeds."""
+    return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
+
+
+def by_driver(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return a column per strategy and a row per driver, the mean over profiles and seeds."""
+    return paired(episodes, column).groupby("driver_id").mean()
+
+
+def driver_savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.Series:
+    """Return the share of a baseline's mean energy that a strategy saves, by driver."""
+    energy = by_driver(episodes, column)
+    return share_saved(energy[strategy], energy[baseline])
+
+
+def per_seed(episodes: pd.DataFrame, column: str) -> dict[str, pd.Series]:
+    """Return, for each strategy, the mean of a column over the episodes of each training seed."""
+    found = {}
+    for strategy, rows in episodes.groupby("strategy", sort=False):
+        values = rows.groupby("training_seed", dropna=False)[column].mean()
+        if values.notna().any():
+            found[str(strategy)] = values
+    return found
+
+
+def per_window(episodes: pd.DataFrame, columns: str | Sequence[str]) -> pd.DataFrame:
+    """Return the means over drivers: a row per strategy, training seed and window.
+
+    Of the same drivers in every window these rows give the same :func:`savings`, faster.
+    """
+    keys = ["strategy", "training_seed", "profile_id"]
+    names = [columns] if isinstance(columns, str) else list(columns)
+    if "training_seed" not in episodes:
+        episodes = episodes.assign(training_seed=pd.NA)
+    return episodes.groupby(keys, dropna=False, sort=False)[names].mean().reset_index()
+
+
+def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> Estimate:
+    """Return the share of a strategy's mean energy saved against a baseline.
+
+    Args:
+        episodes: rows of an evaluation, or of :func:`per_window`.
+        column: the energy.
+        strategy: who saves.
+        baseline: against whom.
+
+    Returns:
+        The share with its interval over windows and seeds (:func:`intervals.saving`), of the
+        windows that both were evaluated on; NaN where one of them is missing.
+    """
+    energy = per_window(episodes[episodes["strategy"].isin([strategy, baseline])], column)
+    energy["training_seed"] = energy["training_seed"].astype(object).fillna(-1)
+    table = energy.pivot(index="profile_id", columns=["strategy", "training_seed"], values=column)
+    table = table.dropna(axis=1, how="all").dropna()
+    if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
+        return Estimate(np.nan, np.nan, np.nan)
+    return saving(table[strategy].to_numpy(), table[baseline].to_numpy())
+
+
+def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, float]:
+    """Return the shares of (window, driver) pairs and of drivers who draw more with a strategy.
+
+    Args:
+        energy: a table of :func:`paired`; the mean over seeds counts.
+        strategy: with whom.
+        baseline: compared with whom.
+
+    Returns:
+        ``pairs`` and ``drivers``, the latter by their mean over windows; NaN where one is missing.
+    """
+    if strategy == baseline or not {strategy, baseline} <= set(energy):
+        return {"pairs": float("nan"), "drivers": float("nan")}
+    pairs = energy[[strategy, baseline]].dropna()
+    levels = {"pairs": pairs, "drivers": pairs.groupby("driver_id").mean()}
+    return {name: float((x[strategy] > x[baseline]).mean()) for name, x in levels.items()}
+
+
+def stratified(
+    episodes: pd.DataFrame, column: str, strategy: str, baseline: str, by: Sequence[str] = LEADER
+) -> pd.DataFrame:
+    """Savings in the terciles of windows by what their leader does.
+
+    Args:
+        episodes: rows of an evaluation.
+        column: the energy.
+        strategy: who saves.
+        baseline: against whom.
+        by: columns that are the same in every row of a window.
+
+    Returns:
+        One row per measure and tercile, the lowest first: its windows, the range of the measure
+        and the share saved [%] with its interval.
+    """
+    rows = []
+    for measure in by:
+        windows = episodes.groupby("profile_id")[measure].first().sort_values()
+        parts = np.array_split(np.arange(len(windows)), len(TERCILES))
+        for name, chosen in zip(TERCILES, parts, strict=True):
+            part = windows.iloc[chosen]
+            if part.empty:
+                continue
+            inside = episodes[episodes["profile_id"].isin(part.index)]
+            row: dict[str, object] = {"by": measure, "tercile": name, "windows": len(part)}
+            row |= {"least": part.iloc[0], "most": part.iloc[-1]}
+            found = savings(inside, column, strategy, baseline)
+            rows.append(row | found.columns("saving_pct", 100.0))
+    return pd.DataFrame(rows)
