@@ -54,7 +54,7 @@ def per_window(episodes: pd.DataFrame, columns: str | Sequence[str]) -> pd.DataF
     keys = ["strategy", "training_seed", "profile_id"]
     names = [columns] if isinstance(columns, str) else list(columns)
     if "training_seed" not in episodes:
-        episodes = episodes.assign(training_seed=pd.NA)
+        episodes = episodes.assign(training_seed=np.nan)
     return episodes.groupby(keys, dropna=False, sort=False)[names].mean().reset_index()
 
 

@@ -9,7 +9,7 @@ from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import evaluate, pairs
 from lcc_rl.evaluation.rollout import reset_options
-from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.evaluation.strategies import Strategy, baseline, baseline_controller
 from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
 from lcc_rl.functional.power import motor_power
 
@@ -76,6 +76,35 @@ def test_strategies_meet_the_same_noise() -> None:
     a, _ = run("idm")
     b, _ = run("idm", "reward.terms.safety.weight=3")
     pd.testing.assert_frame_equal(a, b, check_exact=True)
+
+
+def test_the_human_baseline_draws_its_drivers_and_leaves_the_one_behind() -> None:
+    cfg = strategy("alcc").cfg
+    rows, one = (
+        evaluate(baseline(cfg, name), INPUTS, 5, 64, 1)[0].set_index(["profile_id", "driver_id"])
+        for name in ("human", "idm")
+    )
+    # One driver draws the same before everybody, drivers of the population do not.
+    spread, none = (x.groupby("profile_id")["cav_energy_kj"].std() for x in (rows, one))
+    assert spread.min() > 100.0 * none.max()
+    assert (rows["time_gap_s"] == one["time_gap_s"]).all()
+    # Neither the baseline's car nor a learned one has noise.
+    again, _ = evaluate(baseline(cfg, "human"), INPUTS, 5, 64, 1)
+    assert (again["cav_energy_kj"].to_numpy() == rows["cav_energy_kj"].to_numpy()).all()
+    node = baseline_controller("human")
+    assert (node["noise"], node["desired_speed"], node["time_gap"]) == (0.0, None, None)
+
+
+def test_what_the_leader_does_is_in_every_row_of_its_window() -> None:
+    rows, _ = run("idm")
+    speed = PROFILES.record(2)
+    own = rows[rows["profile_id"] == 2]
+    assert own["leader_speed_mps"].to_numpy() == pytest.approx(float(speed.mean()))
+    # Over a window A2 is the path energy and what the last speed stores more than the first.
+    drawn = float(motor_power(speed[:-1], speed.diff() / 0.1).sum()) * 1e-4
+    path = own["leader_path_energy_kj"].iloc[0]
+    linear = [float(1213 * v + 2484 * v**2 / 2 + 1.374 * v**3 / 3) * 1e-3 for v in speed[[0, -1]]]
+    assert path == pytest.approx(drawn - (linear[1] - linear[0]), rel=0.03)
 
 
 def test_collisions_end_the_count() -> None:
