@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load, plain, short_name
+from lcc_rl.config_checks import AUTO
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
@@ -32,10 +33,9 @@ log = logging.getLogger("lcc_rl")
 KNOWLEDGE = ("memory", "preview")
 GAINS = ("path", "paper_like", "tuned")
 # Baselines by name: the controller of the automated vehicles, by what makes it.
-OF_POPULATION = [f"scenario.controllers.automated.{x}=null" for x in ("desired_speed", "time_gap")]
 BASELINES = {
     "idm": ("variant=idm",),
-    "human": ("variant=idm", *OF_POPULATION),
+    "human": ("variant=idm", *(f"{AUTO}.{x}=null" for x in ("desired_speed", "time_gap"))),
     **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
     "deadbeat": ("variant=deadbeat",),
     "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),

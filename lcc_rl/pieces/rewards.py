@@ -1,7 +1,6 @@
 """Rewards: named, weighted terms per automated vehicle, each logged by itself, and their sum.
 
-A term of your own is a class with the names it reads (:mod:`lcc_rl.pieces.views`) and its
-formula::
+A term of your own is a class with what it reads (:mod:`lcc_rl.pieces.views`) and its formula::
 
     class Comfort(RewardTerm):
         reads = ("self.jerk",)
@@ -104,7 +103,6 @@ class SafetyReward(RewardTerm):
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the unweighted term."""
-        # Contact itself is no matter of the margin: opening within it is the way out.
         room = torch.where(gap > 0.0, (gap - self.margin).clamp(min=TOUCH), gap)
         ttc = time_to_collision(room, -relative_speed, self.floor)
         return (ttc.clamp(max=self.threshold) / self.threshold).log()
