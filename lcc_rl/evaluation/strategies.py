@@ -147,10 +147,9 @@ def without_automated(cfg: DictConfig) -> DictConfig:
 
 
 def rule(cfg: DictConfig) -> Strategy:
-    """Return the strategy of a configuration that learns nothing.
+    """Return the strategy of a configuration that learns nothing, named after its variant.
 
-    Its name is that of the variant, of the controller where that is another than the variant's,
-    and ``direct`` where nobody is automated.
+    After the controller where that is another, and ``direct`` where nobody is automated.
     """
     if not string_of(cfg).count(AUTOMATED):
         return Strategy(DIRECT, cfg)
