@@ -177,10 +177,8 @@ def kde(
         drivers: number of drivers to draw.
         seed: seed of the draw.
         bandwidth: factor on the data's spread; None takes Scott's rule.
-        bounds: calibration bounds by parameter, to which draws are clipped; those not named keep
-            their default.
-        mode: see :func:`load_drivers`; of globally calibrated drivers all five parameters are
-            drawn jointly.
+        bounds: calibration bounds by parameter, to which draws are clipped; else their defaults.
+        mode: see :func:`load_drivers`; globally calibrated drivers have five joint parameters.
 
     Raises:
         ConfigError: if a setting is out of range or unknown.

@@ -51,16 +51,11 @@ def play(
     known = written(pieces)
     kept = [key for key in keys if key in known]
     reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
-    wanted = {*kept, *reads, TERMINATED}
-    step = Step(closure(pieces, wanted), env.base_env.horizon)
+    step = Step(closure(pieces, {*kept, *reads, TERMINATED}), env.base_env.horizon)
     with torch.no_grad():
-        state = entries(env.reset(given))
-        record: dict[Key, list[Tensor]] = {
-            key: [state[key]] if key[-1] == "speed" else [] for key in kept
-        }
+        state = _begin(env, given, pieces, who)
+        record = {key: [state[key]] if key[-1] == "speed" else [] for key in kept}
         running, alive = torch.ones_like(state[TERMINATED]), []
-        start = [entry for piece in pieces for entry in written_by(piece, state)]
-        check_moment(start, state, running, pieces, who)
         for _ in range(env.base_env.horizon):
             reached = step.checked({**state, **_action(policy, reads, state, env)}, running, who)
             for key in kept:
@@ -69,6 +64,16 @@ def play(
             running = running & ~reached[TERMINATED]
             state = {key: reached.get(key, value) for key, value in state.items()}
     return {key: torch.stack(values) for key, values in record.items()}, torch.stack(alive)
+
+
+def _begin(
+    env: TransformedEnv, given: TensorDictBase, pieces: Sequence[Piece], who: str
+) -> dict[Key, Tensor]:
+    """Return the first moment of the episodes, whose entries are checked."""
+    state = entries(env.reset(given))
+    start = [entry for piece in pieces for entry in written_by(piece, state)]
+    check_moment(start, state, torch.ones_like(state[TERMINATED]), pieces, who)
+    return state
 
 
 def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
