@@ -85,7 +85,7 @@ def run_command(module: str, *words: str, cwd: Path, check: bool = False) -> Don
 def jobs_in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the pipeline train in a thread, one variant at a time, instead of new processes."""
 
-    def threads(max_workers: int, mp_context: object) -> ThreadPoolExecutor:
+    def threads(max_workers: int, mp_context: object, initializer: object) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(1)
 
     monkeypatch.setattr("lcc_rl.commands.pipeline.ProcessPoolExecutor", threads)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
+import os
+import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from functools import cache
@@ -27,6 +29,7 @@ from lcc_rl.results.drawing import save
 from lcc_rl.results.figures import learning_curve
 from lcc_rl.results.trust import check_targets
 from lcc_rl.runs.cli import prepare_torch, root_key
+from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
 from lcc_rl.targets import forget_places
@@ -156,7 +159,7 @@ def _train_all(parts: dict[str, DictConfig], folder: Path, jobs: int) -> None:
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name)}
     # A fresh interpreter per training: forking a process that has used torch's threads can hang.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max_workers=jobs, mp_context=context) as pool:
+    with ProcessPoolExecutor(jobs, context, _end_with_parent) as pool:
         futures: dict[str, Future[None]] = {
             name: pool.submit(_train_one, plain(cfg), str(folder / name))
             for name, cfg in todo.items()
@@ -177,6 +180,18 @@ def _stop_children(futures: list[Future[None]]) -> None:
     _, running = wait(futures, PATIENCE)
     for process in multiprocessing.active_children() if running else ():
         process.terminate()
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent was killed; it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+
+    def wait_for_end() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(INTERRUPTED)
+
+    threading.Thread(target=wait_for_end, daemon=True).start()
 
 
 def _train_one(settings: dict[str, Any], folder: str) -> None:

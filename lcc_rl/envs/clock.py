@@ -12,8 +12,25 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.step import tick
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_whole
 from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
+
+MOST_SEED = 2**64 - 1  # of torch's generators
+
+
+def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
+    """Return the shape of a batch of episodes.
+
+    Raises:
+        ConfigError: if it is empty or no whole numbers.
+    """
+    try:
+        batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
+    except (TypeError, ValueError):
+        raise ConfigError(f"batch_size must be whole numbers, got {batch_size!r}") from None
+    if any(size < 1 for size in batch):
+        raise ConfigError(f"batch_size must hold at least one episode, got {batch_size}")
+    return batch
 
 
 class Clock(EnvBase):
@@ -31,7 +48,8 @@ class Clock(EnvBase):
         device: where the tensors live.
 
     Raises:
-        ConfigError: if the horizon is not positive, or the batch is empty or no whole numbers.
+        ConfigError: if the horizon is not positive, the batch is empty or no whole numbers, or the
+            seed is none.
     """
 
     def __init__(
@@ -44,12 +62,8 @@ class Clock(EnvBase):
     ) -> None:
         if horizon < 1:
             raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
-        try:
-            batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
-        except TypeError:
-            raise ConfigError(f"batch_size must be whole numbers, got {batch_size!r}") from None
-        if any(size < 1 for size in batch):
-            raise ConfigError(f"batch_size must hold at least one episode, got {batch_size}")
+        batch = batch_shape(batch_size)
+        require_whole("", 0, MOST_SEED, seed=seed)
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon
         self.generator = torch.Generator()
@@ -129,6 +143,12 @@ class Traffic(TransformedEnv):
                 f"expected a TensorDict of {list(self.batch_size)} episodes, as the environment "
                 f"has, got {list(tensordict.batch_size)}"
             )
+        for key in self.action_keys:
+            # Another shape may fit nevertheless: one action would drive every vehicle.
+            found, wanted = tensordict.get(key, None), self.full_action_spec[key].shape
+            if found is not None and found.shape != wanted:
+                name = ".".join(as_key(key))
+                raise ConfigError(f"{name} must be {list(wanted)}, got {list(found.shape)}")
 
     def _check_options(self, given: TensorDictBase) -> None:
         """Check what a caller gives to ``reset``; TorchRL would ignore what it does not know.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,18 +14,20 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.config import CALLED, build_as, load
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
-from lcc_rl.envs.clock import Clock, Traffic
+from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.inputs import load_inputs, string_of
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
+from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces import CBFFilter, Piece, Places, StringMotion, TotalReward
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.schemas import check_ranges
 
 ACTION = (AUTOMATED, "action")
+MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
 
 
 def build_env(
@@ -51,7 +54,7 @@ def build_env(
         A TorchRL environment; docs/entries.md lists its entries.
 
     Raises:
-        ConfigError: naming the option at fault.
+        ConfigError: naming the option at fault, or saying what the batch needs in memory.
     """
     scenario = cfg.scenario
     check_ranges(cfg)
@@ -61,9 +64,18 @@ def build_env(
     if acts:
         actions[ACTION] = (string_of(cfg).count(AUTOMATED), 1)
     check_pieces(pieces, scenario.horizon, actions)
+    require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
     env = Traffic(clock, Pieces(*pieces))
     return env.to(device) if device is not None else env
+
+
+def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
+    """Return the bytes that a step of a batch of episodes needs at the least."""
+    one = torch.Size([1])
+    specs = [spec for piece in pieces for spec in piece.written_specs(one, None).values()]
+    moment = sum(spec.shape.numel() * spec.dtype.itemsize for spec in specs)
+    return MOMENTS * moment * math.prod(batch_shape(batch_size))
 
 
 def build_pieces(

@@ -12,6 +12,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,6 +36,7 @@ from lcc_rl.runs.states import Busy, busy, is_claimed, one_line, record, survey
 log = logging.getLogger("lcc_rl")
 
 PLAN = "sweep.json"
+MOST_RUNS = 100_000  # of a sweep: Hydra would hold all of them in memory
 LONGEST_NAME = 100  # characters of a folder's name before the hash
 SILENT = logging.CRITICAL + 1
 NO_RESULT = None  # returned to the sweeper; Optuna refuses NaN
@@ -114,10 +116,13 @@ class SweepCallback(Callback):
             sys.exit(BAD_INPUT)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the plan and log the folder."""
+        """Write the plan and log the folder; exit with one line where it has too many runs."""
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
         plan = make_plan(config)
+        if plan.runs > MOST_RUNS:
+            print(f"lcc_rl: error: a sweep has at most {MOST_RUNS} runs", file=sys.stderr)
+            sys.exit(BAD_INPUT)  # as above
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
@@ -189,8 +194,8 @@ def make_plan(config: DictConfig) -> Plan:
     varied = [key_of(key) for key in swept]
     if "n_trials" in sweeper:
         return Plan(int(sweeper.n_trials), varied)
-    grid = [list(item.sweep_string_iterator()) for item in swept.values()]
-    return Plan(math.prod(map(len, grid)), varied)
+    values = (islice(item.sweep_string_iterator(), MOST_RUNS + 1) for item in swept.values())
+    return Plan(math.prod(sum(1 for _ in some) for some in values), varied)
 
 
 def read_plan(folder: Path) -> Plan:

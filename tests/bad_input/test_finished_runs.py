@@ -77,3 +77,11 @@ def test_a_sweep_does_not_write_over_a_run_of_other_settings(finished, tmp_path)
         (folder / "episodes.parquet").read_bytes(),
         (folder / "config.yaml").read_bytes(),
     )
+
+
+def test_a_sweep_of_a_billion_runs_is_one_line(tmp_path) -> None:
+    words = ("-m", *RULE[1:], "seed=range(1000000)", "data.seed=range(1000000000)")
+    done = run_command(RULE[0], *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "lcc_rl: error: a sweep has at most 100000 runs\n"
+    assert not list(tmp_path.iterdir())
