@@ -11,12 +11,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import DictConfig, OmegaConf
 
 import lcc_rl
-import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import build, config_hash, load
 from lcc_rl.envs import build_env
