@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 
@@ -298,28 +297,6 @@ def test_policies_of_two_agents_stand_side_by_side(tmp_path) -> None:
 
 
 # -- files ----------------------------------------------------------------------------------------
-
-
-def test_a_disk_that_fills_up_during_training_is_one_clear_error(tmp_path, monkeypatch) -> None:
-    cfg = tiny("train", "variant=alcc", "training.episodes=32")
-    written = files.os.replace
-    count = 0
-
-    def fills_up(source, target):
-        nonlocal count
-        count += 1
-        if count > 9:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        written(source, target)
-
-    monkeypatch.setattr(files.os, "replace", fills_up)
-    with pytest.raises(ResultsError, match=r"cannot be written: .*No space left"):
-        training.run(cfg, tmp_path, quiet=True)
-    monkeypatch.undo()
-    assert not [path for path in tmp_path.iterdir() if path.suffix == ".tmp"]
-    read_torch(tmp_path / "checkpoint.pt")
-    training.complete(cfg, tmp_path)  # goes on once there is space
-    assert len(read_parquet(tmp_path / "training.parquet")) == 4
 
 
 def test_an_older_table_is_migrated(tmp_path, monkeypatch) -> None:

@@ -187,7 +187,7 @@ def test_policies_that_do_not_fit(trained, tmp_path, overrides, words) -> None:
         ("training.environments=0", r"training\.environments must be a whole number from 1"),
         ("evaluation.drivers=0", r"evaluation\.drivers must be a whole number from 1"),
         ("evaluation.profiles=0", r"evaluation\.profiles must be a whole number from 1"),
-        ("scenario.time_step=-0.1", r"time_step must be positive"),
+        ("scenario.time_step=-0.1", r"time_step must lie in \[0\.001, 10\], got -0\.1"),
         ("~scenario.pieces.ttc", r"lacks \['ttc'\], which the evaluation measures"),
         ("~scenario.pieces.predicted_power", r"reads human\.predicted_power, which no piece"),
         ("~scenario.controllers.human", r"has the role 'human', but scenario\.controllers names"),
