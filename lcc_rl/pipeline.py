@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.runs import check_folder, save_config
+from lcc_rl.results.runs import check_folder, check_links, save_config
 from lcc_rl.runs.cli import entry_point, root_key, run_folder
 
 log = logging.getLogger("lcc_rl")
@@ -31,6 +31,7 @@ def main(cfg: DictConfig) -> None:
             )
         if not (folder / OVERRIDES).is_file():
             raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {OVERRIDES}")
+        check_links(folder)
         trust = list(cfg.trust)
         overrides = stored_overrides(folder / OVERRIDES, trust)
         cfg = load("pipeline", overrides)

@@ -146,7 +146,7 @@ def test_an_interrupted_evaluation_leaves_no_old_rows(trained, tmp_path, monkeyp
     monkeypatch.setattr(evaluation, "evaluate_and_write", interrupted)
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "evaluation.seed=7")
     with pytest.raises(KeyboardInterrupt):
-        evaluation.run(cfg, tmp_path, quiet=True)
+        evaluation.run(cfg, tmp_path, quiet=True, replace=True)
     assert load_config(tmp_path).evaluation.seed == 7
     assert not (tmp_path / "episodes.parquet").exists()
 

@@ -39,7 +39,7 @@ from lcc_rl.io.files import read_parquet, read_torch
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import read_settings
 from lcc_rl.runs.interrupts import INTERRUPTED
-from lcc_rl.runs.states import RESULTS, read_progress
+from lcc_rl.runs.states import LOCK, RESULTS, read_progress
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 UNTIMED = "timing.parquet"  # seconds, which differ
@@ -218,8 +218,9 @@ def compare(whole: Path, killed: Path) -> None:
 
 
 def content(root: Path) -> list[Path]:
-    """Return the files of a folder that a command leaves, without its logs."""
-    return [path for path in root.rglob("*") if path.is_file() and path.suffix != ".log"]
+    """Return the files of a folder that a command leaves, without its logs and locks."""
+    files = [path for path in root.rglob("*") if path.is_file()]
+    return [path for path in files if path.suffix != ".log" and path.name != LOCK]
 
 
 def complete(job: Job, folder: Path, log: Path) -> None:
@@ -277,7 +278,7 @@ class Test:
         if what == "was done":
             self.end(name)
             return False
-        self.seen[f"{what} of a {name}"] += 1
+        self.seen[f"{what} in {name}s"] += 1
         return True
 
     def end(self, name: str) -> None:

@@ -98,9 +98,10 @@ def _write(result: Calibration, read: list[str], cfg: DictConfig, folder: Path) 
         "config_hash": config_hash(settings),
         "report": "\n".join([*read, *result.report]),
     }
-    write_parquet(result.drivers, folder / "drivers.parquet", metadata)
     save(calibration_figure(result.drivers), folder / "calibration.png")
     save(joint_figure(result.drivers), folder / "joint_distribution.png")
+    # Last: who finds it finds a finished calibration.
+    write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 
 
 def _say(console: Console, lines: list[str]) -> None:

@@ -23,6 +23,7 @@ from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.runs import (
     check_folder,
+    check_links,
     load_config,
     load_policy,
     save_config,
@@ -83,6 +84,7 @@ def _resumed(cfg: DictConfig, folder: Path) -> DictConfig:
 
     Where the rows are logged may be said anew: what is stored names no place to write.
     """
+    check_links(folder)
     own = load_config(folder, tuple(cfg.trust))
     for table in (EPISODES, RECORD):
         made_by = (

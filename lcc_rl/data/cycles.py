@@ -83,7 +83,7 @@ def stretch(
 
     Raises:
         DataError: if the record cannot be read or does not cover the stretch.
-        ConfigError: if the scale is not positive or the stretch empty.
+        ConfigError: if the scale is not positive, the leader implausibly fast or the stretch empty.
     """
     require_positive(f"leader: {path}", scale=scale)
     time, speed = read_speed_record(path, plausible)
@@ -94,6 +94,12 @@ def stretch(
     if begin < time[0] or end > time[-1] + 1e-6:
         raise DataError(
             f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s"
+        )
+    limit = (plausible or Plausible()).max_speed
+    if scale * speed.max() > limit:
+        raise ConfigError(
+            f"leader: {path} at scale={scale:g} drives up to {scale * speed.max():.3g} m/s, "
+            f"leader.plausible.max_speed={limit:g}"
         )
     stem = Path(path).stem
     label = name or f"{stem}@{begin:g}s"
@@ -128,7 +134,8 @@ class RecordLeaders:
         least_variation: evaluation windows whose total speed change is below this are left out
             [m/s].
         path: default path of the stretches.
-        plausible: thresholds of every sample, before scaling; None for the defaults.
+        plausible: thresholds of every sample before scaling, of its speed also afterwards; None for
+            the defaults.
 
     Raises:
         ConfigError: if ``least_variation`` is negative.

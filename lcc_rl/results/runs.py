@@ -59,6 +59,17 @@ def check_folder(cfg: DictConfig, folder: Path) -> None:
         )
 
 
+def check_links(folder: Path) -> None:
+    """Refuse to resume in a folder that holds links: one of somebody else could lead anywhere.
+
+    Raises:
+        ResultsError: naming the link.
+    """
+    link = next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None)
+    if link is not None:
+        raise ResultsError(f"{link}: a link, which may lead out of the folder; put the file there")
+
+
 def _as_text(cfg: DictConfig) -> str:
     return OmegaConf.to_yaml(OmegaConf.create(plain(cfg)))
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from commands import DATA
 
+from lcc_rl.data.cycles import stretch
 from lcc_rl.envs import make_env
 from lcc_rl.errors import ConfigError
 
@@ -44,3 +45,9 @@ def test_one_action_does_not_drive_three_vehicles() -> None:
     moment = env.reset().set(("automated", "action"), torch.zeros(2, 1, 1))
     with pytest.raises(ConfigError, match=r"automated.action must be \[2, 3, 1\], got \[2, 1, 1\]"):
         env.step(moment)
+
+
+def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:
+    assert stretch("udds", 0.1, scale=2.0).speeds.max() > 50.0
+    with pytest.raises(ConfigError, match=r"udds at scale=100 drives up to .* m/s, leader.plaus"):
+        stretch("udds", 0.1, scale=100.0)
