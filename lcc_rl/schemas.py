@@ -155,6 +155,9 @@ def check_ranges(cfg: Any) -> None:
         everything = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
+    for key in cfg:  # left out on the command line
+        if OmegaConf.is_missing(cfg, key):
+            raise ConfigError(f"{key} is required: say {key}=…")
     for key in (*RANGES, *WHOLE):
         value = OmegaConf.select(cfg, key)
         if value is None:
