@@ -36,6 +36,8 @@ QUICK = "calibration.local_genetic.generations=2"
 AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")
 NO_AGENT = ("experiment=smoke", *DATA, HORIZON)
 TINY = (*NO_AGENT, *AGENT)
+# The baselines of the leading-cruise scenario, in their order.
+HUMANS = ("direct", "idm", "human")
 
 
 def tiny(entry: str, *overrides: str, agent: bool = True) -> DictConfig:

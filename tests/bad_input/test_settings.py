@@ -17,7 +17,7 @@ from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole
 from lcc_rl.functional.pattern import parse_string
-from lcc_rl.pieces import Action, DriverEstimator, NGSIMLeader
+from lcc_rl.pieces import Action, DriverEstimator, NGSIMLeader, Observation
 from lcc_rl.schemas import RANGES, WHOLE, check_ranges
 
 RESOURCES = {
@@ -27,6 +27,7 @@ RESOURCES = {
     "horizon": 20,
     "string": parse_string("automated human"),
     "name": "term",
+    "observation": Observation({"ahead": {"speed": 0.1}}),
     "observation_size": 7,
     "action_size": 1,
     "seed": 0,

@@ -47,6 +47,7 @@ from lcc_rl.pieces import (
     NGSIMLeader,
     Observation,
     ObservationMemory,
+    PathEnergy,
     Piece,
     Places,
     RewardPiece,
@@ -148,6 +149,8 @@ def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "SmoothSafety": lambda: SmoothSafety("smooth_safety", **own),
         "SmoothEfficiency": lambda: SmoothEfficiency("smooth_efficiency", **own),
         "Smoothness": lambda: Smoothness(**own),
+        "PathEnergy": lambda: PathEnergy(T, "path_energy", **own),
+        "PathEnergy, behind": lambda: PathEnergy(T, "path_behind", of="behind", **own),
     }
 
 

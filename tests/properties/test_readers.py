@@ -148,7 +148,8 @@ values = st.recursive(
 @FUZZ
 @given(st.dictionaries(st.text("abcxyz", min_size=1, max_size=6), values, max_size=4))
 def test_a_configuration_survives_its_file(tmp_path, content) -> None:
-    cfg = OmegaConf.create({**content, "variant": "alcc"})
+    kept = {"variant": "alcc", "scenario": {}, "evaluation": {}}
+    cfg = OmegaConf.create({**content, **kept})
     save_config(cfg, tmp_path)
     again = load_config(tmp_path)
     assert plain(again) == plain(cfg)
