@@ -145,13 +145,13 @@ def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Excepti
     # What exists may depend on the other overrides: leave out only those that fail.
     kept, wrong = list(overrides), key
     while True:
-        kept = [item for item in kept if wrong and wrong not in item]
+        fewer = [item for item in kept if wrong and wrong not in item]
         try:
-            return explain(error, _compose(entry, kept, hydra))
+            return explain(error, _compose(entry, fewer, hydra))
         except (HydraException, OmegaConfBaseException) as next_error:
-            if not kept:
+            if len(fewer) in (0, len(kept)):  # nobody typed the key that was refused
                 return error
-            wrong = refused_key(next_error)
+            kept, wrong = fewer, refused_key(next_error)
 
 
 def _culprit(entry: str, overrides: Sequence[str]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_types import check_numbers
 from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
+from lcc_rl.targets import TARGET, settings_at
 
 
 @dataclass
@@ -143,7 +144,7 @@ WHOLE: dict[str, tuple[int, ...]] = {
 
 
 def check_ranges(cfg: Any) -> None:
-    """Check that all numbers of a configuration are finite, and the schema's in their range.
+    """Check that a configuration is whole, its numbers finite, and the schema's in their range.
 
     Args:
         cfg: configuration of an entry point, or a part such as ``{"scenario": …}``.
@@ -155,9 +156,14 @@ def check_ranges(cfg: Any) -> None:
         everything = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
-    for key in cfg:  # left out on the command line
-        if OmegaConf.is_missing(cfg, key):
-            raise ConfigError(f"{key} is required: say {key}=…")
+    schema = OmegaConf.get_type(cfg)
+    lacking = [x.name for x in fields(schema) if x.name not in cfg] if is_dataclass(schema) else []
+    # Of an object, who builds it says what it lacks.
+    lacking += [
+        key for key, node, value in settings_at(everything) if value == "???" and TARGET not in node
+    ]
+    if lacking:
+        raise ConfigError(f"{lacking[0]} is required: say {lacking[0]}=…")
     for key in (*RANGES, *WHOLE):
         value = OmegaConf.select(cfg, key)
         if value is None:

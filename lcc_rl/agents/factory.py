@@ -44,6 +44,9 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
             "learned; say agent=none to evaluate it"
         )
     observation = build_as("a piece", Piece, cfg.observation, "observation", string=string)
+    driver = cfg.scenario.controllers.get(AUTOMATED) or {}
+    # The acceleration of action 1, where the vehicles are driven by actions.
+    limits = {key: driver[key] for key in ("max_acceleration",) if key in driver}
     agent: Agent = build_as(
         "an agent",
         ("policy", "anneal", "load_state_dict"),
@@ -51,7 +54,7 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         "agent",
         population=population,
         observation=observation,
-        max_acceleration=cfg.scenario.controllers.automated.get("max_acceleration", 3.0),
+        **limits,
         observation_size=observation.event_shape[-1],
         action_size=1,
         seed=cfg.seed,

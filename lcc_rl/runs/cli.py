@@ -23,7 +23,7 @@ from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys, refused_by_hydra
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
-from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
+from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible, was_interrupted
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.precision import set_precision
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
@@ -34,7 +34,6 @@ from lcc_rl.schemas import check_ranges
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 DEVICES = ("cpu", "cuda")
-# Threads, or processes: more of them than this on any machine are a mistake, and can crash it.
 NO_BEST = "No trials are completed"  # message of Optuna
 
 
@@ -121,14 +120,14 @@ def sweep(command: Callable[[], Any]) -> None:
     """Run a Hydra command; report how the runs of a sweep ended."""
     try:
         command()
-    except KeyboardInterrupt:
-        folder = SweepCallback.end()
-        if folder is None:
-            raise
-        raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
-    except ValueError as error:
+    except (KeyboardInterrupt, Exception) as error:
+        if was_interrupted(error) and not isinstance(error, LccError):
+            folder = SweepCallback.end()
+            if folder is None:
+                raise KeyboardInterrupt from error
+            raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
         # Hydra's plugin asks for the best trial even if all failed; conclude reports those.
-        if NO_BEST not in str(error):
+        if not isinstance(error, ValueError) or NO_BEST not in str(error):
             raise
     finally:
         folder = SweepCallback.end()

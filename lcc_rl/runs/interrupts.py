@@ -65,6 +65,13 @@ def interruptible() -> Iterator[None]:
         yield
 
 
+def was_interrupted(error: BaseException | None) -> bool:
+    """Whether an error followed from an interrupt, which broke into what cannot bear it."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
+
+
 @contextmanager
 def stop_signal() -> Iterator[threading.Event]:
     """Set the event on the first SIGINT or SIGTERM; the second one acts as before."""

@@ -46,6 +46,10 @@ def test_other_errors_hangs_and_too_much_memory_are_failures(monkeypatch, does, 
 # What it found, one for each kind.
 FOUND = (
     ("~drivers", "drivers is required: say drivers=…"),
+    ("~threads", "threads is required: say threads=…"),
+    ("~scenario.controllers.automated", "scenario.controllers names only human"),
+    ("scenario.controllers.human='???'", "scenario.controllers.human is required: say"),
+    ("+experiment@deployed=single_profile", "Could not override 'split@deployed.split'"),
     ("agent=null", "agent=null: Config group override must be a string or a list"),
     ("logger=[nan,1]", r"logger=\[nan,1\]: argument of type 'int'"),
     ("evaluation.baselines.x=1", r"evaluation\.baselines\.x=1: invalid literal"),

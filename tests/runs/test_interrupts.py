@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+from lcc_rl.errors import Interrupted
+from lcc_rl.runs.cli import sweep
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible, is_command, stop_signal
 
 IMPORTS = "import sys; sys.argv = ['-m']; import lcc_rl; print('on', flush=True); input()"
@@ -35,6 +37,26 @@ def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
 def test_importing_the_package_elsewhere_changes_no_handler() -> None:
     assert not is_command()
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_an_interrupt_that_another_error_hides_is_one_still() -> None:
+    def composing() -> None:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            {}["what the interrupt has left half done"]
+
+    def stopping() -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise Interrupted("stopped; resume it") from None
+
+    for command, kind in ((composing, KeyboardInterrupt), (stopping, Interrupted)):
+        with pytest.raises(kind):
+            sweep(command)
+    with pytest.raises(KeyError):
+        sweep(lambda: {}["no interrupt"])
 
 
 def test_sigterm_is_an_interrupt_and_afterwards_what_it_was() -> None:
