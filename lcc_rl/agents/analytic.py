@@ -9,45 +9,29 @@ et al., "Accelerated policy learning with parallel differentiable simulation", I
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.agents.loop import anneal, check_fraction
-from lcc_rl.agents.objective import Objective
+from lcc_rl.agents.simulated import SimulatedAgent, SimulatedSettings
 from lcc_rl.config import require
 from lcc_rl.errors import require_in, require_positive
-from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.pieces.observation import Observation
 from lcc_rl.policies.actor import seeded_mlp
-from lcc_rl.policies.rules import make_policy
 
 
 @dataclass(frozen=True)
-class AnalyticSettings:
-    """Settings of the analytic agent; conf/agent holds their values.
+class AnalyticSettings(SimulatedSettings):
+    """Settings of the analytic agent; the layers are those of policy and value network.
 
     Args:
-        policy: what learns: ``"network"``, a rule with learned constants (``"idm"``, ``"acc"``), or
-            a network on top of a rule (``"residual_idm"``, ``"residual_acc"``).
-        constants: constants of a rule at the start; those left out have its own values.
-        hidden: sizes of the ReLU layers of policy and value network.
         learning_rate: of the policy at the start; it falls along half a cosine.
         final_lr_fraction: of it that is left at the end.
         clip_norm: gradients longer than this are shortened to it; through 300 steps of traffic
             they can become arbitrarily long.
         gamma: discount.
-        surrogates: nodes of reward terms that take the place of those of the same name in the
-            objective; their weights multiply the terms' own. Those of terms that the reward
-            lacks are ignored.
-        limits: largest share of the time in which a surrogate's limit may be missed, by its name;
-            its weight is then the price at the start, see :class:`lcc_rl.agents.limits.Limits`.
-        limit_rate: largest change of the logarithm of such a price per batch of episodes.
-        regularizers: nodes of reward terms that belong to the objective only.
         bootstrap: learn a value and add it at the end of every segment; without it the segment is
             all that counts, and should be the whole episode.
         value_lr: learning rate of the value network.
@@ -60,17 +44,10 @@ class AnalyticSettings:
         ConfigError: if a setting is out of range or contradicts another.
     """
 
-    policy: str = "network"
-    constants: Mapping[str, float] | None = None
-    hidden: Sequence[int] = (200, 100, 50)
     learning_rate: float = 3e-3
     final_lr_fraction: float = 0.05
     clip_norm: float = 1.0
     gamma: float = 0.998
-    surrogates: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float | None] = field(default_factory=dict)
-    limit_rate: float = 0.1
-    regularizers: Mapping[str, Any] = field(default_factory=dict)
     bootstrap: bool = True
     value_lr: float = 1e-3
     td_lambda: float = 0.95
@@ -90,51 +67,18 @@ class AnalyticSettings:
         check_fraction(self.final_lr_fraction)
 
 
-class Analytic:
+class Analytic(SimulatedAgent):
     """A policy, its optimizer, the objective's stand-ins and, where asked for, a value.
 
-    Args:
-        observation: what the policy sees.
-        seed: seed of the initial weights.
-        time_step: duration of a step [s], for terms of the objective that need it.
-        max_acceleration: acceleration of action 1 [m/s²], for rules.
-        string: the string of vehicles, for terms of the objective.
-        settings: see :class:`AnalyticSettings`; None for its defaults.
-        device: where the networks live.
-
-    Raises:
-        ConfigError: if a setting is out of range.
+    Arguments as of :class:`lcc_rl.agents.simulated.SimulatedAgent`.
     """
 
     Settings: ClassVar[type[AnalyticSettings]] = AnalyticSettings
 
-    def __init__(
-        self,
-        observation: Observation,
-        seed: int,
-        time_step: float,
-        max_acceleration: float = 3.0,
-        string: VehicleString | None = None,
-        settings: AnalyticSettings | None = None,
-        device: str = "cpu",
-    ) -> None:
-        self.settings = own = AnalyticSettings() if settings is None else settings
-        self.device = device
-        self.objective = Objective(
-            own.surrogates,
-            own.regularizers,
-            own.limits,
-            own.limit_rate,
-            device,
-            time_step=time_step,
-            string=string,
-        )
-        size = observation.event_shape[-1]
-        self.policy: TensorDictModule = make_policy(
-            own.policy, observation, own.hidden, seed, own.constants, max_acceleration
-        ).to(device)
-        self.value = seeded_mlp(size, 1, own.hidden, seed + 1).to(device)
-        self.target = seeded_mlp(size, 1, own.hidden, seed + 1).to(device)
+    def _prepare(self, size: int) -> None:
+        own, seed = self.settings, self.seed + 1
+        self.value = seeded_mlp(size, 1, own.hidden, seed).to(self.device)
+        self.target = seeded_mlp(size, 1, own.hidden, seed).to(self.device)
         self.optimizer = torch.optim.Adam(
             [entry for entry in self.policy.parameters() if entry.requires_grad],
             lr=own.learning_rate,

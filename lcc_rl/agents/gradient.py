@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
-from lcc_rl.agents.objective import Objective
+from lcc_rl.agents.loop import REPORTED, derived_seed, episode_statistics
+from lcc_rl.agents.simulated import SimulatedLoop
 from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.pieces.base import State, next_key
-from lcc_rl.pieces.rewards import REWARD, RewardTerm
 
 log = logging.getLogger("lcc_rl")
 
@@ -28,7 +25,7 @@ log = logging.getLogger("lcc_rl")
 WORTH_COMPILING = 100
 
 
-class GradientTrainer(TrainingLoop[Analytic]):
+class GradientTrainer(SimulatedLoop[Analytic]):
     """Trains by the simulator's gradient; arguments as of :class:`TrainingLoop`.
 
     A segment of the settings is the stretch through which gradients flow; the whole episode where
@@ -39,9 +36,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
     watched = "loss_actor"
 
     def _prepare(self) -> None:
-        self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
-        self.objective = self.agent.objective
-        self.objective.replace(self.terms)
+        super()._prepare()
         if not self.agent.settings.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
@@ -56,10 +51,10 @@ class GradientTrainer(TrainingLoop[Analytic]):
             compiled = self.settings.compiled
         if compiled is None:
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
-        return rollout_of(self.env, self.objective, self.terms, compiled)
+        return self._rollout(compiled)
 
     def footprint(self) -> Footprint:
-        source, own = rollout_of(self.env, self.objective, self.terms, False), self.agent.settings
+        source, own = self._rollout(), self.agent.settings
         # The first steps lack the gradient that reaches the later ones through the motion.
         (less, _, _), (more, data, state) = (self._played(source, steps) for steps in (2, 3))
         count = self.env.batch_size.numel()
@@ -115,9 +110,8 @@ class GradientTrainer(TrainingLoop[Analytic]):
         self.iteration += 1
         self.updates += len(losses)
         shares = _mean(missed)
-        limits = self.objective.limits
-        prices = {f"price_{name}": limits.price(name) for name in shares}
-        limits.update(shares)
+        limits = self._limits_row(shares)
+        self.objective.limits.update(shares)
         episodes = torch.cat(played, dim=1)
         row = {
             "iteration": float(self.iteration),
@@ -127,8 +121,7 @@ class GradientTrainer(TrainingLoop[Analytic]):
             "learning_rate": rate,
             **episode_statistics(episodes),
             **_mean(losses),
-            **{f"share_{name}": share for name, share in shares.items()},
-            **prices,
+            **limits,
         }
         self._record(row, *spent)
         return row
@@ -141,25 +134,6 @@ class GradientTrainer(TrainingLoop[Analytic]):
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
         return after, self.agent.update(self.objective.score(data) * before, after, moments)
-
-
-def rollout_of(
-    env: TransformedEnv, objective: Objective, terms: Sequence[RewardTerm], compiled: bool
-) -> DifferentiableRollout:
-    """Return what plays episodes for an objective, and records the reward's terms.
-
-    Args:
-        env: the training environment.
-        objective: what is learned from.
-        terms: the reward's terms.
-        compiled: compile the simulator's step.
-    """
-    return DifferentiableRollout(
-        env,
-        wanted=objective.wanted(),
-        observed=[REWARD, *(term.targets[0] for term in terms)],
-        compiled=compiled,
-    )
 
 
 def _mean(rows: list[dict[str, Any]]) -> dict[str, float]:

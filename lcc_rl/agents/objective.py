@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -21,11 +21,8 @@ class Objective:
     """The terms of an objective and the prices of its limits.
 
     Args:
-        surrogates: nodes of reward terms that take the place of those of the same name; their
-            weights multiply the terms' own. Those of terms that the reward lacks are ignored, and
-            so are their limits.
-        regularizers: nodes of further terms.
-        limits, limit_rate: see :class:`lcc_rl.agents.limits.Limits`.
+        settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
+            :class:`lcc_rl.agents.simulated.SimulatedSettings`.
         device: where the terms compute.
         **resources: what terms may need: ``time_step``, ``string``.
 
@@ -33,35 +30,25 @@ class Objective:
         ConfigError: if a node or a limit is wrong.
     """
 
-    def __init__(
-        self,
-        surrogates: Mapping[str, Any],
-        regularizers: Mapping[str, Any],
-        limits: Mapping[str, float | None],
-        limit_rate: float,
-        device: str,
-        **resources: Any,
-    ) -> None:
-        def made(where: str, nodes: Mapping[str, Any]) -> dict[str, RewardTerm]:
+    def __init__(self, settings: Any, device: str, **resources: Any) -> None:
+        def made(where: str) -> dict[str, RewardTerm]:
             return {
                 name: build(node, f"agent.{where}.{name}", name=name, **resources).to(device)
-                for name, node in nodes.items()
+                for name, node in getattr(settings, where).items()
                 if node is not None
             }
 
-        self.surrogates = made("surrogates", surrogates)
-        self.regularizers = made("regularizers", regularizers)
-        self.limits = Limits(limits, limit_rate, self.surrogates)
+        self.surrogates, self.regularizers = made("surrogates"), made("regularizers")
+        self.limits = Limits(settings.limits, settings.limit_rate, self.surrogates)
         self.terms: list[tuple[RewardTerm, float]] = []
 
-    def replace(self, terms: Sequence[RewardTerm]) -> list[tuple[RewardTerm, float]]:
-        """Set and return what is maximised in place of the reward's terms, with factors."""
+    def replace(self, terms: Sequence[RewardTerm]) -> None:
+        """Set what is maximised in place of the reward's terms, with factors."""
         own = self.surrogates
         chosen = [
             (own[term.name], term.weight) if term.name in own else (term, 1.0) for term in terms
         ]
         self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
-        return self.terms
 
     def wanted(self) -> list[Key]:
         """Return the entries of the moment reached that the terms read."""
@@ -81,14 +68,16 @@ class Objective:
             factor * self.limits.price(term.name) * term.compute(*_entries(term, data)).squeeze(-1)
             for term, factor in self.terms
         ]
-        for (term, _), part in zip(self.terms, parts, strict=True):
-            if checked and any_lost([part]):
-                raise Diverged(f"the objective's term {term.name} ({type(term).__name__}) is nan")
+        if checked and any_lost(parts):
+            for (term, _), part in zip(self.terms, parts, strict=True):
+                if any_lost([part]):
+                    kind = type(term).__name__
+                    raise Diverged(f"the objective's term {term.name} ({kind}) is nan")
         return torch.stack(parts).sum(0)
 
-    def limited(self) -> list[str]:
-        """Return the names of the terms that have a limit to keep."""
-        return [term.name for term, _ in self.terms if term.name in self.limits.largest]
+    def limited(self) -> dict[str, Any]:
+        """Return the terms that have a limit to keep, by name."""
+        return {term.name: term for term, _ in self.terms if term.name in self.limits.largest}
 
     def missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:
         """Return the share of a rollout's time in which each limit was missed.
@@ -98,13 +87,12 @@ class Objective:
             running: which steps count, ``[batch, steps, 1]``.
         """
         shares = {}
-        terms: list[Any] = [term for term, _ in self.terms if term.name in self.limits.largest]
         with torch.no_grad():
-            for term in terms:
+            for name, term in self.limited().items():
                 missed = term.missed(*term.views(*_entries(term, data))).squeeze(-1)
                 counted = running.expand_as(missed)
                 total = (missed * counted).double().sum() / counted.sum().clamp(min=1)
-                shares[term.name] = float(total)
+                shares[name] = float(total)
         return shares
 
 

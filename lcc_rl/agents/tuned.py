@@ -9,67 +9,52 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModule
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.agents.gradient import rollout_of
-from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
-from lcc_rl.agents.objective import Objective
+from lcc_rl.agents.loop import REPORTED, derived_seed, episode_statistics
+from lcc_rl.agents.simulated import SimulatedAgent, SimulatedLoop, SimulatedSettings
 from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, require_positive, require_whole
-from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.pieces.observation import Observation
-from lcc_rl.pieces.rewards import RewardTerm
-from lcc_rl.policies.rules import make_policy
 
 MOST_WEIGHTS = 500  # beyond, the covariance of a generation's candidates says too little
 
 
 @dataclass(frozen=True)
-class TunedSettings:
-    """Settings of the tuner; conf/agent holds their values.
+class TunedSettings(SimulatedSettings):
+    """Settings of the tuner.
 
     Args:
-        policy, constants, hidden: see :class:`lcc_rl.agents.analytic.AnalyticSettings`.
         candidates: weights tried on the same episodes before the search moves.
         sigma: standard deviation of the candidates at the start; of a rule's constants that of
             their logarithms.
-        surrogates, limits, limit_rate, regularizers: likewise.
 
     Raises:
         ConfigError: if a setting is out of range.
     """
 
     policy: str = "idm"
-    constants: Mapping[str, float] | None = None
     hidden: Sequence[int] = ()
+    limit_rate: float = 0.2
     candidates: int = 10
     sigma: float = 0.3
-    surrogates: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float | None] = field(default_factory=dict)
-    limit_rate: float = 0.2
-    regularizers: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_positive("agent", sigma=self.sigma)
         require_whole("agent", 4, 1000, candidates=self.candidates)
 
 
-class Tuned:
+class Tuned(SimulatedAgent):
     """A policy whose weights are tuned by search.
 
-    Args:
-        observation, seed, time_step, max_acceleration, string, device: see
-            :class:`lcc_rl.agents.analytic.Analytic`.
-        settings: see :class:`TunedSettings`; None for its defaults.
+    Arguments as of :class:`lcc_rl.agents.simulated.SimulatedAgent`.
 
     Raises:
         ConfigError: if a setting is out of range, or there are too many weights to search.
@@ -77,35 +62,12 @@ class Tuned:
 
     Settings: ClassVar[type[TunedSettings]] = TunedSettings
 
-    def __init__(
-        self,
-        observation: Observation,
-        seed: int,
-        time_step: float,
-        max_acceleration: float = 3.0,
-        string: VehicleString | None = None,
-        settings: TunedSettings | None = None,
-        device: str = "cpu",
-    ) -> None:
-        self.settings = own = TunedSettings() if settings is None else settings
-        self.seed = seed
-        self.objective = Objective(
-            own.surrogates,
-            own.regularizers,
-            own.limits,
-            own.limit_rate,
-            device,
-            time_step=time_step,
-            string=string,
-        )
-        self.policy: TensorDictModule = make_policy(
-            own.policy, observation, own.hidden, seed, own.constants, max_acceleration
-        ).to(device)
+    def _prepare(self, size: int) -> None:
         self.weights = [entry for entry in self.policy.parameters() if entry.requires_grad]
         count = sum(entry.numel() for entry in self.weights)
         if count > MOST_WEIGHTS:
             raise ConfigError(
-                f"agent.policy={own.policy} has {count} weights, a search can tune "
+                f"agent.policy={self.settings.policy} has {count} weights, a search can tune "
                 f"{MOST_WEIGHTS}: say agent.policy=idm or acc, or a smaller agent.hidden"
             )
         self.start = parameters_to_vector(self.weights).detach().double().cpu().numpy()
@@ -175,19 +137,14 @@ class Tuned:
         self.policy.load_state_dict(state["policy"])
 
 
-class SearchLoop(TrainingLoop[Tuned]):
+class SearchLoop(SimulatedLoop[Tuned]):
     """Tunes by search, one candidate an iteration; arguments as of :class:`TrainingLoop`."""
 
     advice = "Lower agent.sigma"
     watched = "cost"
 
-    def _prepare(self) -> None:
-        self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
-        self.objective = self.agent.objective
-        self.objective.replace(self.terms)
-
     def _source(self) -> DifferentiableRollout:
-        return rollout_of(self.env, self.objective, self.terms, False)
+        return self._rollout()
 
     def footprint(self) -> Footprint:
         with torch.no_grad():
@@ -212,8 +169,7 @@ class SearchLoop(TrainingLoop[Tuned]):
             running = 1.0 - (data["next", "terminated"].cumsum(1) > 0).double()
             objective = self.objective.score(data) * running
         shares = self.objective.missed(data, running)
-        limits = self.objective.limits
-        prices = {f"price_{name}": limits.price(name) for name in shares}
+        limits = self._limits_row(shares)
         cost = -float(objective.sum(1).mean())
         self.agent.tell(cost, shares)
         self.agent.settle()
@@ -226,8 +182,7 @@ class SearchLoop(TrainingLoop[Tuned]):
             "updates": float(self.updates),
             **episode_statistics(data.select(*REPORTED)),
             "cost": cost,
-            **{f"share_{name}": share for name, share in shares.items()},
-            **prices,
+            **limits,
         }
         self._record(row, time.perf_counter() - begun, 0.0)
         return row

@@ -134,8 +134,10 @@ def _composed(overrides: list[str]) -> list[dict[str, Any]]:
 
 def _episodes(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Return the node of the trajectories that a job keeps in its folder."""
-    node = {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
-    return node | {key: plain(cfg.data[key]) for key in ("plausible",) if cfg.data.get(key)}
+    node: dict[str, Any] = {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
+    if cfg.data.get("plausible"):
+        node["plausible"] = plain(cfg.data.plausible)
+    return node
 
 
 def calibrate_once(cfg: DictConfig, folder: Path) -> Path:

@@ -15,6 +15,7 @@ from lcc_rl.config import CALLED, build_as, load
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
+from lcc_rl.envs.finite import ACTION
 from lcc_rl.envs.inputs import load_inputs, string_of
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
@@ -26,7 +27,6 @@ from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.schemas import check_ranges
 
-ACTION = (AUTOMATED, "action")
 MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
 
 

@@ -28,7 +28,7 @@ from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.functional.power import acceleration_loss, steady_power
+from lcc_rl.functional.power import path_power
 from lcc_rl.pieces.base import STEP
 from lcc_rl.pieces.views import VEHICLES, Views
 
@@ -127,7 +127,7 @@ def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> N
 def path_energy(data: TensorDictBase, time_step: float) -> Tensor:
     """Return the energy of all vehicles without what the last speed stores, ``[batch]`` [kJ]."""
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
-    power = steady_power(now) + acceleration_loss(now, (then - now) / time_step)
+    power = path_power(now, (then - now) / time_step)
     return power.flatten(1).sum(1) * time_step * KILO
 
 

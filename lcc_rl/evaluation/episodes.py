@@ -19,11 +19,11 @@ from lcc_rl.config import require
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs, string_of
-from lcc_rl.evaluation.metrics import energy_measures, measured_ttc, safety_measures
+from lcc_rl.evaluation.metrics import KILO, energy_measures, measured_ttc, safety_measures
 from lcc_rl.evaluation.rollout import Record, play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.functional.power import acceleration_loss, steady_power
+from lcc_rl.functional.power import path_power
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.controllers import Population
@@ -259,8 +259,8 @@ def leader_measures(profiles: Profiles, profile: Tensor) -> pd.DataFrame:
     rows = []
     for index in ids:
         speed = profiles.record(int(index))
-        loss = acceleration_loss(speed[:-1], speed.diff() / profiles.time_step)
-        energy = (steady_power(speed[:-1]) + loss).sum() * profiles.time_step / 1e3
+        power = path_power(speed[:-1], speed.diff() / profiles.time_step)
+        energy = power.sum() * profiles.time_step * KILO
         rows.append((float(energy), float(speed.mean())))
     return pd.DataFrame(np.array(rows)[place], columns=list(LEADER))
 

@@ -87,6 +87,19 @@ def acceleration_loss(speed: Tensor, acceleration: Tensor) -> Tensor:
     return (p02 + p12 * speed) * acceleration * acceleration
 
 
+def path_power(speed: Tensor, acceleration: Tensor) -> Tensor:
+    """Power that a path takes: :func:`steady_power` and :func:`acceleration_loss`.
+
+    Args:
+        speed: speed at the start of the step, any shape [m/s].
+        acceleration: executed acceleration, same shape [m/s²].
+
+    Returns:
+        Power [W], same shape: A2 without what the motion stores.
+    """
+    return steady_power(speed) + acceleration_loss(speed, acceleration)
+
+
 def kinetic_energy(speed: Tensor, vehicle: Vehicle = PAPER_VEHICLE) -> Tensor:
     """Kinetic energy ½ δ m v² including rotating parts [J] of a car at ``speed`` [m/s]."""
     return 0.5 * vehicle.rotating_mass * vehicle.mass * speed * speed

@@ -15,7 +15,7 @@ from torch.nn.functional import softplus
 
 from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.functional.power import acceleration_loss, steady_power
+from lcc_rl.functional.power import path_power
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
@@ -200,7 +200,7 @@ class PathEnergy(RewardTerm):
     def reward(self, speed: Tensor, acceleration: Tensor, *indices: Tensor) -> Tensor:
         """Return the unweighted term."""
         before = speed - acceleration * self.time_step
-        power = steady_power(before) + acceleration_loss(before, acceleration)
+        power = path_power(before, acceleration)
         if self.behind:
             power = self.sections.sum(power, *indices)
         return power * -self.factor

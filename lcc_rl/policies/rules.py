@@ -7,6 +7,7 @@ simulator, or by search, can train them, and what is stored is a policy like any
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
@@ -23,7 +24,7 @@ from lcc_rl.policies.actor import make_actor, seeded_mlp
 SEEN = ("self.speed", "self.gap", "self.relative_speed")
 
 
-class Rule(nn.Module):
+class Rule(nn.Module, ABC):
     """A rule whose constants are learned; their logarithms are, so that they stay positive.
 
     Args:
@@ -41,8 +42,8 @@ class Rule(nn.Module):
     def __init__(
         self,
         observation: Observation,
-        constants: Mapping[str, float] | None = None,
-        max_acceleration: float = 3.0,
+        constants: Mapping[str, float] | None,
+        max_acceleration: float,
     ) -> None:
         super().__init__()
         given = dict(constants or {})
@@ -69,11 +70,11 @@ class Rule(nn.Module):
         command = self.acceleration(speed, gap, relative_speed, *self.logarithms.exp())
         return (command / self.max_acceleration).clamp(-1.0, 1.0)
 
+    @abstractmethod
     def acceleration(
         self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
     ) -> Tensor:
         """Return the acceleration [m/s²] for the constants in the order of ``START``."""
-        raise NotImplementedError
 
 
 class IDMRule(Rule):
@@ -148,8 +149,8 @@ def make_policy(
     observation: Observation,
     hidden: Sequence[int],
     seed: int,
-    constants: Mapping[str, float] | None = None,
-    max_acceleration: float = 3.0,
+    constants: Mapping[str, float] | None,
+    max_acceleration: float,
 ) -> TensorDictModule:
     """Build the policy of an agent.
 

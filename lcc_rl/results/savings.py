@@ -76,7 +76,7 @@ def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -
     table = energy.pivot(index="profile_id", columns=["strategy", "training_seed"], values=column)
     table = table.dropna(axis=1, how="all").dropna()
     if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
-        return Estimate(np.nan, np.nan, np.nan)
+        return NOTHING
     return saving(table[strategy].to_numpy(), table[baseline].to_numpy())
 
 
