@@ -148,7 +148,9 @@ def explained(error: Exception, entry: str, overrides: Sequence[str]) -> Excepti
         fewer = [item for item in kept if wrong and wrong not in item]
         try:
             return explain(error, _compose(entry, fewer, hydra))
-        except (HydraException, OmegaConfBaseException) as next_error:
+        except Exception as next_error:
+            if not refused_by_hydra(next_error):
+                raise
             if len(fewer) in (0, len(kept)):  # nobody typed the key that was refused
                 return error
             kept, wrong = fewer, refused_key(next_error)

@@ -121,4 +121,5 @@ def string_of_scenario(scenario: Any) -> VehicleString:
 
 
 def _is_human(node: Any) -> bool:
-    return node is not None and str(node.get("_target_", "")).endswith((".IDM", ".Handover"))
+    known = OmegaConf.is_dict(node)  # anything else is refused where it is built
+    return known and str(node.get("_target_", "")).endswith((".IDM", ".Handover"))

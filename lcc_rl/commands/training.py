@@ -19,7 +19,7 @@ from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
-from lcc_rl.io.files import parquet_metadata, read_parquet, remove_leftovers
+from lcc_rl.io.files import parquet_metadata, read_parquet
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.runs import (
     check_folder,
@@ -144,7 +144,6 @@ def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: 
     if resume:
         trainer.load()
     save_config(cfg, folder)
-    remove_leftovers(folder / POLICIES)
     trainer.on_keep = partial(keep_policy, agent, cfg, folder)
     with build_logger(cfg).opened(folder) as trainer.on_row:
         trainer.run()

@@ -22,7 +22,16 @@ from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
 from lcc_rl.io.memory import require_memory
-from lcc_rl.pieces import CBFFilter, Piece, Places, StringMotion, TotalReward
+from lcc_rl.pieces import (
+    Action,
+    CBFFilter,
+    Controller,
+    Corrected,
+    Piece,
+    Places,
+    StringMotion,
+    TotalReward,
+)
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.schemas import check_ranges
@@ -103,7 +112,7 @@ def build_pieces(
     pieces = _leader(scenario, named.pop("leader", None), resources)
     drivers = _drivers(scenario, string, resources)
     pieces += [Places(string), *drivers, _motion(scenario, string, resources)]
-    pieces += [piece.watch() for piece in drivers if isinstance(piece, CBFFilter)]
+    pieces += _watchers(drivers)
     pieces += [_build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
     check_spacing(pieces, profiles)
     if not string.count(AUTOMATED):
@@ -115,6 +124,17 @@ def build_pieces(
     ]
     # The sum stays last, before collisions of the next step.
     return [*pieces, TotalReward(list(cfg.reward.terms), string)]
+
+
+def _watchers(drivers: Sequence[Controller | CBFFilter]) -> list[Piece]:
+    """Build the pieces that say what the filters answer for, and what they change."""
+    filters = {piece.role: piece for piece in drivers if isinstance(piece, CBFFilter)}
+    changed = [
+        Corrected(piece.max_acceleration, piece.string, piece.role)
+        for piece in drivers
+        if isinstance(piece, Action) and piece.role in filters
+    ]
+    return [*(piece.watch() for piece in filters.values()), *changed]
 
 
 def _build(node: Any, where: str, **resources: Any) -> Any:
@@ -136,7 +156,7 @@ def _leader(scenario: Any, node: Any, resources: dict[str, Any]) -> list[Piece]:
     return [] if node is None else [_build(node, "scenario.pieces.leader", **resources)]
 
 
-def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> list[Piece]:
+def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> list[Any]:
     """Build the controllers of the roles that occur, and their safety filters."""
     pieces = []
     for group, needed in (("controllers", True), ("filters", False)):

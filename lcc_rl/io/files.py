@@ -24,6 +24,7 @@ from lcc_rl.version import __version__
 SCHEMA_VERSION = "1"
 # Changes of a table from one schema version to the next, by the older version.
 MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
+SUBFOLDERS = ("figures", "policies")  # of a run; other folders in it are runs of their own
 PROCESSOR = "lcc_rl.processor"  # in a table's metadata
 
 
@@ -68,10 +69,14 @@ def _sync_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of killed writers; call it only while no writer is active."""
-    for path in folder.glob(".*.tmp"):
-        with suppress(OSError):
-            path.unlink()
+    """Remove temporary files of killed writers from a run's folder and its own subfolders.
+
+    Call it only while no writer is active.
+    """
+    for place in (folder, *(folder / name for name in SUBFOLDERS)):
+        for path in place.glob(".*.tmp"):
+            with suppress(OSError):
+                path.unlink()
 
 
 def write_parquet(

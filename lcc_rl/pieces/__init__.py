@@ -2,7 +2,7 @@
 
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
-from lcc_rl.pieces.cbf import CBFFilter
+from lcc_rl.pieces.cbf import CBFFilter, Corrected
 from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
 from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
 from lcc_rl.pieces.estimator import DriverEstimator
@@ -24,7 +24,13 @@ from lcc_rl.pieces.rewards import (
 from lcc_rl.pieces.rules import FollowerStopper, Handover
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
-from lcc_rl.pieces.surrogates import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
+from lcc_rl.pieces.surrogates import (
+    Correction,
+    PathEnergy,
+    SmoothEfficiency,
+    Smoothness,
+    SmoothSafety,
+)
 from lcc_rl.pieces.termination import Collision
 
 __all__ = [
@@ -38,6 +44,8 @@ __all__ = [
     "Communication",
     "ConstantAcceleration",
     "Controller",
+    "Corrected",
+    "Correction",
     "DeadBeat",
     "DriverEstimator",
     "EfficiencyReward",

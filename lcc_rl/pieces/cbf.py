@@ -131,6 +131,35 @@ class CBFFilter(StepTransform):
         return (time_gap * share * moving).clamp(min=self.least_gap), slope
 
 
+class Corrected(StepTransform):
+    """Writes by how much the command differs from a policy's action, ``(role, "correction")``.
+
+    ``[*batch, n, 1]`` [m/s²]: zero where the filter lets the policy drive.
+
+    Args:
+        max_acceleration: acceleration of action 1 [m/s²].
+        string: the string of vehicles; one automated vehicle where not given.
+        role: whose commands are filtered.
+    """
+
+    def __init__(
+        self,
+        max_acceleration: float = 3.0,
+        string: VehicleString | None = None,
+        role: str = AUTOMATED,
+    ) -> None:
+        string = VehicleString((role,)) if string is None else string
+        self.views = Views(string, role, [f"{role}.action", f"next.command.{role}"])
+        writes, shape = [(role, "correction")], (string.count(role), 1)
+        super().__init__(self.views.keys, writes, event_shape=shape)
+        self.max_acceleration = max_acceleration
+
+    def compute(self, *entries: Tensor) -> Tensor:
+        """Return what the filter added."""
+        action, command = self.views(*entries)
+        return command - self.max_acceleration * action
+
+
 class Promised(StepTransform):
     """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
 

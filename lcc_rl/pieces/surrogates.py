@@ -161,6 +161,31 @@ class Smoothness(RewardTerm):
         return -jerk.square()
 
 
+class Correction(RewardTerm):
+    """Minus the square of what the safety filter changes: draws a policy to the filter's limits.
+
+    Where the filter drives, a policy has no gradient, and one that starts there, braking always,
+    never learns anything. Only of use with a filter that writes the correction.
+
+    Args:
+        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`; the price of 1 (m/s²)².
+    """
+
+    reads = ("automated.correction",)
+
+    def __init__(
+        self,
+        name: str = "correction",
+        weight: float = 0.1,
+        string: VehicleString | None = None,
+    ) -> None:
+        super().__init__(name, weight, string=string)
+
+    def reward(self, correction: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        return -correction.square()
+
+
 class PathEnergy(RewardTerm):
     """−P/scale · T of the energy that a path takes: A2 without what the motion stores.
 

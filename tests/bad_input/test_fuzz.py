@@ -66,6 +66,18 @@ def test_what_it_found_stays_mended(override, words) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_number_where_a_controller_belongs() -> None:
+    with pytest.raises(ConfigError, match=r"scenario\.controllers\.automated"):
+        fuzz.build_study(("variant=ddpg", *fuzz.SMALL, "++scenario.controllers.automated=-0.0"))
+
+
+def test_two_wrong_options_of_which_the_second_shows_without_the_first() -> None:
+    wrong = ("knowledge@deployed=preview", "++evaluation.baselines.weight=0.5")
+    with pytest.raises(ConfigError, match="unknown option 'knowledge'; valid: agent") as caught:
+        fuzz.build_study(("variant=own_energy", *fuzz.SMALL, *wrong))
+    assert "\n" not in str(caught.value)
+
+
 def test_a_reference_in_a_circle_that_arises_when_the_policy_is_deployed() -> None:
     with pytest.raises(ConfigError, match="Interpolation to parent node"):
         fuzz.build_study(("variant=hcfs", *fuzz.SMALL, "deployed.clamp=${scenario}"))

@@ -9,7 +9,8 @@ from torchrl.envs import check_env_specs
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces import CBFFilter, Corrected, Correction
+from lcc_rl.pieces.rewards import TERMS
 
 WHOLE = "scenario.horizon=300"
 
@@ -54,6 +55,28 @@ def test_every_automated_vehicle_of_a_string_is_filtered() -> None:
     assert data["promised"].shape == data["ttc"].shape
     assert data["promised"].mean() > 0.95
     assert data["gap"].min() > 0.1
+
+
+def test_what_the_filter_changes_is_recorded_and_priced() -> None:
+    price = "+reward.terms.held={_target_: lcc_rl.pieces.Correction, weight: 0.5}"
+    env = small_env("alcc", 32, [WHOLE, "+filter=cbf", price], nominal=True)
+    keys = [("automated", "correction"), ("vehicles", "command"), (*TERMS, "held")]
+    record, _ = play(env, lambda td: td.set(ACTION, torch.full((32, 1, 1), 0.2)), None, keys)
+    correction, command, term = (record[key] for key in keys)
+    command = command[-len(correction) :, ..., :1, :]
+    assert torch.allclose(correction, command - 0.6, atol=1e-6)
+    assert correction.abs().max() > 0.5
+    assert (correction == 0).double().mean() > 0.1  # where the filter lets it drive
+    assert torch.allclose(term, -0.5 * correction.square(), atol=1e-6)
+
+
+def test_where_the_filter_drives_the_price_has_the_only_gradient() -> None:
+    action = torch.full((3, 1, 1), -0.9, requires_grad=True)
+    speed, gap = column(6.0, 6.0, 6.0), column(25.0, 25.0, 25.0)
+    command = CBFFilter(0.1).filtered(3.0 * action, speed, gap, speed, 0 * speed)
+    assert torch.autograd.grad(command.sum(), action, retain_graph=True)[0].abs().sum() == 0
+    price = Correction(weight=1.0).compute(Corrected().compute(action, command))
+    assert (torch.autograd.grad(price.sum(), action)[0] > 0).all()  # brake less
 
 
 def column(*values: float) -> torch.Tensor:

@@ -32,6 +32,8 @@ from lcc_rl.pieces import (
     Communication,
     ConstantAcceleration,
     Controller,
+    Corrected,
+    Correction,
     DeadBeat,
     DriverEstimator,
     EfficiencyReward,
@@ -71,7 +73,7 @@ from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, s
 HORIZON, T = 12, 0.1
 CONNECTED = ("cacc", "beat", "hybrid")
 ROLES = ("human", "automated", "human", "cacc", "cacc", "automated", "beat", "stopper")
-ROLES = (*ROLES, "handover", "constant", "guarded", "hybrid", "hybrid", "human")
+ROLES = (*ROLES, "handover", "constant", "plain", "hybrid", "hybrid", "human")
 STRINGS = {
     "open": VehicleString(ROLES),
     "drawn": VehicleString(ROLES, drawn=True),
@@ -83,6 +85,8 @@ SCALES = {
     "behind": {"speed": 0.1, "gap": 0.1},
     "memory": {"entries": 0.5},
 }
+FILTERED = "Action, filtered"
+ACTIONS = {ACTION: (2, 1), ("plain", "action"): (1, 1), ("hybrid", "action"): (2, 1)}
 BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller)
 STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
 
@@ -107,7 +111,8 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         return FollowerStopper(T, speed, window=0.5, string=string, role=role)
 
     return {
-        "Action": lambda: Action(string=string),
+        FILTERED: lambda: Action(string=string),
+        "Action": lambda: Action(string=string, role="plain"),
         "IDM": lambda: human("human"),
         "CACC": lambda: CACC(T, k3=0.4, string=string, role="cacc"),
         "DeadBeat": lambda: DeadBeat(T, string=string, role="beat"),
@@ -116,11 +121,11 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
             human("handover"), stopper("handover"), 0.5, T, string, "handover"
         ),
         "ConstantAcceleration": lambda: ConstantAcceleration(0.3, string, "constant"),
-        "ConstantAcceleration, guarded": lambda: ConstantAcceleration(1.0, string, "guarded"),
         "HCFS": lambda: HCFS(
             CACC(T, k3=0.4, string=string, role="hybrid"), T, string=string, role="hybrid"
         ),
-        "CBFFilter": lambda: CBFFilter(T, string=string, role="guarded"),
+        "CBFFilter": lambda: CBFFilter(T, string=string),
+        "Corrected": lambda: Corrected(3.0, string),
     }
 
 
@@ -149,6 +154,7 @@ def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "SmoothSafety": lambda: SmoothSafety("smooth_safety", **own),
         "SmoothEfficiency": lambda: SmoothEfficiency("smooth_efficiency", **own),
         "Smoothness": lambda: Smoothness(**own),
+        "Correction": lambda: Correction(**own),
         "PathEnergy": lambda: PathEnergy(T, "path_energy", **own),
         "PathEnergy, behind": lambda: PathEnergy(T, "path_behind", of="behind", **own),
     }
@@ -191,12 +197,12 @@ def made(road: str) -> dict[str, Piece]:
 # What is checked of each piece; what the filter replaces is no piece's own any more.
 EACH = pytest.mark.parametrize(
     ("road", "name"),
-    [(r, n) for r in STRINGS for n in makers(r) if n != "ConstantAcceleration, guarded"],
+    [(r, n) for r in STRINGS for n in makers(r) if n != FILTERED],
 )
 
 
 def clock(batch_size: int | tuple[int, ...] = 3) -> Clock:
-    return Clock(HORIZON, batch_size, {ACTION: (2, 1), ("hybrid", "action"): (2, 1)}, seed=4)
+    return Clock(HORIZON, batch_size, ACTIONS, seed=4)
 
 
 def full_env(road: str, batch_size: int | tuple[int, ...] = 3) -> TransformedEnv:
@@ -263,7 +269,7 @@ def test_torchrls_compose_and_this_packages_give_the_same(road) -> None:
 
     def same_actions(td):
         step = data[:, next(number)]
-        return td.update(step.select(ACTION, ("hybrid", "action")))
+        return td.update(step.select(*ACTIONS))
 
     other = env.rollout(HORIZON, same_actions, break_when_any_done=False)
     assert set(other.keys(True, True)) == set(data.keys(True, True))

@@ -74,9 +74,11 @@ def test_a_failure_is_recorded_and_forgotten_when_tried_again(tmp_path) -> None:
         fails(tmp_path, ConfigError("agent.gamma must\nlie in [0, 1)"))
     assert (tmp_path / ERROR).read_text() == "agent.gamma must lie in [0, 1)\n"
     assert inspect_run(tmp_path).error == "agent.gamma must lie in [0, 1)"
-    (tmp_path / ".episodes.parquet.1.tmp").write_text("half a fi")
+    (tmp_path / "figures").mkdir()
+    for name in (".episodes.parquet.1.tmp", "figures/.savings.png.1.tmp"):
+        (tmp_path / name).write_text("half a fi")
     with working(tmp_path):
-        assert list(tmp_path.iterdir()) == [tmp_path / LOCK]
+        assert set(tmp_path.rglob("*")) == {tmp_path / LOCK, tmp_path / "figures"}
     assert inspect_run(tmp_path).state == "stopped"
 
 
