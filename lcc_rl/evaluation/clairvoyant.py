@@ -33,6 +33,7 @@ from lcc_rl.pieces.base import STEP
 from lcc_rl.pieces.views import VEHICLES, Views
 
 MEASURED = ("gap", "relative_speed", "time_gap", "speed")
+BOTH, OWN = "clairvoyant", "clairvoyant own"
 MARGIN = 1.01  # the limits are kept with one per cent to spare
 LEAST_GAP = 0.5  # [m]
 FAR = 20.0  # beyond this a limit is not missed by more [m]
@@ -65,6 +66,7 @@ def clairvoyant(
     seed: int,
     iterations: int = 400,
     compiled: bool = True,
+    own: bool = False,
     report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None,
 ) -> Strategy:
     """Return the best that was found, starting from a learned controller's drive.
@@ -78,6 +80,7 @@ def clairvoyant(
             given the same, and a batch that holds all episodes.
         iterations: steps along the gradient.
         compiled: compile the simulator.
+        own: minimise the energy of the automated vehicles only, without regard for others.
         report: told the number of the iteration, the energy [kJ] and the price of the limits.
 
     Raises:
@@ -102,13 +105,13 @@ def clairvoyant(
         _, record = source.play(source.start(given), network, steps, shifts)
         data = source.assemble(record)
         check_batch(data, pieces_of(env), who=strategy.title)
-        energy = path_energy(data, strategy.cfg.scenario.time_step)
+        energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None)
         missed = misses(data, string)
         _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
     planned = Planned(strategy.policy, shifts.detach())
-    return replace(strategy, name="clairvoyant", policy=planned, seed=None)
+    return replace(strategy, name=OWN if own else BOTH, policy=planned, seed=None)
 
 
 def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> None:
@@ -124,9 +127,17 @@ def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> N
     optimizer.step()
 
 
-def path_energy(data: TensorDictBase, time_step: float) -> Tensor:
-    """Return the energy of all vehicles without what the last speed stores, ``[batch]`` [kJ]."""
+def path_energy(
+    data: TensorDictBase, time_step: float, string: VehicleString | None = None
+) -> Tensor:
+    """Return the energy without what the last speed stores, ``[batch]`` [kJ].
+
+    Of all vehicles, or, given the string, of the automated ones.
+    """
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
+    if string is not None:
+        views = Views(string, AUTOMATED, ["self.speed", "next.self.speed"])
+        now, then = views(*(data.get(key) for key in views.keys))
     power = path_power(now, (then - now) / time_step)
     return power.flatten(1).sum(1) * time_step * KILO
 

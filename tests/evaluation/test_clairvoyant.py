@@ -82,6 +82,15 @@ def test_misses(gap, relative_speed, speed, missed) -> None:
     assert float(found) == pytest.approx(missed, abs=1e-4)
 
 
+def test_without_regard_the_car_alone_saves() -> None:
+    start = learned()
+    plans = [clairvoyant(start, INPUTS, 2, 1, 30, False, own) for own in (True, False)]
+    alone, both = (played(plan) for plan in plans)
+    assert alone["strategy"].unique().tolist() == ["clairvoyant own"]
+    assert alone["cav_path_energy_kj"].mean() < both["cav_path_energy_kj"].mean()
+    assert alone["total_path_energy_kj"].mean() > both["total_path_energy_kj"].mean()
+
+
 def test_path_energy_at_constant_speed() -> None:
     # 0.1 s of A2 at 5 and 0 m/s, without acceleration.
     watts = 110.3 + 422.9 * 5 - 0.0279 * 25 + 0.3557 * 125 + 110.3
@@ -101,6 +110,15 @@ def test_the_command(tmp_path, capsys) -> None:
     assert "clairvoyant" in capsys.readouterr().out
     rows = pd.read_parquet(tmp_path / "episodes.parquet")
     assert rows["strategy"].value_counts().to_dict() == {"idm": 2, "alcc": 2, "clairvoyant": 2}
+    starts = ["--policy", "pretrained", "--policy", "pretrained/reference", "--regard"]
+    tool.BLOCK = 2  # a window at a time
+    two = ["scenario.horizon=30", "evaluation.profiles=2", "evaluation.drivers=2"]
+    assert tool.main([*own, *starts, *two]) == 0
+    assert "take" in capsys.readouterr().out
+    rows = pd.read_parquet(tmp_path / "episodes.parquet")
+    names = ["idm", "alcc", "reference", "clairvoyant", "clairvoyant own"]
+    assert rows["strategy"].value_counts().to_dict() == dict.fromkeys(names, 4)
+    assert rows.groupby("strategy")["profile_id"].agg(set).map(sorted).tolist() == [[0, 1]] * 5
     out = ["--out", str(tmp_path / "none")]
     for wrong, words in (
         (["--iterations", "0"], "iterations must be at least 1, got 0"),
