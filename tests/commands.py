@@ -27,6 +27,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.savings import UNTRAINED as UNTRAINED  # the baselines, in their order
 from lcc_rl.runs.interrupts import SIGNALS
 
 # Data that take a fraction of a second to generate; enough for every entry point.
@@ -36,8 +37,6 @@ QUICK = "calibration.local_genetic.generations=2"
 AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")
 NO_AGENT = ("experiment=smoke", *DATA, HORIZON)
 TINY = (*NO_AGENT, *AGENT)
-# The baselines of the leading-cruise scenario, in their order.
-HUMANS = ("direct", "idm", "human")
 
 
 def tiny(entry: str, *overrides: str, agent: bool = True) -> DictConfig:

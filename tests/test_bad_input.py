@@ -8,7 +8,7 @@ import re
 import pandas as pd
 import pytest
 import torch
-from commands import HUMANS, QUICK, tiny
+from commands import UNTRAINED, QUICK, tiny
 from omegaconf import OmegaConf
 
 from lcc_rl import results
@@ -291,7 +291,7 @@ def test_policies_of_two_agents_stand_side_by_side(tmp_path) -> None:
     compared = f"compare=[{tmp_path / 'analytic'}]"
     cfg = tiny("evaluate", "variant=alcc", f"policy={tmp_path / 'ddpg'}", compared, agent=False)
     rows = evaluation.run(cfg, tmp_path / "both", quiet=True)
-    assert list(rows["strategy"].unique()) == [*HUMANS, "alcc analytic", "alcc ddpg"]
+    assert list(rows["strategy"].unique()) == [*UNTRAINED, "alcc analytic", "alcc ddpg"]
     energies = rows.groupby("strategy")["total_energy_kj"].mean()
     assert energies["alcc analytic"] != energies["alcc ddpg"]
 

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import (
-    HUMANS,
+    UNTRAINED,
     QUICK,
     TINY,
     assert_same_tables,
@@ -77,7 +77,7 @@ def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> N
     assert any(not torch.equal(weights[name], last[name]) for name in last)
     cfg = tiny("evaluate", "variant=alcc", f"policy={kept}", agent=False)
     rows = evaluation.run(cfg, tmp_path / "evaluation", quiet=True)
-    assert set(rows["strategy"]) == {*HUMANS, "alcc"}
+    assert set(rows["strategy"]) == {*UNTRAINED, "alcc"}
 
 
 def test_what_is_kept_is_no_part_of_a_run_and_a_given_policy_is() -> None:
@@ -94,7 +94,7 @@ def test_a_folder_with_a_training_is_not_overwritten(trained) -> None:
 def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}")
     rows = evaluation.run(cfg, tmp_path)  # not quiet: draws figures
-    assert set(rows["strategy"]) == {*HUMANS, "alcc"}
+    assert set(rows["strategy"]) == {*UNTRAINED, "alcc"}
     # The training's own evaluation met the same episodes.
     own = read_parquet(trained / "episodes.parquet")
     again = rows[rows["strategy"] == "alcc"].reset_index(drop=True)[own.columns]
@@ -204,7 +204,7 @@ def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
     training.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct", quiet=True)
     cfg = tiny("evaluate", "variant=idm", "scenario.string='automated human*3'", agent=False)
     rows = evaluation.run(cfg, tmp_path / "three")
-    assert set(rows["strategy"]) == {*HUMANS}
+    assert set(rows["strategy"]) == {*UNTRAINED}
     assert (tmp_path / "three" / "figures" / "episode_idm.png").exists()
 
 
@@ -217,7 +217,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     jobs_in_threads(monkeypatch)
     overrides = [*TINY, QUICK, "variants=[reference,alcc]"]
     rows = pipeline.run(load("pipeline", overrides), tmp_path, overrides)
-    assert set(rows["strategy"]) == {*HUMANS, "reference", "alcc"}
+    assert set(rows["strategy"]) == {*UNTRAINED, "reference", "alcc"}
     for name in ("reference", "alcc"):
         assert (tmp_path / name / "policy.pt").exists()
     figures = {path.name for path in (tmp_path / "evaluation" / "figures").iterdir()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from commands import HUMANS, run_process, tiny
+from commands import UNTRAINED, run_process, tiny
 from helpers import POPULATION, compose, wavy_profiles
 
 from lcc_rl.commands import evaluation
@@ -72,7 +72,7 @@ def rows(folder, *overrides):
 def test_a_power_model_measures_every_strategy(tmp_path) -> None:
     words = ("variant=alcc", "policy=pretrained")
     plain, own = rows(tmp_path / "a", *words), rows(tmp_path / "b", *words, POWER)
-    assert set(own["strategy"]) == {*HUMANS, "alcc"}
+    assert set(own["strategy"]) == {*UNTRAINED, "alcc"}
     # The same drives, measured by another model: direct has no automated vehicle.
     for name in ("cav_energy_kj", "hdv_energy_kj"):
         known = plain[name].notna()
@@ -84,7 +84,7 @@ def test_a_power_model_measures_every_strategy(tmp_path) -> None:
 def test_a_driver_model_drives_behind_every_strategy(tmp_path) -> None:
     words = ("variant=alcc", "policy=pretrained")
     plain, own = rows(tmp_path / "a", *words), rows(tmp_path / "b", *words, HUMAN)
-    for name in (*HUMANS, "alcc"):
+    for name in (*UNTRAINED, "alcc"):
         one, two = (x.loc[x["strategy"] == name, "hdv_energy_kj"].mean() for x in (plain, own))
         assert one != two, name
     # The automated vehicle of the human baseline is the IDM still.
@@ -94,7 +94,7 @@ def test_a_driver_model_drives_behind_every_strategy(tmp_path) -> None:
 
 def test_a_controller_is_evaluated_beside_the_baselines(tmp_path) -> None:
     own, plain = rows(tmp_path / "a", "variant=idm", OWN), rows(tmp_path / "b", "variant=idm")
-    assert list(own["strategy"].unique()) == [*HUMANS, "keepdistance"]
+    assert list(own["strategy"].unique()) == [*UNTRAINED, "keepdistance"]
     one, two = (x[x["strategy"] == "idm"].reset_index(drop=True) for x in (own, plain))
     assert one[two.columns].equals(two)
 

@@ -32,10 +32,15 @@ log = logging.getLogger("lcc_rl")
 # Pieces that belong to what a policy observes, not to the traffic.
 KNOWLEDGE = ("memory", "preview")
 GAINS = ("path", "paper_like", "tuned")
+PLACE = "controller@scenario.controllers.automated"
+# Cruise controls whose constants were tuned, also behind the safety filter: they keep it.
+TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
+FILTERED = "_filtered"
 # Baselines by name: the controller of the automated vehicles, by what makes it.
 BASELINES = {
     "idm": ("variant=idm",),
     "human": ("variant=idm", *(f"{AUTO}.{x}=null" for x in ("desired_speed", "time_gap"))),
+    **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
     **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
     "deadbeat": ("variant=deadbeat",),
     "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
@@ -113,6 +118,9 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
+    if name in TUNED and cfg.scenario.filters.get(AUTOMATED) is not None:
+        filtered = baseline_controller(name, FILTERED)
+        return Strategy(name, driven_by(cfg, filtered))
     controller = baseline_controller(name)
     if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)
@@ -120,15 +128,16 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
 
 
 @cache  # composed once: an evaluation asks for each several times
-def baseline_controller(name: str) -> Any:
-    """Return the node of a baseline's controller.
+def baseline_controller(name: str, suffix: str = "") -> Any:
+    """Return the node of a baseline's controller, of a tuned one also behind the filter.
 
     Raises:
         ConfigError: if there is none of that name.
     """
     if name not in BASELINES:
         raise unknown_name("baseline", name, (DIRECT, *BASELINES))
-    return plain(load("evaluate", BASELINES[name]).scenario.controllers.automated)
+    *first, last = BASELINES[name]
+    return plain(load("evaluate", [*first, last + suffix]).scenario.controllers.automated)
 
 
 def without_filter(cfg: DictConfig) -> DictConfig:

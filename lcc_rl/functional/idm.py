@@ -42,13 +42,13 @@ class IDMConstants:
             if not isinstance(value, Tensor):
                 require_positive("IDM", **{name: value})
 
-    def with_(self, **changes: Tensor) -> IDMConstants:
+    def with_(self, **changes: Tensor | float) -> IDMConstants:
         """Return a copy in which some constants vary by driver (tensors, for calibration)."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
 def desired_gap(
-    speed: Tensor, approach_rate: Tensor, time_gap: Tensor, constants: IDMConstants
+    speed: Tensor, approach_rate: Tensor, time_gap: Tensor | float, constants: IDMConstants
 ) -> Tensor:
     """Dynamic desired gap s* = s0 + max(0, vT + vΔv / (2√(ab))) (A4).
 
@@ -69,8 +69,8 @@ def idm_acceleration(
     speed: Tensor,
     gap: Tensor,
     approach_rate: Tensor,
-    desired_speed: Tensor,
-    time_gap: Tensor,
+    desired_speed: Tensor | float,
+    time_gap: Tensor | float,
     constants: IDMConstants,
 ) -> Tensor:
     """IDM acceleration a(1 − (v/v0)^δ − (s*/s)²), held within physical limits (A3).

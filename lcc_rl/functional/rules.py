@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lcc_rl.functional.idm import IDMConstants, idm_acceleration
+
 
 def follower_stopper_speed(
     speed: Tensor,
@@ -46,6 +48,37 @@ def follower_stopper_speed(
     commanded = torch.where(gap < far, freeing, desired_speed)
     commanded = torch.where(gap < middle, rising, commanded)
     return torch.where(gap < near, torch.zeros_like(commanded), commanded)
+
+
+def idm_acc(
+    speed: Tensor,
+    gap: Tensor,
+    relative_speed: Tensor,
+    desired_speed: Tensor | float,
+    time_gap: Tensor | float,
+    acceleration: Tensor | float,
+    deceleration: Tensor | float,
+    min_gap: Tensor | float,
+) -> Tensor:
+    """Return the acceleration of a cruise control by the Intelligent Driver Model (A3–A4).
+
+    Args:
+        speed: own speed v [m/s].
+        gap: bumper-to-bumper gap [m].
+        relative_speed: v_ahead − v [m/s].
+        desired_speed: v0 [m/s].
+        time_gap: T [s].
+        acceleration: a [m/s²].
+        deceleration: b [m/s²].
+        min_gap: s0 [m].
+
+    Returns:
+        Acceleration [m/s²], of the arguments' shape.
+    """
+    shared = IDMConstants().with_(
+        acceleration=acceleration, deceleration=deceleration, min_gap=min_gap
+    )
+    return idm_acceleration(speed, gap, -relative_speed, desired_speed, time_gap, shared)
 
 
 def linear_acc(

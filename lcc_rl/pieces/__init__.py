@@ -5,6 +5,7 @@ from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
 from lcc_rl.pieces.cbf import CBFFilter, Corrected
 from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
 from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
+from lcc_rl.pieces.cruise import IDMACC, LinearACC
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.hybrid import HCFS
@@ -37,6 +38,7 @@ __all__ = [
     "CACC",
     "HCFS",
     "IDM",
+    "IDMACC",
     "Action",
     "CBFFilter",
     "Collision",
@@ -57,6 +59,7 @@ __all__ = [
     "HeadwayStart",
     "JerkReward",
     "LeaderPreview",
+    "LinearACC",
     "MotorPower",
     "NGSIMLeader",
     "Observation",

@@ -16,8 +16,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.errors import ConfigError, require_positive, unknown_name
-from lcc_rl.functional.idm import IDMConstants, idm_acceleration
-from lcc_rl.functional.rules import linear_acc
+from lcc_rl.functional.rules import idm_acc, linear_acc
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
@@ -91,11 +90,7 @@ class IDMRule(Rule):
     def acceleration(
         self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
     ) -> Tensor:
-        desired_speed, time_gap, acceleration, deceleration, min_gap = constants
-        shared = IDMConstants().with_(
-            acceleration=acceleration, deceleration=deceleration, min_gap=min_gap
-        )
-        return idm_acceleration(speed, gap, -relative_speed, desired_speed, time_gap, shared)
+        return idm_acc(speed, gap, relative_speed, *constants)
 
 
 class ACCRule(Rule):

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.intervals import Estimate, band, share_saved
-from lcc_rl.results.savings import BASELINES, HUMANS, by_driver, paired, savings, worse_off
+from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, paired, savings, worse_off
 
 # Distinct without colour vision and in grey.
 COLOURS = {
@@ -274,7 +274,7 @@ def write_study_figures(folder: str | Path) -> list[Path]:
     target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
     paths = []
-    if len(steps) and "idm" in names and cars[-1] not in HUMANS:
+    if len(steps) and "idm" in names and cars[-1] not in UNTRAINED:
         paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
     for name in cars:
         if len(steps) and (steps["strategy"] == name).any():
@@ -283,7 +283,7 @@ def write_study_figures(folder: str | Path) -> list[Path]:
             figure = human_energy(episodes, name)
             paths.append(save(figure, target / f"human_energy_{name}.png"))
         for baseline in BASELINES:
-            if baseline in names and baseline != name and name not in HUMANS:
+            if baseline in names and baseline != name and name not in UNTRAINED:
                 figure = paired_improvement(episodes, name, baseline)
                 path = target / f"improvement_{name}_vs_{baseline}.png"
                 paths.append(save(figure, path))

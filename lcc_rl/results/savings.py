@@ -10,8 +10,8 @@ import pandas as pd
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
-BASELINES = ("idm", "human", "reference")
-HUMANS = ("direct", "idm", "human")  # not trained
+BASELINES = ("idm", "human", "idm tuned", "reference")
+UNTRAINED = ("direct", "idm", "human", "idm tuned", "acc tuned")
 NOTHING = Estimate(np.nan, np.nan, np.nan)
 # Prefix of a saving, and of which energy: the path's, which leaves out what the motion stores
 # and with it what ending slower saves; and as drawn (A2).

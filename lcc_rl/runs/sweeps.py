@@ -26,7 +26,7 @@ from rich.live import Live
 
 from lcc_rl.config import NOT_IDENTITY, identity
 from lcc_rl.errors import Interrupted, LccError, ResultsError
-from lcc_rl.io.files import atomic_path
+from lcc_rl.io.files import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT
 from lcc_rl.runs.overview import live
@@ -124,11 +124,13 @@ class SweepCallback(Callback):
             print(f"lcc_rl: error: a sweep has at most {MOST_RUNS} runs", file=sys.stderr)
             sys.exit(BAD_INPUT)  # as above
         type(self).folder = type(self).target = folder
+        running = any(state.state == "running" for state in survey(folder))
+        if not running:
+            remove_leftovers(folder)
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
-        running = any(state.state == "running" for state in survey(folder))
         resume_search(config, alone=not running)
         if sys.stdout.isatty():
             self._draw(config, plan.runs)

@@ -25,6 +25,7 @@ from lcc_rl.pieces import (
     CACC,
     HCFS,
     IDM,
+    IDMACC,
     Action,
     CBFFilter,
     Collision,
@@ -45,6 +46,7 @@ from lcc_rl.pieces import (
     HeadwayStart,
     JerkReward,
     LeaderPreview,
+    LinearACC,
     MotorPower,
     NGSIMLeader,
     Observation,
@@ -73,7 +75,17 @@ from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, s
 HORIZON, T = 12, 0.1
 CONNECTED = ("cacc", "beat", "hybrid")
 ROLES = ("human", "automated", "human", "cacc", "cacc", "automated", "beat", "stopper")
-ROLES = (*ROLES, "handover", "constant", "plain", "hybrid", "hybrid", "human")
+ROLES = (
+    *ROLES,
+    "handover",
+    "constant",
+    "plain",
+    "following",
+    "cruising",
+    "hybrid",
+    "hybrid",
+    "human",
+)
 STRINGS = {
     "open": VehicleString(ROLES),
     "drawn": VehicleString(ROLES, drawn=True),
@@ -120,6 +132,8 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "Handover": lambda: Handover(
             human("handover"), stopper("handover"), 0.5, T, string, "handover"
         ),
+        "IDMACC": lambda: IDMACC(string=string, role="following"),
+        "LinearACC": lambda: LinearACC(string=string, role="cruising"),
         "ConstantAcceleration": lambda: ConstantAcceleration(0.3, string, "constant"),
         "HCFS": lambda: HCFS(
             CACC(T, k3=0.4, string=string, role="hybrid"), T, string=string, role="hybrid"

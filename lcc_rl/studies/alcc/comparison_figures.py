@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.results.drawing import new_figure
 from lcc_rl.results.figures import colour, style
-from lcc_rl.results.savings import HUMANS, per_seed
+from lcc_rl.results.savings import UNTRAINED, per_seed
 from lcc_rl.studies.alcc.tables import comparison
 
 INK, SOFT = "#222222", "#8a8a8a"
@@ -130,7 +130,7 @@ def single_profile_figure(episodes: pd.DataFrame) -> Figure:
         human = float(energy["idm"].mean())
         axis.hlines(human, place - 0.36, place + 0.36, color=colour("idm"), lw=2.5)
         _once(axis, seen, "idm", "idm (human driver)", "-")
-        learned = [name for name in energy if name not in HUMANS]
+        learned = [name for name in energy if name not in UNTRAINED]
         for number, strategy in enumerate(sorted(learned, reverse=True)):
             values = energy[strategy].to_numpy(float)
             centre = place - 0.16 + 0.32 * number

@@ -9,7 +9,7 @@ from lcc_rl.results.intervals import mean, share_saved
 from lcc_rl.results.report import heading
 from lcc_rl.results.savings import (
     BASELINES,
-    HUMANS,
+    UNTRAINED,
     KINDS,
     NOTHING,
     paired,
@@ -69,7 +69,7 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
     columns = [f"total_{column}" for column in KINDS.values()]
     windows, path = per_window(episodes, columns), paired(episodes, columns[0])
     found = per_seed(episodes, columns[0])
-    learned = [name for name in found if name not in HUMANS]
+    learned = [name for name in found if name not in UNTRAINED]
     rows = []
     for strategy in learned:
         for baseline in (name for name in COMPARED if name in found and name != strategy):
@@ -93,7 +93,7 @@ def strata(episodes: pd.DataFrame) -> pd.DataFrame:
         The rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained
         strategy without it, against each baseline.
     """
-    names = [name for name in per_seed(episodes, "total_path_energy_kj") if name not in HUMANS]
+    names = [name for name in per_seed(episodes, "total_path_energy_kj") if name not in UNTRAINED]
     kept = ["alcc"] if "alcc" in names else names
     parts = [
         stratified(episodes, "total_path_energy_kj", name, baseline).assign(
@@ -209,7 +209,7 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
     for change, part in episodes.groupby(by, sort=False):
         windows = per_window(part, [path, "total_energy_kj", *SHARES.values(), "rms_jerk_mps3"])
         for strategy, energy in per_seed(windows, path).items():
-            if strategy in HUMANS:
+            if strategy in UNTRAINED:
                 continue
             own = windows[windows["strategy"] == strategy]
             row: dict[str, object] = {by: change, "strategy": strategy}
