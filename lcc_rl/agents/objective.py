@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lcc_rl.agents.limits import Limits
 from lcc_rl.config import build
-from lcc_rl.errors import Diverged
+from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
@@ -50,9 +50,24 @@ class Objective:
         ]
         self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
 
-    def wanted(self) -> list[Key]:
-        """Return the entries of the moment reached that the terms read."""
-        return [key for term, _ in self.terms for _, key in term.sources]
+    def wanted(self, known: Collection[Key]) -> list[Key]:
+        """Return the entries of the moment reached that the terms read.
+
+        Args:
+            known: the entries that there are.
+
+        Raises:
+            ConfigError: naming a term that reads another one.
+        """
+        read = [(term, key) for term, _ in self.terms for _, key in term.sources]
+        for term, key in read:
+            if key not in known:
+                what = f"{term.name} ({type(term).__name__})"
+                raise ConfigError(
+                    f"agent: the objective's term {what} reads {'.'.join(key)}, which no piece "
+                    "writes; take the term out or add the piece"
+                )
+        return [key for _, key in read]
 
     def score(self, data: TensorDictBase, checked: bool = True) -> Tensor:
         """Return the objective at every step of a rollout, ``[batch, steps, A]``.

@@ -14,6 +14,7 @@ from lcc_rl.agents.objective import Objective
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
 from lcc_rl.policies.rules import make_policy
@@ -101,9 +102,10 @@ class SimulatedLoop(TrainingLoop[SimulatedT]):
 
     def _rollout(self, compiled: bool = False) -> DifferentiableRollout:
         """Return what plays episodes for the objective, and records the reward's terms."""
+        known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(
             self.env,
-            wanted=self.objective.wanted(),
+            wanted=self.objective.wanted(known),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=compiled,
         )

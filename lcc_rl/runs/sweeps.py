@@ -124,13 +124,13 @@ class SweepCallback(Callback):
             print(f"lcc_rl: error: a sweep has at most {MOST_RUNS} runs", file=sys.stderr)
             sys.exit(BAD_INPUT)  # as above
         type(self).folder = type(self).target = folder
-        running = any(state.state == "running" for state in survey(folder))
-        if not running:
-            remove_leftovers(folder)
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
+        running = any(state.state == "running" for state in survey(folder))
+        if not running:
+            remove_leftovers(folder)
         resume_search(config, alone=not running)
         if sys.stdout.isatty():
             self._draw(config, plan.runs)

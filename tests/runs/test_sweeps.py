@@ -71,11 +71,12 @@ def test_run_names_are_one_level_short_and_found_again_by_hash(tmp_path) -> None
 def test_a_sweep_removes_the_half_written_plan_of_a_killed_one(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(SweepCallback, "folder", None)
     monkeypatch.setattr(SweepCallback, "target", None)
-    (tmp_path / ".sweep.json.1.tmp").write_text("{")
-    cfg = hydra_like(tmp_path, "seed=4")
+    cfg = hydra_like(tmp_path / "new", "seed=4")
     cfg.hydra.launcher = {"_target_": "hydra._internal.core_plugins.BasicLauncher"}
+    SweepCallback().on_multirun_start(cfg)  # its folder is new
+    (tmp_path / "new" / ".sweep.json.1.tmp").write_text("{")
     SweepCallback().on_multirun_start(cfg)
-    assert [path.name for path in tmp_path.iterdir()] == ["sweep.json"]
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["sweep.json"]
 
 
 def test_plans_know_grids_and_searches(tmp_path) -> None:
