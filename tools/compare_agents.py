@@ -3,6 +3,7 @@
     python tools/compare_agents.py agents data=ngsim data.path=...      # ddpg, td3, sac, analytic
     python tools/compare_agents.py agents training.keep_every=5 ...     # ... and on the way there
     python tools/compare_agents.py knowledge data=ngsim data.path=...   # memory and preview
+    python tools/compare_agents.py limits data=ngsim data.path=...      # networks and tuned rules
 
 Each runs trainings into ``--out``, then reads their parquet files and writes a table and a
 figure. The same command resumes where it stopped and skips finished runs; ``--draw`` only draws.
@@ -15,6 +16,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Callable, Iterable
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -29,6 +31,7 @@ from agent_results import (
     table_of_agents,
     table_of_knowledge,
 )
+from limit_results import comparisons, figure_of_limits, table_of_limits
 from matplotlib.figure import Figure
 
 from lcc_rl.commands.pipeline import root_key
@@ -38,6 +41,7 @@ from lcc_rl.envs import load_inputs
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import trained
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.policies.rules import NETWORK
 from lcc_rl.results.drawing import save
 from lcc_rl.results.runs import load_policy
 from lcc_rl.runs.cli import main_guard, prepare_torch
@@ -78,6 +82,22 @@ def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
         for kind, changes in kinds.items()
         for seed in range(options.seeds)
     ]
+
+
+def runs_of_limits(options: argparse.Namespace) -> list[Run]:
+    """Return trainings of networks and of rules' constants within several limits."""
+    runs = []
+    for variant, kind, share in product(options.variants, options.policies, options.shares):
+        how = ["experiment=limits"] if kind == NETWORK else ["experiment=limits_tuned"]
+        how += [f"agent.policy={kind}", f"agent.limits.efficiency={share}"]
+        runs += [
+            Run(
+                options.out / variant / kind / f"limit_{share}" / f"seed_{seed}",
+                (f"variant={variant}", *how, f"seed={seed}", *options.overrides),
+            )
+            for seed in range(options.seeds)
+        ]
+    return runs
 
 
 def human(options: argparse.Namespace) -> Run:
@@ -162,6 +182,7 @@ Part = tuple[
 PARTS: dict[str, Part] = {
     "agents": (runs_of_agents, table_of_agents, figure_of_agents),
     "knowledge": (runs_of_knowledge, table_of_knowledge, figure_of_knowledge),
+    "limits": (runs_of_limits, table_of_limits, figure_of_limits),
 }
 
 
@@ -182,6 +203,8 @@ def perform(part: str, options: argparse.Namespace) -> int:
     write_parquet(table, options.out / f"{part}.parquet")
     save(draw(options.out), options.out / f"{part}.png")
     print(table.to_string(index=False, float_format="{:.4g}".format))
+    if part == "limits":
+        print(*comparisons(options.out, options.at), sep="\n")
     log.info("table and figure: %s", options.out / f"{part}.png")
     return failed
 
@@ -200,8 +223,13 @@ def parser() -> argparse.ArgumentParser:
         if part == "agents":
             one.add_argument("--agents", type=words, default=list(AGENTS))
             one.add_argument("--variants", type=words, default=["alcc", "reference"])
-        else:
+        elif part == "knowledge":
             one.add_argument("--agent", default="analytic")
+        else:
+            one.add_argument("--variants", type=words, default=["alcc"])
+            one.add_argument("--policies", type=words, default=[NETWORK, "idm", "acc"])
+            one.add_argument("--shares", type=words, default=["0.005", "0.01", "0.02"])
+            one.add_argument("--at", type=float, default=0.01, help="share at which to compare")
     return top
 
 

@@ -75,18 +75,23 @@ def saving(values: ArrayLike, baseline: ArrayLike) -> Estimate:
     value = share_saved(_mean(own), _mean(other))
     if max(*own.shape, *other.shape) < 2:
         return Estimate(value, np.nan, np.nan)
-    windows = _weights(len(own), 0)
+    windows = weights(len(own), 0)
     means = [
-        ((windows @ side) * _weights(side.shape[1], stream)).sum(1)
+        ((windows @ side) * weights(side.shape[1], stream)).sum(1)
         for stream, side in enumerate((own, other), 1)
     ]
+    return Estimate(value, *bounds(share_saved(*means)))
+
+
+def bounds(resampled: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the bounds of an interval from resampled estimates, by their percentiles."""
     tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.quantile(share_saved(*means), [tail, 1.0 - tail])
-    return Estimate(value, float(low), float(high))
+    low, high = np.quantile(resampled, [tail, 1.0 - tail])
+    return float(low), float(high)
 
 
 @lru_cache(maxsize=8)  # a table asks for the same ones again and again
-def _weights(count: int, stream: int) -> NDArray[np.float64]:
+def weights(count: int, stream: int) -> NDArray[np.float64]:
     """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
     draws, generator = max(count - 1, 1), np.random.default_rng([SEED, stream])
     return generator.multinomial(draws, np.full(count, 1.0 / count), RESAMPLES) / draws

@@ -10,6 +10,9 @@ import pandas as pd
 import pytest
 from agent_results import course
 from helpers import compose
+from limit_results import HUES, MEANS
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
 
 from lcc_rl.commands import training
 from lcc_rl.config import load
@@ -148,3 +151,54 @@ def test_numbers_of_trainings(option, tmp_path) -> None:
 def test_a_typing_error_is_no_override(tmp_path) -> None:
     with pytest.raises(ConfigError, match="--sedes"):
         tool.main(["agents", "--sedes=3"])
+
+
+def fabricate_limit(folder: Path, policy: str, share: float, energy: float, seed: int) -> None:
+    place = folder / "alcc" / policy / f"limit_{share}" / f"seed_{seed}"
+    save_config(compose("alcc", "agent=analytic", f"seed={seed}"), place)
+    rows = pd.DataFrame(
+        {
+            "profile_id": [0, 0, 1, 1],
+            "driver_id": [0, 1, 0, 1],
+            "total_path_energy_kj": [energy, energy, energy + 4.0, energy + 4.0],
+            "share_time_gap_long_moving": share,
+            "leader_speed_mps": 5.0,
+            "leader_path_energy_kj": 50.0,
+            "strategy": "alcc",
+        }
+    )
+    for name in set(MEANS) - set(rows):
+        rows[name] = 0.0
+    write_parquet(rows, place / "episodes.parquet")
+
+
+def test_limits_are_compared_as_fronts_and_drawn_again_from_what_is_kept(tmp_path, capsys) -> None:
+    for seed in (0, 1):
+        for share, energy in ((0.005, 120.0), (0.02, 110.0)):
+            fabricate_limit(tmp_path, "network", share, energy, seed)
+            fabricate_limit(tmp_path, "idm", share, energy + 5.0, seed)
+    assert tool.main(["limits", "--draw", "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    # At 1 %: 116.67 + 2 against 121.67 + 2.
+    assert "alcc idm against alcc network: -4.21% (-4.2" in said
+    kept = tmp_path / "kept"
+    write_parquet(read_parquet(tmp_path / "windows.parquet"), kept / "windows.parquet")
+    assert tool.main(["limits", "--draw", "--out", str(kept)]) == 0
+    assert capsys.readouterr().out == said
+    image = imread(kept / "limits.png")[..., :3].reshape(-1, 3)
+    for hue in HUES["network"], HUES["idm"]:  # both lines are drawn
+        assert (abs(image - to_rgb(hue)).max(1) < 0.05).sum() > 100
+    with pytest.raises(ResultsError, match="no finished training below it"):
+        tool.main(["limits", "--draw", "--out", str(tmp_path / "none")])
+
+
+def test_what_the_limits_would_run() -> None:
+    options = tool.parser().parse_args(["limits", "--seeds", "2", "--shares", "0.01"])
+    options.overrides = ["data=stream"]
+    runs = tool.runs_of_limits(options)
+    assert len(runs) == 6
+    by_policy = {run.compose().agent.policy: run.compose() for run in runs}
+    assert set(by_policy) == {"network", "idm", "acc"}
+    for cfg in by_policy.values():
+        assert cfg.agent.limits == {"safety": None, "efficiency": 0.01}
+        assert cfg.scenario.filters.automated.time_gap == 2.45

@@ -9,9 +9,9 @@ from lcc_rl.results.intervals import mean, share_saved
 from lcc_rl.results.report import heading
 from lcc_rl.results.savings import (
     BASELINES,
-    UNTRAINED,
     KINDS,
     NOTHING,
+    UNTRAINED,
     paired,
     per_seed,
     per_window,
