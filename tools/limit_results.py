@@ -78,11 +78,12 @@ def figure_of_limits(folder: Path) -> Figure:
     axes = figure.subplots()
     for kind, rows in windows.groupby(KINDS, sort=False):
         variant, policy = map(str, kind)
-        look = {"color": HUES.get(policy, "#222222"), "label": f"{variant}, {policy}"}
+        hue, style_of = HUES.get(policy, "#222222"), LINES.get(variant, "-.")
         line = points(rows).sort_values(SHARE)
-        axes.plot(100.0 * line[SHARE], line[ENERGY], ls=LINES.get(variant, "-."), **look)
+        name = f"{variant}, {policy}"
+        axes.plot(100.0 * line[SHARE], line[ENERGY], ls=style_of, color=hue, label=name)
         each = rows.groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
-        axes.plot(100.0 * each[SHARE], each[ENERGY], ".", color=look["color"], alpha=0.6)
+        axes.plot(100.0 * each[SHARE], each[ENERGY], ".", color=hue, alpha=0.6)
     axes.legend(frameon=False, fontsize=8)
     style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy\n[kJ per episode]")
     return figure
