@@ -45,8 +45,8 @@ def windows_of(folder: Path) -> pd.DataFrame:
         means = episodes.groupby("profile_id", as_index=False)[[*MEANS, *DESCRIBED]].mean()
         means["drivers"] = episodes["driver_id"].nunique()
         means["training_seed"] = int(episodes["seed"].iloc[0])
-        named = {"variant": variant, "policy": policy, "limit": float(limit.removeprefix("limit_"))}
-        parts.append(means.assign(**named))
+        share = float(limit.removeprefix("limit_"))
+        parts.append(means.assign(variant=variant, policy=policy, limit=share))
     if parts:
         write_parquet(pd.concat(parts, ignore_index=True), folder / WINDOWS)
     if not (folder / WINDOWS).exists():
