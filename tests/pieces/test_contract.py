@@ -56,6 +56,7 @@ from lcc_rl.pieces import (
     SmoothEfficiency,
     Smoothness,
     SmoothSafety,
+    SpacingReward,
     StepTransform,
     StringMotion,
     TimeGap,
@@ -118,7 +119,12 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "ConstantAcceleration": lambda: ConstantAcceleration(0.3, string, "constant"),
         "ConstantAcceleration, guarded": lambda: ConstantAcceleration(1.0, string, "guarded"),
         "HCFS": lambda: HCFS(
-            CACC(T, k3=0.4, string=string, role="hybrid"), T, string=string, role="hybrid"
+            CACC(T, k3=0.4, string=string, role="hybrid"),
+            T,
+            spacing_weight=0.02,
+            spacing_time=1.0,
+            string=string,
+            role="hybrid",
         ),
         "CBFFilter": lambda: CBFFilter(T, string=string, role="guarded"),
     }
@@ -146,6 +152,7 @@ def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "CollisionPenalty": lambda: CollisionPenalty(**own),
         "VelocityReward": lambda: VelocityReward(**own),
         "JerkReward": lambda: JerkReward(**own),
+        "SpacingReward": lambda: SpacingReward(**own),
         "SmoothSafety": lambda: SmoothSafety("smooth_safety", **own),
         "SmoothEfficiency": lambda: SmoothEfficiency("smooth_efficiency", **own),
         "Smoothness": lambda: Smoothness(**own),
