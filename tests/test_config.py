@@ -56,7 +56,7 @@ def test_the_tests_know_every_variant() -> None:
 @pytest.mark.parametrize("experiment", options("experiment"))
 @pytest.mark.parametrize("entry", ["train", "evaluate", "pipeline"])
 def test_every_experiment_composes(entry, experiment) -> None:
-    variant = ["variant=ddpg"] if experiment == "paper_hcfs" else []
+    variant = ["variant=ddpg"] if "hcfs" in experiment else []
     cfg = load(entry, [f"experiment={experiment}", *variant])
     build_agent(cfg, POPULATION)
     assert cfg.training.episodes % cfg.training.environments == 0
@@ -191,7 +191,8 @@ def test_values_of_files_are_the_defaults_of_constructors() -> None:
 
 
 def select(root: DictConfig, key: str) -> Any:
-    value = OmegaConf.select(root, key)
+    key, _, otherwise = key.removeprefix("oc.select:").partition(",")
+    value = OmegaConf.select(root, key, default=float(otherwise) if otherwise else None)
     return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
@@ -238,6 +239,7 @@ WITH = {
     "leader/paper": ["leader.path=x"],
     "leader/openacc": ["leader.path=x"],
     "experiment/paper_hcfs": ["variant=ddpg"],
+    "experiment/hcfs_spacing": ["variant=ddpg"],
 }
 TYPED = {
     "filter": "+filter",

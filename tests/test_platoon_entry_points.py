@@ -92,6 +92,18 @@ def test_the_gradient_through_the_simulator_trains_platoons_too(tmp_path) -> Non
     assert cfg.scenario.horizon % cfg.training.segment == 0
 
 
+@pytest.mark.slow
+def test_with_a_spacing_term_a_platoon_keeps_its_gaps(tmp_path) -> None:
+    # A quarter of the recipe's length; 600 s behind a leader never trained on.
+    short = ("training.episodes=7680", "evaluation.profiles=1", "evaluation.baselines=[]")
+    words = ["variant=ddpg", "agent=analytic", "experiment=hcfs_spacing", "leader.cases={}", *short]
+    rows = training.run(load("train", words), tmp_path, quiet=True)
+    whole = rows[rows["case"] == "full length"]
+    assert whole["frames"].min() > 2900
+    assert whole["max_gap_error_m"].max() < 2.0
+    assert whole["energy_ratio"].max() < 1.0
+
+
 def test_evaluate_every_variant(trained, tmp_path) -> None:
     yardsticks = {"cacc path", "cacc paper_like", "cacc tuned", "deadbeat", "deadbeat oracle"}
     expected = {

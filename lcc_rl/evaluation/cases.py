@@ -18,7 +18,8 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
 
 WINDOWS = "windows"
-RECORDED = ("speed", "gap", "acceleration", "jerk", "speed_error", "leader_speed_error")
+ERRORS = ("gap_error", "speed_error", "leader_speed_error")
+RECORDED = ("speed", "gap", "acceleration", "jerk", *ERRORS)
 INDEX, REWARD = (AUTOMATED, "index"), (AUTOMATED, "reward")
 KEYS = [("leader", "speed"), *(("vehicles", name) for name in RECORDED), REWARD]
 KEYS += [INDEX, *((HYBRID, name) for name in ("winner", *COUNTERS))]
@@ -117,13 +118,16 @@ def measure(series: Series) -> pd.DataFrame:
 
     Speed errors are e_v(i,0), as in the paper's tables; ``energy_ratio`` is that of
     Σ e_v(i,i−1)² to the same of the vehicle ahead (string stability: at most 1), missing for the
-    first vehicle and where nothing moves.
+    first vehicle and where nothing moves. ``max_gap_error_m`` is the largest |e_x(i,i−1)|, missing
+    for vehicles that are not automated: they keep no headway.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
     energy = series["speed_error"].square().sum(0)
     ratio = torch.full_like(energy, torch.nan)
     ahead = energy[..., :-1]
     ratio[..., 1:] = torch.where(ahead > 1e-3, energy[..., 1:] / ahead.clamp(min=1e-3), torch.nan)
+    keeps = series["reward"].isfinite().all(0)
+    gap_error = series["gap_error"].abs().amax(0)
     columns = {
         "speed_error_sum": error.sum(0),
         "speed_error_squares": error.square().sum(0),
@@ -131,6 +135,7 @@ def measure(series: Series) -> pd.DataFrame:
         "jerk_squares": jerk.square().sum(0),
         "reward": series["reward"].sum(0),
         "min_gap_m": series["gap"].amin(0),
+        "max_gap_error_m": torch.where(keeps, gap_error, torch.nan),
         "peak_jerk_mps3": jerk.amax(0),
         "energy_ratio": ratio,
     }

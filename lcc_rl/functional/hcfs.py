@@ -11,7 +11,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.kinematics import advance_speed
+from lcc_rl.functional.kinematics import advance_gap, advance_speed
+
+
+class Place(NamedTuple):
+    """Where a vehicle is in its platoon, each ``[*batch, N, 1]``.
+
+    leader_gap: e_x(i,0), positive where too far behind [m]; leader_speed: v_0 [m/s].
+    """
+
+    leader_gap: Tensor
+    leader_speed: Tensor
 
 
 @dataclass(frozen=True)
@@ -19,19 +29,26 @@ class PlatoonReward:
     """The paper's reward H4–H6: −ω1 |e_v(i,0)|/v_max − ω2 |jerk|/jerk_scale.
 
     Table IV of the paper determines ω1/v_max = 0.369 s/m and ω2 = 0.036 (jerk_scale =
-    2 a_max/T = 30 m/s³).
+    2 a_max/T = 30 m/s³). The paper's reward has no spacing; −ω3 (e_x(i,0)/gap_scale)² is an
+    addition, of which only :meth:`one_step` knows.
 
     Args:
         velocity_weight: ω1.
         speed_scale: v_max [m/s].
         jerk_weight: ω2.
         jerk_scale: 2 a_max/T [m/s³].
+        spacing_weight: ω3; 0, the paper's, leaves gaps out.
+        gap_scale: deviation that costs ω3 [m].
+        spacing_time: how long the speeds that a step leads to are kept until e_x counts [s].
     """
 
     velocity_weight: float = 10.0
     speed_scale: float = 27.1
     jerk_weight: float = 0.036
     jerk_scale: float = 30.0
+    spacing_weight: float = 0.0
+    gap_scale: float = 1.0
+    spacing_time: float = 0.0
 
     def __call__(self, speed_error: Tensor, jerk: Tensor) -> Tensor:
         """Return the reward of e_v(i,0) [m/s] and jerk [m/s³], of their broadcast shape."""
@@ -47,11 +64,31 @@ class PlatoonReward:
         acceleration: Tensor,
         leader_next: Tensor,
         time_step: float,
+        place: Place | None = None,
     ) -> Tensor:
-        """Return the reward that an acceleration will earn, ``[*batch, N, 1]`` (H12)."""
+        """Return the reward that an acceleration will earn, ``[*batch, N, 1]`` (H12).
+
+        With a spacing weight also by the place it leads to, e_x(i,0) after the step and after
+        ``spacing_time`` at the speeds reached. One step alone moves a vehicle by a T²/2, so
+        little that its speed would outweigh its place in every step.
+
+        Args:
+            speed: v_i [m/s].
+            last_acceleration: a_{k−1} as executed [m/s²].
+            acceleration: the candidate [m/s²].
+            leader_next: the predicted speed of each vehicle's leader [m/s].
+            time_step: T [s].
+            place: where the vehicle is, which a spacing weight needs.
+        """
         reached, executed = advance_speed(speed, acceleration, time_step)
         jerk = (executed - last_acceleration) / time_step
-        return self(leader_next - reached, jerk)
+        earned = self(leader_next - reached, jerk)
+        if not self.spacing_weight or place is None:
+            return earned
+        leader_gap, leader_speed = place
+        error = advance_gap(leader_gap, leader_speed, speed, leader_next, reached, time_step)
+        error = error + self.spacing_time * (leader_next - reached)
+        return earned - self.spacing_weight * (error / self.gap_scale).square()
 
 
 def safe_acceleration(
@@ -121,6 +158,7 @@ def hybrid_decision(
     reward: PlatoonReward,
     time_step: float,
     max_acceleration: float,
+    place: Place | None = None,
 ) -> Decision:
     """Decide between two candidate accelerations, per follower (H12–H14).
 
@@ -143,12 +181,13 @@ def hybrid_decision(
         reward: the reward to compare by.
         time_step: T [s].
         max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
+        place: where the vehicle is, which a reward with a spacing weight needs.
     """
     candidates, clamped, capped = _bounded(
         torch.stack([rule, learned]), interval, cap, max_acceleration
     )
     rule, learned = candidates.unbind(0)
-    earned = reward.one_step(speed, last_acceleration, candidates, leader_next, time_step)
+    earned = reward.one_step(speed, last_acceleration, candidates, leader_next, time_step, place)
     winner = (earned[1] > earned[0]).to(torch.int64)
     if last_winner is None:
         switched = torch.zeros_like(clamped)

@@ -12,15 +12,14 @@ from lcc_rl.pieces.hybrid import HCFS
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.observation import Observation
+from lcc_rl.pieces.platoon_rewards import JerkReward, SpacingReward, VelocityReward
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
     EnergyReward,
-    JerkReward,
     RewardTerm,
     SafetyReward,
     TotalReward,
-    VelocityReward,
 )
 from lcc_rl.pieces.rules import FollowerStopper, Handover
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
@@ -73,6 +72,7 @@ __all__ = [
     "SmoothEfficiency",
     "SmoothSafety",
     "Smoothness",
+    "SpacingReward",
     "StepTransform",
     "StringMotion",
     "TimeGap",

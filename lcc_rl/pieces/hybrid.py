@@ -16,6 +16,7 @@ from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Decision,
+    Place,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
@@ -27,6 +28,7 @@ from lcc_rl.pieces.connected import Communication, check_leader, leader_names
 from lcc_rl.pieces.controllers import Controller
 
 HYBRID, COUNTERS = "hybrid", ("switches", "clamps", "cap_interventions")
+OWN = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
 SPARE = 2.0  # beyond the gap that the cap needs, for what vehicles deviate from it [m]
 
 
@@ -49,12 +51,14 @@ class HCFS(Controller):
         clamp: hold the candidates within the jerk bound; false is the literal rule, which
             violates it.
         safe_cap: hold the result below what braking allows; false is the literal rule, which in
-            long runs drives through the vehicle ahead: the reward has no spacing term. It brakes
-            fully where a measurement, the action or the rule's command is no finite number.
+            long runs drives through the vehicle ahead: the paper's reward has no spacing term. It
+            brakes fully where a measurement, the action or the rule's command is no finite number.
         braking: b of the safe cap [m/s²].
         margin: gap that it keeps at standstill [m].
         velocity_weight, speed_scale, jerk_weight, jerk_scale: of the reward compared, see
             :class:`lcc_rl.functional.hcfs.PlatoonReward`.
+        spacing_weight, gap_scale, spacing_time: of its spacing term, likewise; with
+            weight 0 they have no effect, which is the paper's rule.
         string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
 
     Raises:
@@ -76,6 +80,9 @@ class HCFS(Controller):
         speed_scale: float = 27.1,
         jerk_weight: float = 0.036,
         jerk_scale: float = 30.0,
+        spacing_weight: float = 0.0,
+        gap_scale: float = 1.0,
+        spacing_time: float = 0.0,
         string: VehicleString | None = None,
         role: str = AUTOMATED,
     ) -> None:
@@ -84,16 +91,17 @@ class HCFS(Controller):
         # More than the vehicles can brake would be no safe cap.
         require_in(where, f"(0, {max_acceleration}]", braking=braking)
         weights = {"velocity_weight": velocity_weight, "jerk_weight": jerk_weight}
+        weights |= {"spacing_weight": spacing_weight, "spacing_time": spacing_time}
         require_in(where, "[0, inf)", margin=margin, **weights)
-        require_positive(where, speed_scale=speed_scale, jerk_scale=jerk_scale)
-        own = [f"self.{name}" for name in ("speed", "acceleration", "received_gap", "speed_error")]
+        scales = {"speed_scale": speed_scale, "jerk_scale": jerk_scale, "gap_scale": gap_scale}
+        require_positive(where, **scales)
         state = [(HYBRID, name) for name in ("winner", *COUNTERS)]
         super().__init__(
             string,
             role,
             [
                 f"{role}.action",
-                *own,
+                *(f"self.{name}" for name in OWN),
                 *leader_names(lookahead),
                 *(".".join(key) for key in state),
                 *rule.names,
@@ -104,15 +112,15 @@ class HCFS(Controller):
         self.time_step, self.max_acceleration = time_step, max_acceleration
         self.jerk_bound, self.clamp, self.safe_cap = jerk_bound, clamp, safe_cap
         self.braking, self.margin = braking, margin
-        self.reward = PlatoonReward(velocity_weight, speed_scale, jerk_weight, jerk_scale)
+        self.reward = PlatoonReward(**weights, **scales)
 
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""
         own, leader, (winner, *counts), rule = (
-            entries[:4],
-            entries[4:7],
-            entries[7:11],
-            entries[11:],
+            entries[:5],
+            entries[5:8],
+            entries[8:12],
+            entries[12:],
         )
         decision = self.decide(action, own, leader, winner, self.rule.command(*rule))
         flags = (decision.switched, decision.clamped, decision.capped)
@@ -128,7 +136,7 @@ class HCFS(Controller):
         rule: Tensor,
     ) -> Decision:
         """Return the decision and what led to it."""
-        speed, last, gap, speed_error = own
+        speed, last, gap, speed_error, leader_gap = own
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         cap = safe_acceleration(
             gap, speed, speed + speed_error, self.time_step, self.braking, self.margin
@@ -145,6 +153,7 @@ class HCFS(Controller):
             self.reward,
             self.time_step,
             self.max_acceleration,
+            Place(leader_gap, leader[0]),
         )
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:

@@ -216,64 +216,6 @@ class CollisionPenalty(RewardTerm):
         return -hit.to(torch.float32)
 
 
-class VelocityReward(RewardTerm):
-    """−|e_v(i,0)|/v_max, at the state reached (HCFS H4–H5).
-
-    Args:
-        name, weight, string: see :class:`RewardTerm`; ω1.
-        speed_scale: v_max [m/s].
-
-    Raises:
-        ConfigError: if the scale is not positive.
-    """
-
-    reads = ("self.leader_speed_error",)
-
-    def __init__(
-        self,
-        name: str = "velocity",
-        weight: float = 10.0,
-        speed_scale: float = 27.1,
-        string: VehicleString | None = None,
-    ) -> None:
-        require_positive(f"reward.terms.{name}", speed_scale=speed_scale)
-        super().__init__(name, weight, string=string)
-        self.speed_scale = speed_scale
-
-    def reward(self, speed_error: Tensor) -> Tensor:
-        """Return the unweighted term."""
-        return -speed_error.abs() / self.speed_scale
-
-
-class JerkReward(RewardTerm):
-    """−|jerk|/(2 a_max/T) (HCFS H6).
-
-    Args:
-        name, weight, string: see :class:`RewardTerm`; ω2.
-        jerk_scale: 2 a_max/T [m/s³].
-
-    Raises:
-        ConfigError: if the scale is not positive.
-    """
-
-    reads = ("self.jerk",)
-
-    def __init__(
-        self,
-        name: str = "jerk",
-        weight: float = 0.036,
-        jerk_scale: float = 30.0,
-        string: VehicleString | None = None,
-    ) -> None:
-        require_positive(f"reward.terms.{name}", jerk_scale=jerk_scale)
-        super().__init__(name, weight, string=string)
-        self.jerk_scale = jerk_scale
-
-    def reward(self, jerk: Tensor) -> Tensor:
-        """Return the unweighted term."""
-        return -jerk.abs() / self.jerk_scale
-
-
 class TotalReward(RewardPiece):
     """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``.
 

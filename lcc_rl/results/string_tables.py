@@ -23,9 +23,9 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
     Returns:
         One row per strategy. Sums run over followers and frames: Σ|e_v(i,0)| and its standard
         deviation [m/s], Σ|jerk| and its standard deviation [m/s³], Σ reward with its 95 %
-        interval over seeds, switches and interventions, each the mean over seeds. Smallest gap
-        [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share of frames
-        driven by the learned policy are those of all seeds together.
+        interval over seeds, switches and interventions, each the mean over seeds. Smallest gap and
+        largest gap error [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share
+        of frames driven by the learned policy are those of all seeds together.
 
     Raises:
         ConfigError: if there is no such case.
@@ -54,6 +54,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         row[f"{name}_std_{label}"] = float(np.sqrt(max(spread, 0.0)))
     row |= intervals.mean(per_run("reward")).columns("reward")
     row["min_gap_m"] = rows["min_gap_m"].min()
+    row["max_gap_error_m"] = rows["max_gap_error_m"].max()
     row["collisions"] = int(rows["collided"].sum())
     row["peak_jerk_mps3"] = rows["peak_jerk_mps3"].max()
     row["string_ratio"] = rows["energy_ratio"].max()
@@ -71,6 +72,7 @@ ROWS = (
     ("std |jerk| [m/s³]", "jerk_std_mps3", "{:.2f}"),
     ("Σ reward", "reward", "{:.2f}"),
     ("smallest gap [m]", "min_gap_m", "{:.2f}"),
+    ("largest gap error [m]", "max_gap_error_m", "{:.2f}"),
     ("collisions", "collisions", "{:.0f}"),
     ("peak |jerk| [m/s³]", "peak_jerk_mps3", "{:.1f}"),
     ("string ratio, worst", "string_ratio", "{:.2f}"),

@@ -61,6 +61,8 @@ NODES = (
         {
             **dict.fromkeys(("max_acceleration", "jerk_bound", "speed_scale"), POSITIVE),
             **dict.fromkeys(("margin", "velocity_weight", "jerk_weight"), NOT_NEGATIVE),
+            **dict.fromkeys(("spacing_weight", "spacing_time"), NOT_NEGATIVE),
+            "gap_scale": POSITIVE,
             "braking": (0, 3.5, nan),
         },
     ),
@@ -125,6 +127,11 @@ NODES = (
     ("", "reward.terms.cav_energy", {"scale": POSITIVE, "of": ("all", 1)}),
     ("variant=ddpg", "reward.terms.velocity", {"speed_scale": POSITIVE}),
     ("variant=ddpg", "reward.terms.jerk", {"jerk_scale": POSITIVE}),
+    (
+        "experiment=hcfs_spacing",
+        "reward.terms.spacing",
+        {"gap_scale": POSITIVE, "weight": ANY},
+    ),
     (
         "",
         "agent",

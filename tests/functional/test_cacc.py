@@ -19,6 +19,7 @@ from lcc_rl.functional.cacc import (
     platoon_errors,
 )
 from lcc_rl.functional.hcfs import (
+    Place,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
@@ -183,6 +184,28 @@ def test_one_step_reward() -> None:
     torch.testing.assert_close(got, column(-0.5 * 0.3 - 0.001 * 2.5))
 
 
+@pytest.mark.parametrize(("seconds", "error"), [(0.0, 0.93), (2.0, 1.53)])
+def test_one_step_reward_with_spacing(seconds, error) -> None:
+    # As above, 0.9 m behind its place and a leader at 10.0 m/s: after the step it is
+    # 0.9 + 0.1 (0 + 0.3) = 0.93 m behind, and falls back by 0.3 m/s.
+    given = (column(10.0), column(0.5), column(1.0), column(10.5)[0], T)
+    place = Place(column(0.9), column(10.0))
+    reward = PlatoonReward(10.0, 20.0, 0.03, 30.0, 0.02, 0.5, seconds)
+    got = reward.one_step(*given, place)
+    wanted = -0.5 * 0.3 - 0.001 * 2.5 - 0.02 * (error / 0.5) ** 2
+    torch.testing.assert_close(got, column(wanted))
+    # The paper's rule knows no place.
+    assert torch.equal(PlatoonReward().one_step(*given, place), PlatoonReward().one_step(*given))
+
+
+def test_spacing_lets_the_one_win_that_closes_the_gap() -> None:
+    # Both candidates of a vehicle at the leader's speed: staying there, or closing a gap of 4 m.
+    place = Place(column(4.0), column(10.0))
+    assert decide(0.3, 0.0, place=place).winner.item() == 1
+    keeping = PlatoonReward(spacing_weight=0.02, spacing_time=3.0)
+    assert decide(0.3, 0.0, reward=keeping, place=place).winner.item() == 0
+
+
 # -- dead-beat -------------------------------------------------------------------------------------
 
 
@@ -240,7 +263,7 @@ def test_the_cap_is_safe_and_tight() -> None:
 # -- hybrid decision -------------------------------------------------------------------------------
 
 
-def decide(rule, learned, last=0.0, winner=None, jerk_bound=30.0, cap=None, leader=10.0):
+def decide(rule, learned, last=0.0, winner=None, jerk_bound=30.0, cap=None, leader=10.0, **more):
     last = column(last)
     return hybrid_decision(
         column(rule),
@@ -251,9 +274,10 @@ def decide(rule, learned, last=0.0, winner=None, jerk_bound=30.0, cap=None, lead
         torch.tensor([leader], dtype=torch.float64),
         None if jerk_bound is None else jerk_interval(last, jerk_bound, T, A_MAX),
         None if cap is None else column(cap),
-        PlatoonReward(),
+        more.pop("reward", PlatoonReward()),
         T,
         A_MAX,
+        **more,
     )
 
 

@@ -221,6 +221,17 @@ def test_without_the_cap_it_drives_through_its_predecessor() -> None:
     assert safe["gap"].min() > 0.4
 
 
+def test_a_spacing_weight_keeps_a_parent_that_drifts_at_its_place() -> None:
+    # The same hasty actor, without the cap: the switch itself takes the rule before it is near.
+    steady = leader(8.0 + 1.5 * torch.sin(T * torch.arange(651.0) / 3.0))
+    spaced = {"spacing_weight": 0.02, "spacing_time": 5.0}
+    kept = play(steady, hcfs("hasty", "path", safe_cap=False, **spaced), 3)
+    assert (kept["gap"] - 5.0).abs().max() < 3.0
+    # One step of spacing alone moves a gap too little to outweigh the speed.
+    literal = play(steady, hcfs("hasty", "path", safe_cap=False, spacing_weight=0.02), 3)
+    assert literal["gap"].min() <= 0.0
+
+
 # -- the hybrid ------------------------------------------------------------------------------------
 
 

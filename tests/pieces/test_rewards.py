@@ -11,6 +11,7 @@ from lcc_rl.pieces import (
     EfficiencyReward,
     EnergyReward,
     SafetyReward,
+    SpacingReward,
     TotalReward,
     parse_string,
 )
@@ -45,6 +46,15 @@ def test_energy() -> None:
     # −20 kW/20 kW · 0.1 s; recuperation earns.
     got = EnergyReward(0.1).reward(t(20000.0, -5000.0))
     torch.testing.assert_close(got, t(-0.1, 0.025))
+
+
+def test_spacing() -> None:
+    # 0.02 (e/2 m)²; 1 m too near costs what 1 m too far does. It pulls back in proportion.
+    error = t(2.0, -1.0, 0.0).requires_grad_()
+    got = SpacingReward(weight=0.02, gap_scale=2.0).compute(error)
+    torch.testing.assert_close(got.detach(), t(-0.02, -0.005, 0.0))
+    got.sum().backward()
+    torch.testing.assert_close(error.grad, t(-0.02, 0.01, 0.0))
 
 
 def test_weights() -> None:

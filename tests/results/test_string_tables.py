@@ -21,6 +21,7 @@ def series() -> dict[str, torch.Tensor]:
     error = torch.tensor([[1.0, 0.5], [-1.0, 0.5], [2.0, -0.5]]).view(shape)
     return {
         "leader_speed_error": error,
+        "gap_error": torch.tensor([[0.0, -1.0], [-2.0, 0.5], [-1.0, -5.1]]).view(shape),
         "speed_error": torch.tensor([[1.0, 2.0], [1.0, 0.0], [0.0, 0.0]]).view(shape),
         "jerk": torch.tensor([[4.0, 0.0], [-6.0, 1.0], [0.0, 0.0]]).view(shape),
         "reward": -error.abs(),
@@ -37,10 +38,19 @@ def test_measures_by_hand() -> None:
     assert (first["speed_error_sum"], second["speed_error_sum"]) == (4.0, 1.5)
     assert (first["jerk_sum"], first["peak_jerk_mps3"]) == (10.0, 6.0)
     assert (first["min_gap_m"], first["collided"], second["collided"]) == (3.0, False, True)
+    assert (first["max_gap_error_m"], second["max_gap_error_m"]) == (2.0, pytest.approx(5.1))
     assert pd.isna(first["energy_ratio"])
     assert second["energy_ratio"] == pytest.approx(4.0 / 2.0)
     assert first["learned_share"] == pytest.approx(2 / 3)
     assert (first["switches"], second["switches"], first["frames"]) == (1, 0, 3)
+
+
+def test_only_automated_vehicles_have_a_gap_to_keep() -> None:
+    given = series()
+    given["reward"][..., 1] = torch.nan  # driven by a human, who earns nothing
+    first, second = measure(given).to_dict("records")
+    assert first["max_gap_error_m"] == 2.0
+    assert pd.isna(second["max_gap_error_m"])
 
 
 def test_case_table_by_hand() -> None:
@@ -53,6 +63,7 @@ def test_case_table_by_hand() -> None:
     assert row["speed_error_std_mps"] == pytest.approx(errors.std(ddof=0))
     assert row["reward"] == pytest.approx(-5.5)
     assert (row["collisions"], row["switches"]) == (1, 1)
+    assert (row["max_gap_error_m"], row["string_ratio"]) == (pytest.approx(5.1), pytest.approx(2.0))
     assert row["learned_share"] == pytest.approx(5 / 6)
     with pytest.raises(ConfigError, match="case 9"):
         case_table(rows, "case 9")
