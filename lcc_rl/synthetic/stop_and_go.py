@@ -18,11 +18,12 @@ class StopAndGo:
     """Leaders that track a target speed which jumps, as in stop-and-go waves.
 
     Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of its
-    level, a wave and a ripple, at least zero. Wave and ripple each take a new Gaussian value after
-    exponentially distributed times; waves are rare and large, ripples frequent and small. The
-    speed follows the target as a critically damped second-order system within acceleration
-    limits, so that acceleration is continuous. Jumps reproduce the heavy-tailed accelerations of
-    recorded traffic better than a Gaussian process does.
+    level, a wave and a ripple, at least zero; a free speed may bound level and wave together. Wave
+    and ripple each take a new Gaussian value after exponentially distributed times; waves are rare
+    and large, ripples frequent and small. The speed follows the target as a critically damped
+    second-order system within acceleration limits, so that acceleration is continuous. Jumps
+    reproduce the heavy-tailed accelerations of recorded traffic better than a Gaussian process
+    does.
 
     The default values are fitted to NGSIM I-80 by ``tools/fit_stream.py``: they minimise the
     distance between the leaders of the synthetic pairs and those of 264 real pairs in the mean
@@ -39,6 +40,8 @@ class StopAndGo:
         response_s: time constant of the response to a jump [s].
         acceleration_limit: largest acceleration [m/s²].
         braking_limit: largest deceleration, positive [m/s²].
+        free_speed_mps: bound of level and wave together: the speed of free traffic, from which
+            waves only slow down [m/s]; None for no bound.
 
     Raises:
         ConfigError: if a parameter is not positive (the spreads may be zero), naming it.
@@ -53,9 +56,12 @@ class StopAndGo:
     response_s: float = 0.99
     acceleration_limit: float = 2.5
     braking_limit: float = 3.5
+    free_speed_mps: float | None = None
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
+            if name == "free_speed_mps" and value is None:
+                continue
             spread = name.endswith("spread_mps")
             require_in("data.leader", "[0, inf)" if spread else "(0, inf)", **{name: value})
 
@@ -80,7 +86,10 @@ class StopAndGo:
         shape = (steps + 1, count)
         wave = self.wave_spread_mps * jumps(shape, time_step / self.wave_s, generator)
         ripple = self.ripple_spread_mps * jumps(shape, time_step / self.ripple_s, generator)
-        return self._track(np.maximum(level + wave + ripple, 0.0), time_step), level
+        traffic = level + wave
+        if self.free_speed_mps is not None:
+            traffic = np.minimum(traffic, self.free_speed_mps)
+        return self._track(np.maximum(traffic + ripple, 0.0), time_step), level
 
     def _track(self, target: Array, time_step: float) -> Array:
         """Speeds of leaders that track target speeds, both ``[steps + 1, count]``."""
