@@ -116,7 +116,8 @@ def _plays_data(leader: Any) -> bool:
     """Whether leaders, or one source of a mixture of them, are those of ``data``."""
     if not OmegaConf.is_dict(leader) or "_target_" not in leader:
         return False
-    return "source" in leader or any(map(_plays_data, leader.values()))
+    known = (key for key in leader if not OmegaConf.is_missing(leader, key))
+    return "source" in leader or any(_plays_data(leader[key]) for key in known)
 
 
 def string_of_scenario(scenario: Any) -> VehicleString:

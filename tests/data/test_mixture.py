@@ -14,6 +14,7 @@ import lcc_rl
 from lcc_rl.commands import evaluation, pipeline, training
 from lcc_rl.config import load
 from lcc_rl.data.cycles import join
+from lcc_rl.data.mixture import Mixture
 from lcc_rl.data.profiles import Split, leader_profiles
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import build_source
@@ -124,13 +125,17 @@ def test_joined_windows_keep_what_follows_them() -> None:
         (["leader.weights={cycles: -1}"], ConfigError, r"leader\.weights\.cycles must be positive"),
         (["leader.weights={cycle: 1}"], ConfigError, "'cycle'.*Did you mean 'cycles'"),
         (["+leader.more=3"], ConfigError, r"leader\.more must be a source of leaders"),
-        (["~leader.traffic", "~leader.cycles"], ConfigError, "names no source"),
         (["leader.cycles.least_variation=1e6"], DataError, r"leader\.cycles: no held-out window"),
     ],
 )
 def test_impossible_mixtures(overrides, error, words) -> None:
     with pytest.raises(error, match=words):
         load_inputs(load("train", ["variant=alcc", *MIXTURE, LONG, *overrides]))
+
+
+def test_a_mixture_of_nothing() -> None:
+    with pytest.raises(ConfigError, match="names no source"):
+        Mixture()
 
 
 @pytest.mark.parametrize(
