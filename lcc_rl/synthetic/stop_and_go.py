@@ -18,12 +18,12 @@ class StopAndGo:
     """Leaders that track a target speed which jumps, as in stop-and-go waves.
 
     Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of its
-    level, a wave and a ripple, at least zero; a free speed may bound level and wave together, and in
-    the lowest waves traffic may stand. Wave and ripple each take a new Gaussian value after exponentially distributed times; waves are rare
-    and large, ripples frequent and small. The speed follows the target as a critically damped
-    second-order system within acceleration limits, so that acceleration is continuous. Jumps
-    reproduce the heavy-tailed accelerations of recorded traffic better than a Gaussian process
-    does.
+    level, a wave and a ripple, at least zero; a free speed may bound level and wave together, and
+    in the lowest waves traffic may stand. Wave and ripple each take a new Gaussian value after
+    exponentially distributed times; waves are rare and large, ripples frequent and small. The
+    speed follows the target as a critically damped second-order system within acceleration
+    limits, so that acceleration is continuous. Jumps reproduce the heavy-tailed accelerations of
+    recorded traffic better than a Gaussian process does.
 
     The default values are fitted to NGSIM I-80 by ``tools/fit_stream.py``: they minimise the
     distance between the leaders of the synthetic pairs and those of 264 real pairs in the mean

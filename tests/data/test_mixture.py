@@ -91,7 +91,7 @@ def test_a_mixture_holds_every_source(drives) -> None:
         "highway": 4,
     }
     assert not set(training.names) & {
-        name.split("+")[0] for name in held_out.names if "d" == name[0]
+        name.split("+")[0] for name in held_out.names if name[0] == "d"
     }
     assert held_out.reach is not None
     assert (held_out.reach > held_out.lengths).any()
