@@ -159,11 +159,6 @@ NODES = (
     ("drivers=fixed", "drivers", {"desired_speed": POSITIVE, "min_gap": POSITIVE}),
     ("drivers=kde", "drivers", {"drivers": WHOLE_ONE, "seed": (-1,), "bandwidth": (0, nan)}),
     ("variant=ddpg", "leader", {"least_variation": NOT_NEGATIVE}),
-    (
-        "leader=drives leader.path=x.csv",
-        "leader",
-        {"least_variation": NOT_NEGATIVE, "evaluation_share": (0, 1.1, *NEVER)},
-    ),
     ("drivers=highway", "drivers", {"least_speed": POSITIVE}),
 )
 CALIBRATION = {
