@@ -87,8 +87,9 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     if ring:
         for key in ("data", "split", "leader"):
             yield key, "a ring road has no leader"
-    elif cfg.get("leader") is not None and "source" not in cfg.leader:
-        for key in ("data", "split"):
+    elif cfg.get("leader") is not None and not _plays_data(cfg.leader):
+        # A pipeline calibrates drivers on the data.
+        for key in ("split",) if "calibration" in cfg else ("data", "split"):
             yield key, "the leader drives the records of leader=…; say leader=trajectories"
     if not ring:
         for key in ("circumference", "vehicle_length", "initial_speed"):
@@ -103,9 +104,20 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     if not OmegaConf.is_dict(cfg.get("agent")) or "_target_" not in cfg.agent:
         for key in () if sweep else ("agent", "training"):
             yield key, f"variant {cfg.variant} learns nothing"
-    unused = {"episodes": ("full_length",), "vehicles": ("batch_size", "sample_episodes")}
+    unused = {
+        "episodes": ("evaluation.full_length", "leader.cases", "leader.full_length"),
+        "vehicles": ("evaluation.batch_size", "evaluation.sample_episodes"),
+    }
     for name in unused.get(cfg.evaluation.rows, ()):
-        yield f"evaluation.{name}", f"it is unused with evaluation.rows={cfg.evaluation.rows}"
+        yield name, f"it is unused with evaluation.rows={cfg.evaluation.rows}"
+
+
+def _plays_data(leader: Any) -> bool:
+    """Whether leaders, or one source of a mixture of them, are those of ``data``."""
+    if not OmegaConf.is_dict(leader) or "_target_" not in leader:
+        return False
+    known = (key for key in leader if not OmegaConf.is_missing(leader, key))
+    return "source" in leader or any(_plays_data(leader[key]) for key in known)
 
 
 def string_of_scenario(scenario: Any) -> VehicleString:

@@ -39,7 +39,7 @@ from lcc_rl.results.trust import check_targets
         ("+evaluation.driver=3", r"Did you mean 'drivers'"),
         ("seed=abc", r"seed=abc: Value 'abc' .* Integer"),
         ("hydra.swep.dir=x", r"Did you mean 'sweep'"),
-        ("leader=udds", r"variant alcc has no leader to choose; leave leader=… out"),
+        ("gains=tuned", r"variant alcc has no gains to choose; leave gains=… out"),
         ("hydra/launcher=cluster", r"unknown choice of hydra/launcher 'cluster'"),
     ],
 )

@@ -26,6 +26,7 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.figures import write_study_figures
 from lcc_rl.results.runs import PRETRAINED, check_folder, load_policy, save_config
+from lcc_rl.results.savings import by_source
 from lcc_rl.results.string_figures import write_platoon_figures
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
@@ -158,12 +159,14 @@ def _evaluate(
 
 def _show(rows: pd.DataFrame, cfg: DictConfig, inputs: Inputs) -> None:
     """Print the summary of an evaluation."""
-    if cfg.evaluation.rows == "vehicles":
-        for case in dict.fromkeys(rows["case"]):
-            show(vehicles_as_rich(case_table(rows, case), case))
-        return
-    title = (
-        f"{len(inputs.evaluation)} held-out profiles × "
-        f"{rows['driver_id'].nunique()} drivers, {cfg.scenario.horizon} steps"
-    )
-    show(as_rich(summary(rows), title))
+    for source, part in by_source(rows):
+        of = f"{source}: " if source else ""
+        if cfg.evaluation.rows == "vehicles":
+            for case in dict.fromkeys(part["case"]):
+                show(vehicles_as_rich(case_table(part, case), f"{of}{case}"))
+            continue
+        title = (
+            f"{of}{part['profile_id'].nunique()} held-out profiles × "
+            f"{part['driver_id'].nunique()} drivers, {cfg.scenario.horizon} steps"
+        )
+        show(as_rich(summary(part), title))

@@ -36,8 +36,9 @@ from lcc_rl.targets import forget_places
 
 log = logging.getLogger("lcc_rl")
 
-# Settings that only the pipeline has; all others are passed on to calibration and trainings.
-OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra")
+# Settings that only the pipeline has, and data, which a variant with other leaders would refuse;
+# all others are passed on to calibration and trainings.
+OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 PATIENCE = 20.0  # a training ends after the iteration at hand [s]
 OVERRIDES, TRAJECTORIES = "overrides.json", "trajectories.parquet"
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
@@ -71,6 +72,9 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> pd.DataFrame:
     # Every part is composed before the first one runs: a typo must not cost an hour.
     parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
+    for part in (*parts.values(), final):
+        OmegaConf.set_struct(part, False)
+        part.data = cfg.data
     for name, part in parts.items():
         check_settings(part, folder / name)
     check_sizes(final)
@@ -82,7 +86,6 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> pd.DataFrame:
         "drivers": {"_target_": BOOTSTRAP, "path": str(drivers)},
     }
     for part in (*parts.values(), final):
-        OmegaConf.set_struct(part, False)
         part.update(inputs)
     _train_all(parts, folder, cfg.jobs)
     final.compare = [

@@ -140,7 +140,7 @@ def _given(cfg: DictConfig, inputs: Inputs, folder: Path) -> Strategy:
 
 def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
     """Train an agent to the end and write its policy."""
-    trainer = make_trainer(cfg, agent, inputs.training, inputs.population, folder)
+    trainer = make_trainer(cfg, agent, inputs.to_learn_from(), inputs.population, folder)
     if resume:
         trainer.load()
     save_config(cfg, folder)

@@ -1,16 +1,20 @@
-"""Speed profiles that a platoon's leader drives: stretches of speed records, evaluation cases."""
+"""Speed profiles that leaders drive: stretches of speed records, traffic, evaluation cases."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lcc_rl.config_types import check_types
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, Split, at_step, from_records, leader_profiles
+from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import read_speed_record, resample
+from lcc_rl.data.units import FRAME
 from lcc_rl.errors import (
     ConfigError,
     DataError,
@@ -44,7 +48,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Leaders:
-    """Speed profiles of a platoon's leader, for training and for evaluation.
+    """Speed profiles of leaders, for training and for evaluation.
 
     Args:
         training: records to draw windows from.
@@ -107,13 +111,18 @@ def stretch(
     return from_records([speeds], [label], [stem], time_step)
 
 
-def join(profiles: list[Profiles]) -> Profiles:
-    """Put several profiles into one collection."""
-    return from_records(
-        [p.record(i) for p in profiles for i in range(len(p))],
-        [name for p in profiles for name in p.names],
-        [recording for p in profiles for recording in p.recordings],
-        profiles[0].time_step,
+def join(parts: Sequence[Profiles]) -> Profiles:
+    """Put several profiles of one step into one collection."""
+    sizes = [len(part.speeds) for part in parts]
+    known = [part.lengths if part.reach is None else part.reach for part in parts]
+    return Profiles(
+        speeds=torch.cat([part.speeds for part in parts]),
+        offsets=torch.cat([part.offsets + sum(sizes[:i]) for i, part in enumerate(parts)]),
+        lengths=torch.cat([part.lengths for part in parts]),
+        names=tuple(name for part in parts for name in part.names),
+        recordings=tuple(name for part in parts for name in part.recordings),
+        time_step=parts[0].time_step,
+        reach=None if all(part.reach is None for part in parts) else torch.cat(known),
     )
 
 
@@ -152,13 +161,13 @@ class RecordLeaders:
     def __post_init__(self) -> None:
         require_in("leader", "[0, inf)", least_variation=self.least_variation)
 
-    def load(self, time_step: float, horizon: int, followers: int) -> Leaders:
+    def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read everything.
 
         Args:
             time_step: step of the scenario [s].
             horizon: steps of a window and of a case.
-            followers: vehicles of windows and of the full length.
+            followers: vehicles of the full length; None reads neither that nor the cases.
 
         Raises:
             DataError: if a record cannot be used, naming the file.
@@ -167,7 +176,7 @@ class RecordLeaders:
         training = join(self._stretches("training", self.training, time_step))
         held_out = join(self._stretches("held_out", self.held_out, time_step))
         whole = None
-        if self.full_length is not None:
+        if self.full_length is not None and followers is not None:
             settings = self._checked(self.full_length, "leader.full_length", STRETCH)
             whole = Case("full length", stretch(time_step=time_step, **settings), followers)
         windows = varying(held_out.windows(horizon), self.least_variation)
@@ -175,7 +184,8 @@ class RecordLeaders:
         for group, profiles in (("training", training), ("held_out", held_out)):
             for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True):
                 report.append(f"{group}: {name}, {length * time_step:g} s")
-        cases = (self._case(name, node, time_step, horizon) for name, node in self.cases.items())
+        nodes = {} if followers is None else self.cases
+        cases = (self._case(name, node, time_step, horizon) for name, node in nodes.items())
         return Leaders(training, windows, tuple(cases), whole, tuple(report))
 
     def _stretches(self, group: str, nodes: Mapping[str, Any], time_step: float) -> list[Profiles]:
@@ -210,6 +220,23 @@ class RecordLeaders:
         return {**settings, "path": path, "plausible": self.plausible}
 
 
+def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Profiles:
+    """Read the speed profiles of the leaders in car-following episodes of NGSIM files.
+
+    Args:
+        path: one or several files of any published NGSIM layout, or a pattern; see
+            :class:`lcc_rl.data.sources.NgsimSource`, whose default criteria apply.
+        time_step: step of the profiles [s]; the records are interpolated to it.
+
+    Raises:
+        ConfigError: if the step is not positive and finite.
+        DataError: if a file cannot be read or holds no car-following episode.
+    """
+    require_positive("profiles", time_step=time_step)
+    episodes = NgsimSource(path).load().episodes
+    return at_step(leader_profiles(episodes, FRAME), time_step)
+
+
 @dataclass(frozen=True)
 class TrajectoryLeaders:
     """Leaders recorded in traffic: those of car-following episodes, such as NGSIM's.
@@ -233,7 +260,7 @@ class TrajectoryLeaders:
         require_positive("leader", source_step=self.source_step)
         require_in("leader", "[0, inf)", least_variation=self.least_variation)
 
-    def load(self, time_step: float, horizon: int, followers: int) -> Leaders:
+    def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read everything; see :meth:`RecordLeaders.load`."""
         loaded = self.source.load()
         profiles = at_step(leader_profiles(loaded.episodes, self.source_step), time_step)

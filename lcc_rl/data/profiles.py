@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import resample
-from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError, DataError, require_in, require_positive
+from lcc_rl.errors import ConfigError, DataError, require_in
+
+NONE_LEFT = "no speed profile left: at least one leader's record is needed"
 
 
 @dataclass(frozen=True)
@@ -30,6 +29,9 @@ class Profiles:
         time_step: time between samples [s].
         reach: samples of each record including those after a window's end, shape ``[profiles]``,
             for previews; None for ``lengths``.
+        weights: how often a training draws each record, relative to the others, ``[profiles]``,
+            float64; None: all alike.
+        sources: the source of each record, where there are several; empty for one.
     """
 
     speeds: Tensor
@@ -39,6 +41,8 @@ class Profiles:
     recordings: tuple[str, ...]
     time_step: float
     reach: Tensor | None = None
+    weights: Tensor | None = None
+    sources: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -50,12 +54,22 @@ class Profiles:
 
     def select(self, indices: Iterable[int]) -> Profiles:
         """Return the records with the given indices, in that order."""
-        chosen = list(indices)
-        return from_records(
-            [self.record(i) for i in chosen],
-            [self.names[i] for i in chosen],
-            [self.recordings[i] for i in chosen],
-            self.time_step,
+        chosen = [int(i) for i in indices]
+        if not chosen:
+            raise DataError(NONE_LEFT)
+        index = torch.tensor(chosen)
+        reach = self.lengths if self.reach is None else self.reach
+        spans = torch.stack([self.offsets[index], self.offsets[index] + reach[index]], 1).tolist()
+        return replace(
+            self,
+            speeds=torch.cat([self.speeds[first:end] for first, end in spans]),
+            offsets=torch.cumsum(reach[index], 0) - reach[index],
+            lengths=self.lengths[index],
+            names=tuple(self.names[i] for i in chosen),
+            recordings=tuple(self.recordings[i] for i in chosen),
+            reach=None if self.reach is None else reach[index],
+            weights=None if self.weights is None else self.weights[index],
+            sources=tuple(self.sources[i] for i in chosen if self.sources),
         )
 
     def windows(self, horizon: int, limit: int | None = None) -> Profiles:
@@ -88,8 +102,11 @@ class Profiles:
         return replace(whole, lengths=played, reach=whole.lengths)
 
     def spread(self, limit: int | None) -> Profiles:
-        """Return at most ``limit`` of the records, spread evenly; None for all."""
-        return self.select(evenly(len(self), limit))
+        """Return at most ``limit`` records of each source, spread evenly; None for all."""
+        groups: dict[str, list[int]] = {}
+        for place, source in enumerate(self.sources or [""] * len(self)):
+            groups.setdefault(source, []).append(place)
+        return self.select(g[i] for g in groups.values() for i in evenly(len(g), limit))
 
     def at_least(self, horizon: int) -> Profiles:
         """Return the records that hold at least ``horizon`` steps.
@@ -130,7 +147,7 @@ def from_records(
         DataError: if there is none, or one holds a negative or missing speed.
     """
     if not records:
-        raise DataError("no speed profile left: at least one leader's record is needed")
+        raise DataError(NONE_LEFT)
     for name, record in zip(names, records, strict=True):
         if not bool(torch.isfinite(record).all()) or bool((record < 0).any()):
             raise DataError(f"profile {name}: speeds must be finite and not negative")
@@ -143,6 +160,12 @@ def from_records(
         recordings=tuple(recordings),
         time_step=time_step,
     )
+
+
+def nothing(time_step: float) -> Profiles:
+    """Return no profile: what is left to train on where all are for evaluation."""
+    none = torch.zeros(0, dtype=torch.int64)
+    return Profiles(torch.zeros(0), none, none, (), (), time_step)
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
@@ -170,23 +193,6 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
     return from_records(records, names, recordings, time_step)
 
 
-def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Profiles:
-    """Read the speed profiles of the leaders in car-following episodes of NGSIM files.
-
-    Args:
-        path: one or several files of any published NGSIM layout, or a pattern; see
-            :class:`lcc_rl.data.sources.NgsimSource`, whose default criteria apply.
-        time_step: step of the profiles [s]; the records are interpolated to it.
-
-    Raises:
-        ConfigError: if the step is not positive and finite.
-        DataError: if a file cannot be read or holds no car-following episode.
-    """
-    require_positive("profiles", time_step=time_step)
-    episodes = NgsimSource(path).load().episodes
-    return at_step(leader_profiles(episodes, FRAME), time_step)
-
-
 def at_step(profiles: Profiles, time_step: float) -> Profiles:
     """Interpolate every record to another step [s]."""
     if time_step == profiles.time_step:
@@ -205,7 +211,8 @@ class Split:
     Args:
         by: ``"recording"`` holds out whole recordings (no shared traffic wave at all);
             ``"vehicle"`` holds out leaders within every recording.
-        evaluation_share: share of the recordings or vehicles held out, 0…1.
+        evaluation_share: share of the recordings or vehicles held out, 0…1; 1 evaluates on all
+            and leaves nothing to train on.
         tuning: for choosing settings: leave the evaluation profiles out and split the training
             profiles once more, by the same rule.
 
@@ -220,7 +227,7 @@ class Split:
     def __post_init__(self) -> None:
         if self.by not in ("recording", "vehicle"):
             raise ConfigError(f"split.by must be 'recording' or 'vehicle', got {self.by!r}")
-        require_in("split", "(0, 1)", evaluation_share=self.evaluation_share)
+        require_in("split", "(0, 1]", evaluation_share=self.evaluation_share)
 
     def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
         """Return the training and the evaluation profiles.
@@ -228,6 +235,8 @@ class Split:
         Raises:
             DataError: if there are not at least two recordings (or vehicles) to divide.
         """
+        if self.evaluation_share == 1:
+            return nothing(profiles.time_step), profiles
         if self.tuning:
             profiles, _ = self._divide(profiles)
         return self._divide(profiles)

@@ -34,6 +34,10 @@ class LoadedEpisodes:
     episodes: pd.DataFrame
     report: list[str]
 
+    def load(self) -> LoadedEpisodes:
+        """Return itself: a table at hand is a source, too."""
+        return self
+
 
 @dataclass(frozen=True)
 class NgsimSource:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,14 @@ from lcc_rl.drivers.parameters import (
     checked_bounds,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
-from lcc_rl.errors import LAST_SEED, ConfigError, DataError, require_positive, require_whole
+from lcc_rl.errors import (
+    LAST_SEED,
+    ConfigError,
+    DataError,
+    require_in,
+    require_positive,
+    require_whole,
+)
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.io.memory import require_memory
 
@@ -108,18 +115,29 @@ class DriverPopulation:
         }
 
 
-def bootstrap(path: str | Path | None = None, mode: str | None = None) -> DriverPopulation:
+def bootstrap(
+    path: str | Path | None = None, mode: str | None = None, least_speed: float | None = None
+) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
 
     Args:
         path: table of calibrated drivers; None takes the shipped I-80 drivers.
         mode: see :func:`load_drivers`.
+        least_speed: to which lower desired speeds are raised, for faster leaders than those of
+            the calibration [m/s]; None raises none. Time gaps stay.
 
     Raises:
-        ConfigError: if the mode is unknown.
+        ConfigError: if the mode is unknown or the speed not one that a driver can desire.
         DataError: if the table is not sound.
     """
-    return from_table(load_drivers(path, mode))
+    found = from_table(load_drivers(path, mode))
+    if least_speed is None:
+        return found
+    low, high = PLAUSIBLE["desired_speed"]
+    require_in("drivers", f"[{low:g}, {high:g}]", least_speed=least_speed)
+    raised = found.desired_speed < least_speed
+    speed = found.desired_speed.clamp(min=least_speed)
+    return replace(found, desired_speed=speed, at_bound=found.at_bound & ~raised)
 
 
 def from_table(table: pd.DataFrame) -> DriverPopulation:

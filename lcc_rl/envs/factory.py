@@ -227,7 +227,7 @@ def make_env(
     """
     cfg = load("train", [f"variant={variant}", *overrides])
     inputs = load_inputs(cfg)
-    profiles = inputs.evaluation if held_out else inputs.training
+    profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)
     count = string_of(cfg).count(AUTOMATED)
     if single and count != 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,10 +15,10 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import CALLED, build_as, is_sweep, plain
 from lcc_rl.config_checks import string_of_scenario
-from lcc_rl.data.cycles import Case
-from lcc_rl.data.profiles import Profiles, from_records, leader_profiles
+from lcc_rl.data.cycles import Case, TrajectoryLeaders
+from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
-from lcc_rl.errors import DataError
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.pattern import RING, VehicleString
 from lcc_rl.pieces.controllers import Population
 
@@ -27,7 +28,7 @@ class Inputs:
     """What a study is made from.
 
     Args:
-        training: speed profiles for training.
+        training: speed profiles for training; none where all are for evaluation.
         evaluation: speed profiles held out, as windows of one horizon.
         population: the human drivers.
         report: what was read and dropped, as plain lines.
@@ -41,6 +42,19 @@ class Inputs:
     report: tuple[str, ...] = ()
     cases: tuple[Case, ...] = ()
     full_length: Case | None = None
+
+    def to_learn_from(self) -> Profiles:
+        """Return the profiles for training.
+
+        Raises:
+            ConfigError: if all are for evaluation.
+        """
+        if not len(self.training):
+            raise ConfigError(
+                "no profile is left to train on: split=none, or evaluation_share=1 of split or "
+                "leader, is for evaluations of what no training has seen; hold out less"
+            )
+        return self.training
 
 
 def string_of(cfg: DictConfig) -> VehicleString:
@@ -87,17 +101,33 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
         return Inputs(nobody, nobody, population)
+    wanted = len(string_of(cfg)) if cfg.evaluation.rows == "vehicles" else None
+    leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, wanted)
+    windows, training = leaders.windows, leaders.training
+    if len(training):
+        training = training.at_least(scenario.horizon)
+    available = {
+        f"profiles {source}".strip(): count
+        for source, count in (Counter(windows.sources) or {"": len(windows)}).items()
+    } | {"drivers": len(population.time_gap)}
+    return Inputs(
+        training,
+        windows.spread(cfg.evaluation.profiles),
+        population,
+        (*leaders.report, *shortfalls(cfg, available)),
+        leaders.cases,
+        leaders.full_length,
+    )
+
+
+def _source_of_leaders(cfg: DictConfig, episodes: Any) -> Any:
+    """Build what ``leader`` describes; without it, the leaders of ``data`` divided by ``split``."""
     if cfg.get("leader") is not None:
-        return _record_inputs(cfg, population)
-    report: Sequence[str] = ()
-    if episodes is None:
-        loaded = _load_episodes(cfg.data)
-        episodes, report = loaded.episodes, loaded.report
-    profiles = leader_profiles(episodes, scenario.time_step).at_least(scenario.horizon)
-    training, evaluation = build_as("a split", CALLED, cfg.split, "split")(profiles)
-    windows = evaluation.windows(scenario.horizon, cfg.evaluation.profiles)
-    available = {"profiles": len(windows), "drivers": len(population.time_gap)}
-    return Inputs(training, windows, population, (*report, *shortfalls(cfg, available)))
+        return build_as("a source of leaders", ("load",), cfg.leader, "leader")
+    loaded = _load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
+    split = build_as("a split", CALLED, cfg.split, "split")
+    # All windows count: what is left out of them is for platoons, whose errors are shares.
+    return TrajectoryLeaders(loaded, split, cfg.scenario.time_step, least_variation=0.0)
 
 
 def constant_profiles(
@@ -138,25 +168,16 @@ def _stamps(value: Any) -> Iterator[tuple[str, int, int]]:
 
 
 def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
-    """Return a line for everything that an evaluation asks more of than there is."""
-    return [
-        f"evaluation.{name}={cfg.evaluation[name]}: only {count} are available; taking all"
-        for name, count in available.items()
-        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count
-    ]
+    """Return a line for everything that an evaluation asks more of than there is.
 
-
-def _record_inputs(cfg: DictConfig, population: Population) -> Inputs:
-    """Read the records that the leader drives."""
-    scenario = cfg.scenario
-    leaders = build_as("a source of leaders", ("load",), cfg.leader, "leader").load(
-        scenario.time_step, scenario.horizon, len(string_of(cfg))
-    )
-    return Inputs(
-        leaders.training.at_least(scenario.horizon),
-        leaders.windows.spread(cfg.evaluation.profiles),
-        population,
-        leaders.report,
-        leaders.cases,
-        leaders.full_length,
-    )
+    Args:
+        cfg: configuration of a study.
+        available: how many there are, by setting, and by the source's name after it.
+    """
+    lines = []
+    for what, count in available.items():
+        name, _, source = what.partition(" ")
+        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count:
+            only = f"only {count} {f'of {source} ' if source else ''}are available; taking all"
+            lines.append(f"evaluation.{name}={cfg.evaluation[name]}: {only}")
+    return lines

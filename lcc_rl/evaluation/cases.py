@@ -16,6 +16,7 @@ from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
+from lcc_rl.results.savings import SOURCE
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")
@@ -44,6 +45,9 @@ def evaluate(
         frame.insert(2, "case", case.name)
         frame.insert(3, "profile", [case.profile.names[i] for i in frame["run_id"]])
         frame.insert(4, "followers", int(frame["follower"].max()))
+        if inputs.evaluation.sources:
+            own = case.profile.sources or [""] * len(case.profile)
+            frame[SOURCE] = [own[i] for i in frame["run_id"]]
         rows.append(frame)
         if case in inputs.cases:
             drawn = trace(series, cfg.scenario.time_step)

@@ -27,7 +27,7 @@ from lcc_rl.functional.power import path_power
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.savings import LEADER
+from lcc_rl.results.savings import LEADER, SOURCE
 from lcc_rl.results.tables import FASTER
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
@@ -218,18 +218,19 @@ def describe(
     profile: Tensor,
     driver: Tensor,
 ) -> pd.DataFrame:
-    """Say which episodes a batch holds: strategy, profile and driver."""
-    return pd.DataFrame(
-        {
-            "strategy": strategy.name,
-            "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
-            "profile": [profiles.names[i] for i in profile.tolist()],
-            "profile_id": profile.numpy(),
-            "driver_id": driver.numpy(),
-            "desired_speed_mps": population.desired_speed[driver].numpy(),
-            "time_gap_s": population.time_gap[driver].numpy(),
-        }
-    )
+    """Say which episodes a batch holds: strategy, profile, its source, and driver."""
+    columns = {
+        "strategy": strategy.name,
+        "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
+        "profile": [profiles.names[i] for i in profile.tolist()],
+        "profile_id": profile.numpy(),
+        "driver_id": driver.numpy(),
+        "desired_speed_mps": population.desired_speed[driver].numpy(),
+        "time_gap_s": population.time_gap[driver].numpy(),
+    }
+    if profiles.sources:
+        columns[SOURCE] = [profiles.sources[i] for i in profile.tolist()]
+    return pd.DataFrame(columns)
 
 
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:

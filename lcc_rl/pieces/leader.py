@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.data.profiles import Profiles, from_trajectories
+from lcc_rl.data.cycles import from_trajectories
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, require_in
 from lcc_rl.functional.random import choose, stream_id, uniform
 from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key, require_option
@@ -37,7 +38,8 @@ class NGSIMLeader(StepTransform):
     c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
 
     Args:
-        profiles: the records to play; each must hold at least ``horizon`` steps.
+        profiles: the records to play; each must hold at least ``horizon`` steps. A random one
+            is drawn by their weights, where they have any.
         horizon: steps per episode.
         time_step: duration of a step [s].
         start: ``"random"`` draws where in the record the window begins, ``"first"`` begins at
@@ -59,6 +61,7 @@ class NGSIMLeader(StepTransform):
     offsets: Tensor
     lengths: Tensor
     starts: Tensor
+    shares: Tensor | None
 
     def __init__(
         self,
@@ -95,6 +98,10 @@ class NGSIMLeader(StepTransform):
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("lengths", profiles.lengths)
         self.register_buffer("starts", profiles.lengths - horizon)
+        shares = None  # cumulative, of the draws that each record and those before it take
+        if profiles.weights is not None:
+            shares = profiles.weights.cumsum(0) / profiles.weights.sum()
+        self.register_buffer("shares", shares)
 
     @classmethod
     def from_file(
@@ -152,13 +159,21 @@ class NGSIMLeader(StepTransform):
         if self.foresight:
             start.set(NEXT_SPEED, self.speed_at(profile, first, still + 1, seed))
 
+    def _drawn(self, seed: Tensor) -> Tensor:
+        """Draw a record by its weight, by counter."""
+        if self.shares is None:
+            return choose(seed, len(self.offsets), self.profile_stream)
+        place = uniform(seed, 0, self.profile_stream).double()
+        drawn = torch.searchsorted(self.shares, place, right=True)
+        return drawn.clamp(max=len(self.offsets) - 1)  # the last share may round to below 1
+
     def _window(self, given: TensorDictBase, seed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the record and its first sample, as given or else drawn."""
         profile, first = given.get(PROFILE, None), given.get(FIRST, None)
         if profile is None and self.profile is not None:
             profile = torch.full_like(seed, self.profile)
         elif profile is None:
-            profile = choose(seed, len(self.offsets), self.profile_stream)
+            profile = self._drawn(seed)
         else:
             require_option(PROFILE, profile, len(self.offsets))
         if first is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,7 @@ NOTHING = Estimate(np.nan, np.nan, np.nan)
 # and with it what ending slower saves; and as drawn (A2).
 KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
 LEADER = ("leader_path_energy_kj", "leader_speed_mps")
+SOURCE = "source"  # of a row's leader, where a mixture has several
 TERCILES = ("lower", "middle", "upper")
 
 
@@ -98,10 +99,19 @@ def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, f
     return {name: float((x[strategy] > x[baseline]).mean()) for name, x in levels.items()}
 
 
+def by_source(episodes: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the rows of each source of leaders with its name; without one, all rows and ""."""
+    if SOURCE not in episodes:
+        yield "", episodes
+        return
+    for source, rows in episodes.groupby(SOURCE, sort=False):
+        yield str(source), rows
+
+
 def stratified(
     episodes: pd.DataFrame, column: str, strategy: str, baseline: str, by: Sequence[str] = LEADER
 ) -> pd.DataFrame:
-    """Savings in the terciles of windows by what their leader does.
+    """Savings in the terciles of windows by what their leader does, and in each source of leaders.
 
     Args:
         episodes: rows of an evaluation.
@@ -112,9 +122,16 @@ def stratified(
 
     Returns:
         One row per measure and tercile, the lowest first: its windows, the range of the measure
-        and the share saved [%] with its interval.
+        and the share saved [%] with its interval; and one per source, where there are several, by
+        its name in the column ``tercile``, without a range.
     """
-    rows = []
+    rows: list[dict[str, object]] = []
+    row: dict[str, object]
+    for source, inside in by_source(episodes) if SOURCE in episodes else ():
+        row = {"by": SOURCE, "tercile": source, "windows": inside["profile_id"].nunique()}
+        row |= {"least": np.nan, "most": np.nan}
+        found = savings(inside, column, strategy, baseline)
+        rows.append(row | found.columns("saving_pct", 100.0))
     for measure in by:
         windows = episodes.groupby("profile_id")[measure].first().sort_values()
         parts = np.array_split(np.arange(len(windows)), len(TERCILES))
@@ -123,7 +140,7 @@ def stratified(
             if part.empty:
                 continue
             inside = episodes[episodes["profile_id"].isin(part.index)]
-            row: dict[str, object] = {"by": measure, "tercile": name, "windows": len(part)}
+            row = {"by": measure, "tercile": name, "windows": len(part)}
             row |= {"least": part.iloc[0], "most": part.iloc[-1]}
             found = savings(inside, column, strategy, baseline)
             rows.append(row | found.columns("saving_pct", 100.0))

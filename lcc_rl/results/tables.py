@@ -135,7 +135,7 @@ def leader_too_fast(episodes: pd.DataFrame) -> list[str]:
     if FASTER not in episodes:
         return []
     remedies = {
-        "direct": "drivers=fixed drivers.desired_speed=45, or drivers calibrated on such traffic",
+        "direct": "drivers=highway, or drivers calibrated on such traffic",
         "idm": "variant=idm scenario.controllers.automated.desired_speed=45 'compare=[<run>]'",
     }
     shares = episodes.groupby("strategy")[FASTER].mean()

@@ -18,7 +18,8 @@ class StopAndGo:
     """Leaders that track a target speed which jumps, as in stop-and-go waves.
 
     Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of its
-    level, a wave and a ripple, at least zero. Wave and ripple each take a new Gaussian value after
+    level, a wave and a ripple, at least zero; a free speed may bound level and wave together, and
+    in the lowest waves traffic may stand. Wave and ripple each take a new Gaussian value after
     exponentially distributed times; waves are rare and large, ripples frequent and small. The
     speed follows the target as a critically damped second-order system within acceleration
     limits, so that acceleration is continuous. Jumps reproduce the heavy-tailed accelerations of
@@ -39,6 +40,9 @@ class StopAndGo:
         response_s: time constant of the response to a jump [s].
         acceleration_limit: largest acceleration [m/s²].
         braking_limit: largest deceleration, positive [m/s²].
+        free_speed_mps: bound of level and wave together: the speed of free traffic, from which
+            waves only slow down [m/s]; None for no bound.
+        stop_share: share of the waves in which traffic stands, 0…1: the lowest ones.
 
     Raises:
         ConfigError: if a parameter is not positive (the spreads may be zero), naming it.
@@ -53,9 +57,14 @@ class StopAndGo:
     response_s: float = 0.99
     acceleration_limit: float = 2.5
     braking_limit: float = 3.5
+    free_speed_mps: float | None = None
+    stop_share: float = 0.0
 
     def __post_init__(self) -> None:
+        require_in("data.leader", "[0, 1)", stop_share=self.stop_share)
         for name, value in vars(self).items():
+            if name == "stop_share" or (name == "free_speed_mps" and value is None):
+                continue
             spread = name.endswith("spread_mps")
             require_in("data.leader", "[0, inf)" if spread else "(0, inf)", **{name: value})
 
@@ -78,9 +87,13 @@ class StopAndGo:
         """
         level = self.mean_speed_mps + self.level_spread_mps * stratified_normal(count, generator)
         shape = (steps + 1, count)
-        wave = self.wave_spread_mps * jumps(shape, time_step / self.wave_s, generator)
+        wave = jumps(shape, time_step / self.wave_s, generator)
         ripple = self.ripple_spread_mps * jumps(shape, time_step / self.ripple_s, generator)
-        return self._track(np.maximum(level + wave + ripple, 0.0), time_step), level
+        traffic = level + self.wave_spread_mps * wave
+        if self.free_speed_mps is not None:
+            traffic = np.minimum(traffic, self.free_speed_mps)
+        target = np.where(wave < ndtri(self.stop_share), 0.0, traffic + ripple)
+        return self._track(np.maximum(target, 0.0), time_step), level
 
     def _track(self, target: Array, time_step: float) -> Array:
         """Speeds of leaders that track target speeds, both ``[steps + 1, count]``."""

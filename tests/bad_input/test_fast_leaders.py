@@ -38,7 +38,7 @@ def test_slow_drivers_behind_faster_leaders_are_said(tmp_path: Path, caplog) -> 
         with caplog.at_level(logging.WARNING, logger="lcc_rl"):
             rows = evaluation.run(cfg, tmp_path / str(v0), quiet=True)
         assert (rows[FASTER].mean() > 0.5) == said
-        found = "drivers=fixed drivers.desired_speed=45" in caplog.text
+        found = "Raise v0: drivers=highway" in caplog.text
         assert found == said
 
 

@@ -162,10 +162,11 @@ NODES = (
     ("", "data", {"noise": (-0.1, 1, *NEVER), "seed": (-1, 1.5, nan), "duration_s": ([9, 1], 3)}),
     ("", "data", {"leader.wave_s": POSITIVE, "leader.wave_spread_mps": NOT_NEGATIVE}),
     ("", "data", {"criteria.min_duration_s": (0, *NOT_NEGATIVE), "criteria.max_gap_m": (-1, nan)}),
-    ("", "split", {"evaluation_share": (0, 1, *NEVER), "by": ("colour", 1)}),
+    ("", "split", {"evaluation_share": (0, 1.1, *NEVER), "by": ("colour", 1)}),
     ("drivers=fixed", "drivers", {"desired_speed": POSITIVE, "min_gap": POSITIVE}),
     ("drivers=kde", "drivers", {"drivers": WHOLE_ONE, "seed": (-1,), "bandwidth": (0, nan)}),
     ("variant=ddpg", "leader", {"least_variation": NOT_NEGATIVE}),
+    ("drivers=highway", "drivers", {"least_speed": POSITIVE}),
 )
 CALIBRATION = {
     "bounds.time_gap": ([2, 1], [0, 1], [1], [1, nan], 3),
