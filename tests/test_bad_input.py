@@ -8,7 +8,7 @@ import re
 import pandas as pd
 import pytest
 import torch
-from commands import UNTRAINED, QUICK, tiny
+from commands import QUICK, UNTRAINED, tiny
 from omegaconf import OmegaConf
 
 from lcc_rl import results

@@ -13,9 +13,9 @@ import pandas as pd
 import pytest
 import torch
 from commands import (
-    UNTRAINED,
     QUICK,
     TINY,
+    UNTRAINED,
     assert_same_tables,
     jobs_in_threads,
     run_command,

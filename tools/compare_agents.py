@@ -107,7 +107,17 @@ def human(options: argparse.Namespace) -> Run:
 
 def data_overrides(overrides: Iterable[str]) -> list[str]:
     """Return the overrides that also apply to a controller without training."""
-    known = ("data", "split", "drivers", "evaluation", "scenario", "experiment", "trust", "device")
+    known = (
+        "data",
+        "split",
+        "leader",
+        "drivers",
+        "evaluation",
+        "scenario",
+        "experiment",
+        "trust",
+        "device",
+    )
     own = ("scenario.filters.", "scenario.pieces.preview.", "scenario.pieces.memory.")
     return [
         item for item in overrides if root_key(item) in known and not key_of(item).startswith(own)

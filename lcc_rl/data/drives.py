@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,8 +28,8 @@ class DriveLeaders:
     """Leaders that drive the speed records of a table.
 
     Several drives are divided by name: whether a drive is held out depends on a SHA-256 hash of
-    its name alone, so that it is on the same side in every file. Of a single record the end is
-    held out.
+    its name alone, or of the part that drives of one day share, so that it is on the same side in
+    every file. Of a single record the end is held out.
 
     Args:
         path: a .csv or .parquet file.
@@ -36,17 +37,20 @@ class DriveLeaders:
             that holds one record; ``time`` [s], even in a record; ``speed`` [m/s].
         evaluation_share: share of the names, or of the single record, that is held out, 0…1; 1
             evaluates on everything and leaves nothing to train on.
+        together: regular expression; drives whose names begin with the same match are on the same
+            side. None: every name by itself.
         tuning: for choosing settings: leave the evaluation's part out and divide the rest again.
         least_variation: see :class:`lcc_rl.data.cycles.RecordLeaders`.
         plausible: thresholds of every sample; None for the defaults.
 
     Raises:
-        ConfigError: if a column is unknown or a number is out of range.
+        ConfigError: if a column is unknown, a number out of range or the expression is none.
     """
 
     path: str
     columns: Mapping[str, str | None] = field(default_factory=lambda: dict(COLUMNS))
     evaluation_share: float = 1 / 3
+    together: str | None = None
     tuning: bool = False
     least_variation: float = 2.0
     plausible: Plausible | None = None
@@ -54,6 +58,12 @@ class DriveLeaders:
     def __post_init__(self) -> None:
         require_in("leader", "(0, 1]", evaluation_share=self.evaluation_share)
         require_in("leader", "[0, inf)", least_variation=self.least_variation)
+        try:
+            re.compile(self.together or "")
+        except re.error as error:
+            raise ConfigError(f"leader.together={self.together}: {error}") from error
+        if self.together and self.columns.get("drive", "") is None:
+            raise ConfigError("leader.together divides drives by name; the table holds one record")
         for key, name in self.columns.items():
             if key not in COLUMNS:
                 raise unknown_name("key of leader.columns", str(key), COLUMNS)
@@ -79,7 +89,7 @@ class DriveLeaders:
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; once more for tuning."""
         share = self.evaluation_share
-        place = np.array([hashed(name) for name in profiles.names])
+        place = np.array([hashed(self._family(name)) for name in profiles.names])
         if again:  # what is left lies in share…1
             place = (place - share) / (1 - share)
         held = place < share
@@ -92,6 +102,19 @@ class DriveLeaders:
                 "change leader.evaluation_share (1: all for evaluation) or give more drives"
             )
         return profiles.select(np.flatnonzero(~held)), profiles.select(np.flatnonzero(held))
+
+    def _family(self, name: str) -> str:
+        """Return the part of a name that says on which side its drive is.
+
+        Raises:
+            DataError: if the name has no such part.
+        """
+        if self.together is None:
+            return name
+        found = re.match(self.together, name)
+        if not found or not found.group():
+            raise DataError(f"{self.path}: drive {name!r} does not begin with {self.together!r}")
+        return found.group()
 
     def _by_time(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide the one record, whose end is held out."""

@@ -10,11 +10,10 @@ import pytest
 from ngsim_text import cells, csv_text, native_text, pair
 
 from lcc_rl.config import build, load
-from lcc_rl.data.cycles import RecordLeaders
+from lcc_rl.data.cycles import RecordLeaders, from_trajectories
 from lcc_rl.data.episodes import validate_episodes, write_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import Plausible
-from lcc_rl.data.cycles import from_trajectories
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import ConfigError, DataError

@@ -76,6 +76,25 @@ def test_tuning_leaves_the_evaluation_out(table) -> None:
     assert not names_of(tuning.training) & names_of(tuning.windows)
 
 
+def test_drives_of_one_day_are_on_one_side(tmp_path) -> None:
+    names = [f"2021-03-{day:02d}_{car}" for day in range(1, 13) for car in range(3)]
+    drives(names).to_parquet(tmp_path / "days.parquet")
+    leaders = DriveLeaders(str(tmp_path / "days.parquet"), together="[^_]+").load(0.1, 300)
+    training, held_out = names_of(leaders.training), names_of(leaders.windows)
+    assert training | held_out == set(names)
+    days = [{name.split("_")[0] for name in side} for side in (training, held_out)]
+    assert not days[0] & days[1]
+    assert len(held_out) == 3 * len(days[1]) > 0
+    for together, error, words in (
+        ("(", ConfigError, r"leader\.together=\(: "),
+        ("x", DataError, "drive '2021-03-01_0' does not begin with 'x'"),
+    ):
+        with pytest.raises(error, match=words):
+            DriveLeaders(str(tmp_path / "days.parquet"), together=together).load(0.1, 300)
+    with pytest.raises(ConfigError, match="the table holds one record"):
+        DriveLeaders("x.csv", {"drive": None}, together="x")
+
+
 def test_everything_for_evaluation(table) -> None:
     found = DriveLeaders(str(table), evaluation_share=1.0).load(0.1, 300)
     assert len(found.training) == 0
