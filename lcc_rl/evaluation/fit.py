@@ -38,6 +38,15 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
             f"policy={cfg.policy} was trained with another observation than this: expected "
             f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
         )
+    # Entries are observed in the order of their scales.
+    orders = [
+        [key for key in node if key.startswith("scales.")] for node in (trained_with, observed)
+    ]
+    if orders[0] != orders[1]:
+        raise ConfigError(
+            f"policy={cfg.policy} was trained with another order of observation.scales: expected "
+            f"{', '.join(orders[0])}, got {', '.join(orders[1])}"
+        )
     check_action(str(cfg.policy), own, cfg)
     remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
     if remembered != asked:
