@@ -52,6 +52,7 @@ log = logging.getLogger("lcc_rl")
 
 AGENTS = ("analytic", "ddpg", "td3", "sac")
 POLICY = "policy.pt"
+GRADIENT = "_gradient"
 
 
 def runs_of_agents(options: argparse.Namespace) -> list[Run]:
@@ -88,8 +89,7 @@ def runs_of_limits(options: argparse.Namespace) -> list[Run]:
     """Return trainings of networks and of rules' constants within several limits."""
     runs = []
     for variant, kind, share in product(options.variants, options.policies, options.shares):
-        how = ["experiment=limits"] if kind == NETWORK else ["experiment=limits_tuned"]
-        how += [f"agent.policy={kind}", f"agent.limits.efficiency={share}"]
+        how = [*learner(kind), f"agent.limits.efficiency={share}"]
         runs += [
             Run(
                 options.out / variant / kind / f"limit_{share}" / f"seed_{seed}",
@@ -98,6 +98,17 @@ def runs_of_limits(options: argparse.Namespace) -> list[Run]:
             for seed in range(options.seeds)
         ]
     return runs
+
+
+def learner(kind: str) -> list[str]:
+    """Return the overrides of a network, or of a rule: by search, or ``rule_gradient``."""
+    if kind == NETWORK:
+        return ["experiment=limits"]
+    rule = kind.removesuffix(GRADIENT)
+    if rule == kind:
+        return ["experiment=limits_tuned", f"agent.policy={rule}"]
+    # Its five constants change little per step at the rate of a network's weights.
+    return ["experiment=limits", f"agent.policy={rule}", "agent.learning_rate=0.03"]
 
 
 def human(options: argparse.Namespace) -> Run:
@@ -237,7 +248,7 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("--agent", default="analytic")
         else:
             one.add_argument("--variants", type=words, default=["alcc"])
-            one.add_argument("--policies", type=words, default=[NETWORK, "idm", "acc"])
+            one.add_argument("--policies", type=words, default=[NETWORK, "idm", "idm_gradient"])
             one.add_argument("--shares", type=words, default=["0.005", "0.01", "0.02"])
             one.add_argument("--at", type=float, default=0.01, help="share at which to compare")
     return top

@@ -26,7 +26,7 @@ MEANS = (
     "collided",
 )
 DESCRIBED = ("leader_speed_mps", "leader_path_energy_kj")  # of a window
-HUES = {"network": "#0072b2", "idm": "#d55e00", "acc": "#009e73"}
+HUES = {"network": "#0072b2", "idm": "#d55e00", "idm_gradient": "#cc79a7", "acc": "#009e73"}
 LINES = {"alcc": "-", "own_energy": "--", "reference": ":"}
 
 
