@@ -63,7 +63,7 @@ def comparisons(folder: Path, at: float) -> list[str]:
     """Say what each kind of controller saves against each other at the same share of the time."""
     windows = read_parquet(folder / WINDOWS)
     kinds = list(dict.fromkeys(windows[KINDS].itertuples(index=False, name=None)))
-    lines = [f"path energy where the time gap is too long for {at:.1%} of the time above 1 m/s:"]
+    lines = [f"path energy with too long a time gap for at most {at:.1%} of the time above 1 m/s:"]
     for one, other in combinations(kinds, 2):
         found = saving_at(windows, one, other, at)
         words = f"{' '.join(one)} against {' '.join(other)}"

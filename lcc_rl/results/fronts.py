@@ -49,12 +49,13 @@ def front(windows: pd.DataFrame, kind: Sequence[str]) -> Front:
 
 
 def energy_at(energy: NDArray[np.float64], share: NDArray[np.float64], at: float) -> float:
-    """Return the energy of a front, ``[limits]`` each, where the share is ``at``.
+    """Return the energy of a front, ``[limits]`` each, where the share is at most ``at``.
 
-    Linear between the limits; NaN outside of what they reach.
+    Linear between the limits; where the share stays below, that of the largest share; NaN where it
+    is never as small.
     """
     order = np.argsort(share)
-    return float(np.interp(at, share[order], energy[order], np.nan, np.nan))
+    return float(np.interp(at, share[order], energy[order], left=np.nan))
 
 
 def saving_at(
@@ -62,7 +63,7 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both at the same share of the time beyond the limit. The interval is a clustered bootstrap over
+    Both at the same share of the time beyond the limit, or below it. The interval is a clustered bootstrap over
     windows, which both meet, and training seeds, as of :func:`lcc_rl.results.intervals.saving`;
     resamples in which a front does not reach the share are left out.
 
@@ -70,7 +71,7 @@ def saving_at(
         windows: see :func:`front`.
         one: variant and policy of who saves.
         other: ... and of whom it is compared with.
-        at: the share of the time.
+        at: the largest share of the time.
     """
     fronts = [front(windows, kind) for kind in (one, other)]
     energies = [energy_at(e.mean((1, 2)), s.mean((1, 2)), at) for e, s in fronts]

@@ -29,10 +29,11 @@ def made(windows: int = 12, seeds: int = 3, saved: float = 0.05, noise: float = 
     return pd.DataFrame(rows, columns=names)
 
 
-def test_energy_is_read_between_the_limits_and_nowhere_else() -> None:
+def test_energy_is_read_between_the_limits_and_beyond_the_last_but_not_before_the_first() -> None:
     energy, share = np.array([90.0, 100.0]), np.array([0.02, 0.01])
     assert energy_at(energy, share, 0.0125) == pytest.approx(97.5)
-    assert np.isnan(energy_at(energy, share, 0.03))
+    assert np.isnan(energy_at(energy, share, 0.005))
+    assert energy_at(energy, share, 0.03) == 90.0  # a limit that is always kept
 
 
 def test_saving_is_read_at_the_same_share_not_at_the_same_limit() -> None:
@@ -54,7 +55,7 @@ def test_the_interval_covers_nothing_where_there_is_nothing() -> None:
     found = saving_at(made(saved=0.0, noise=2.0), NETWORK, RULE, 0.012)
     assert found.low < 0.0 < found.high
     assert found.high - found.low < 0.03
-    missed = saving_at(made(), NETWORK, RULE, 0.2)
+    missed = saving_at(made(), NETWORK, RULE, 0.001)
     assert np.isnan([missed.value, missed.low, missed.high]).all()
 
 
