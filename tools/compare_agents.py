@@ -72,9 +72,7 @@ def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
     """Return trainings with present state only, with memory, and with previews."""
     kinds: dict[str, list[str]] = {"none": [], "memory": ["+knowledge=memory"]}
     for seconds in PREVIEWS:
-        ahead = ",".join(f"{seconds * part / 10:g}" for part in range(1, 11))  # ten speeds
-        horizons = f"scenario.pieces.preview.horizons=[{ahead}]"
-        kinds[f"preview_{seconds:g}s"] = ["+knowledge=preview", horizons]
+        kinds[f"preview_{seconds:g}s"] = preview(seconds)
     return [
         Run(
             options.out / kind / f"seed_{seed}",
@@ -83,6 +81,12 @@ def runs_of_knowledge(options: argparse.Namespace) -> list[Run]:
         for kind, changes in kinds.items()
         for seed in range(options.seeds)
     ]
+
+
+def preview(seconds: float) -> list[str]:
+    """Return the overrides of a preview of ten speeds over so long a time."""
+    ahead = ",".join(f"{seconds * part / 10:g}" for part in range(1, 11))
+    return ["+knowledge=preview", f"scenario.pieces.preview.horizons=[{ahead}]"]
 
 
 def runs_of_limits(options: argparse.Namespace) -> list[Run]:
@@ -101,9 +105,13 @@ def runs_of_limits(options: argparse.Namespace) -> list[Run]:
 
 
 def learner(kind: str) -> list[str]:
-    """Return the overrides of a network, or of a rule: by search, or ``rule_gradient``."""
-    if kind == NETWORK:
-        return ["experiment=limits"]
+    """Return the overrides of a network and what it knows, or of a rule.
+
+    A rule's constants are tuned by search, or by the gradient as ``idm_gradient``.
+    """
+    networks = {NETWORK: [], "memory": ["+knowledge=memory"], "preview": preview(5.0)}
+    if kind in networks:
+        return ["experiment=limits", *networks[kind]]
     rule = kind.removesuffix(GRADIENT)
     if rule == kind:
         return ["experiment=limits_tuned", f"agent.policy={rule}"]
@@ -248,7 +256,9 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("--agent", default="analytic")
         else:
             one.add_argument("--variants", type=words, default=["alcc"])
-            one.add_argument("--policies", type=words, default=[NETWORK, "idm", "idm_gradient"])
+            kinds = [NETWORK, "idm", "idm_gradient"]
+            text = "also memory, preview (5 s), acc, acc_gradient"
+            one.add_argument("--policies", type=words, default=kinds, help=text)
             one.add_argument("--shares", type=words, default=["0.005", "0.01", "0.02"])
             one.add_argument("--at", type=float, default=0.01, help="share at which to compare")
     return top

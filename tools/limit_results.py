@@ -26,7 +26,13 @@ MEANS = (
     "collided",
 )
 DESCRIBED = ("leader_speed_mps", "leader_path_energy_kj")  # of a window
-HUES = {"network": "#0072b2", "idm": "#d55e00", "idm_gradient": "#cc79a7", "acc": "#009e73"}
+HUES = {
+    "network": "#0072b2",
+    "memory": "#56b4e9",
+    "preview": "#009e73",
+    "idm": "#d55e00",
+    "idm_gradient": "#cc79a7",
+}
 LINES = {"alcc": "-", "own_energy": "--", "reference": ":"}
 
 
