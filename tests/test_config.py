@@ -200,7 +200,7 @@ OFFERED = {"profiles", "population", "time_step", "horizon", "string", "nominal"
 OFFERED |= {"observation_size", "action_size", "seed", "settings", "device", "observation"}
 OFFERED |= {"max_acceleration"}
 # Arguments that name entries, and those that only some files choose to give.
-OPTIONAL = {"reads", "widths", "relative_to", "visible", "vehicles", "acceleration", "power"}
+OPTIONAL = {"raw", "reads", "widths", "relative_to", "visible", "vehicles", "acceleration", "power"}
 
 
 def test_every_setting_of_a_constructor_is_in_its_file() -> None:

@@ -80,6 +80,28 @@ def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> N
     assert set(rows["strategy"]) == {*UNTRAINED, "alcc"}
 
 
+def test_the_best_policy_is_that_of_the_run_and_the_last_one_is_kept(trained, tmp_path) -> None:
+    assert not (trained / "policy_last.pt").exists()
+    # Early weights are better than what this learning rate makes of them.
+    words = ("variant=alcc", "agent.best_window=8", "agent.actor_lr=0.1", "training.keep_every=1")
+    rows = training.run(tiny("train", *words), tmp_path, quiet=True)
+    best = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["memory"]["best"]
+    kept = {name: load_policy(path)[0] for name, path in policies(tmp_path).items()}
+    expected = kept[best["iteration"]]
+    assert best["iteration"] < max(kept)
+    for name, chosen in (("policy.pt", expected), ("policy_last.pt", kept[max(kept)])):
+        found, _ = load_policy(tmp_path / name)
+        assert all(torch.equal(found[key], chosen[key]) for key in chosen), name
+    cfg = tiny("evaluate", "variant=alcc", f"policy={tmp_path}", agent=False)
+    again = evaluation.run(cfg, tmp_path / "evaluation", quiet=True)
+    own = again[again["strategy"] == "alcc"].reset_index(drop=True)
+    assert own["total_energy_kj"].tolist() == rows["total_energy_kj"].tolist()
+
+
+def policies(folder: Path) -> dict[int, Path]:
+    return {int(path.stem): path for path in (folder / "policies").iterdir()}
+
+
 def test_what_is_kept_is_no_part_of_a_run_and_a_given_policy_is() -> None:
     assert identity(load("train", ["training.keep_every=5"])) == identity(load("train"))
     given = [load("train", ["variant=hcfs", f"policy={name}"]) for name in "ab"]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import DDPGLoss
+from torchrl.objectives import DDPGLoss, HardUpdate
 
 from lcc_rl.agents.fused import FusedUpdate
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings, leaves
+from lcc_rl.errors import ConfigError, require_whole
 
 
 @dataclass(frozen=True)
@@ -21,9 +24,26 @@ class DDPGSettings(OffPolicySettings):
         fused: compute the update with its gradient written out, which gives the numbers of
             TorchRL's ``DDPGLoss`` up to rounding at up to twice the speed; False uses the loss
             itself.
+        target_every: updates between two steps of each target network towards its own; with
+            ``tau`` 1 a step is a copy.
+        mask_terminal: no value is expected after a collision; False expects one there, too.
+
+    Raises:
+        ConfigError: if a setting is out of range or contradicts another.
     """
 
     fused: bool = True
+    target_every: Mapping[str, int] = field(default_factory=lambda: {"actor": 1, "critic": 1})
+    mask_terminal: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if set(self.target_every) != {"actor", "critic"}:
+            raise ConfigError(
+                "agent.target_every must have the entries actor and critic, got "
+                f"{', '.join(self.target_every) or 'none'}"
+            )
+        require_whole("agent.target_every", 1, **self.target_every)
 
 
 class DDPG(OffPolicy):
@@ -48,6 +68,8 @@ class DDPG(OffPolicy):
         loss = DDPGLoss(
             self.policy, self.values[0], loss_function="l2", delay_actor=True, delay_value=True
         )
+        # TorchRL asks for an updater; _follow does its work, for each network in its own time.
+        HardUpdate(loss)
         self._complete(loss, "value_network_params")
         self.fused: FusedUpdate | None = None
         if self.settings.fused:
@@ -61,13 +83,27 @@ class DDPG(OffPolicy):
             self.optimizers = {"both": self.fused.optimizer}
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        self.count += 1
+        if not self.settings.mask_terminal:
+            batch = batch.clone(False)
+            ended = batch["next", "terminated"]
+            batch["next", "terminated"] = torch.zeros_like(ended)
+        every = self.settings.target_every
+        due = (self.count % every["actor"] == 0, self.count % every["critic"] == 0)
         if self.fused is not None:
-            loss_actor, loss_value = self.fused(batch)
+            loss_actor, loss_value = self.fused(batch, due)
             return {"loss_actor": loss_actor, "loss_value": loss_value}
         losses = self.loss(batch)
         # Only these two: the other entries of TorchRL's result are not losses, and one of them
         # still carries a gradient.
         (losses["loss_actor"] + losses["loss_value"] + self._penalty(batch)).backward()
         self._step("actor", "value")
-        self.targets.step()
+        self._follow(due)
         return {key: losses[key].detach() for key in ("loss_actor", "loss_value")}
+
+    def _follow(self, due: tuple[bool, bool]) -> None:
+        """Move the target networks of actor and critic that are due, as ``SoftUpdate`` does."""
+        for name, now in zip(("actor_network_params", "value_network_params"), due, strict=True):
+            if now:
+                target = getattr(self.loss, f"target_{name}").data
+                target.lerp_(getattr(self.loss, name).data, self.settings.tau)

@@ -80,7 +80,7 @@ def backward(network: Layers, inputs: list[Tensor], slope: Tensor, into: Layers 
 
 
 class FusedUpdate:
-    """One gradient step of DDPG on actor and critic, and one soft step of their targets.
+    """One gradient step of DDPG on actor and critic, and one soft step of the targets due.
 
     Takes the parameters over: they become views of one vector per network.
 
@@ -115,11 +115,12 @@ class FusedUpdate:
         )
 
     @torch.no_grad()
-    def __call__(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def __call__(self, batch: TensorDictBase, due: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
         """Take the step.
 
         Args:
             batch: transitions ``[batch, …]``, as of :meth:`lcc_rl.agents.DDPG.update`.
+            due: whether the target networks of actor and critic take a step.
 
         Returns:
             The losses of actor and critic.
@@ -128,8 +129,9 @@ class FusedUpdate:
         loss_value = self._critic(batch, observation)
         loss_actor = self._actor(observation)
         self.optimizer.step()
-        for target, vector in zip(self.following, self.online, strict=True):
-            target.lerp_(vector, self.tau)
+        for target, vector, now in zip(self.following, self.online, due, strict=True):
+            if now:
+                target.lerp_(vector, self.tau)
         return loss_actor, loss_value
 
     def _critic(self, batch: TensorDictBase, observation: Tensor) -> Tensor:

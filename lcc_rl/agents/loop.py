@@ -125,6 +125,8 @@ class TrainingLoop(ABC, Generic[AgentT]):
         self.iterations = settings.episodes // settings.environments
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
+        # Score, iteration and weights of the best policy, where a subclass keeps one.
+        self.best: dict[str, Any] | None = None
         self.times: list[dict[str, float]] = []
         # Told every row (lcc_rl.runs.loggers), and every iteration whose policy is to be kept.
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None

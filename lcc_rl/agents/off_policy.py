@@ -13,39 +13,50 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
-from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
 from lcc_rl.agents.loop import anneal, check_fraction, derived_seed
-from lcc_rl.errors import ConfigError, require_in, require_positive, unknown_name
+from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole, unknown_name
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.policies.actor import make_actor, seeded_mlp
 
 
 @dataclass(frozen=True)
 class Exploration:
-    """Schedule of the exploration noise, falling linearly during training.
+    """Schedule of the exploration noise: falls linearly, or by a factor at every update.
 
     Args:
-        initial: standard deviation at the first episode.
+        initial: standard deviation at the first episode, where the action's range is [-1, 1].
         final: after the decay.
-        decay_share: share of the training over which it falls.
+        decay_share: share of the training over which it falls linearly; None: see next.
+        decay_per_update: factor of every update, down to ``final``; None: falls linearly.
 
     Raises:
-        ConfigError: if a value is out of range.
+        ConfigError: if a value is out of range, or both or neither decay is given.
     """
 
     initial: float = 0.4
     final: float = 0.05
-    decay_share: float = 0.5
+    decay_share: float | None = 0.5
+    decay_per_update: float | None = None
 
     def __post_init__(self) -> None:
         where = "agent.exploration"
         require_in(where, "[0, inf)", initial=self.initial, final=self.final)
-        require_in(where, "(0, 1]", decay_share=self.decay_share)
+        if (self.decay_share is None) == (self.decay_per_update is None):
+            raise ConfigError(
+                f"{where}: give either decay_share or decay_per_update, and null for the other"
+            )
+        if self.decay_share is not None:
+            require_in(where, "(0, 1]", decay_share=self.decay_share)
+        if self.decay_per_update is not None:
+            require_in(where, "(0, 1]", decay_per_update=self.decay_per_update)
 
-    def sigma(self, share: float) -> float:
-        """Return the standard deviation after this share of the training."""
+    def sigma(self, share: float, updates: int = 0) -> float:
+        """Return the standard deviation after this share of the training and these updates."""
+        if self.decay_per_update is not None:
+            return max(self.final, self.initial * self.decay_per_update**updates)
+        assert self.decay_share is not None
         return self.initial + (self.final - self.initial) * min(share / self.decay_share, 1.0)
 
 
@@ -67,6 +78,9 @@ class OffPolicySettings:
         final_lr_fraction: of the learning rates at the end; they fall to it along half a cosine.
             1 is the literal algorithm, whose policy keeps swinging until it stops.
         updates_per_transition: updates per collected transition.
+        learning_starts: transitions in the buffer before the first update; at least one batch.
+        best_window: episodes whose mean reward rates the policy; the best one becomes the run's.
+            None: the last one does.
         exploration: schedule of the exploration, see :class:`Exploration`.
 
     Raises:
@@ -83,8 +97,15 @@ class OffPolicySettings:
     saturation: float = 0.001
     final_lr_fraction: float = 0.05
     updates_per_transition: float = 0.125
-    exploration: Mapping[str, float] = field(
-        default_factory=lambda: {"initial": 0.4, "final": 0.05, "decay_share": 0.5}
+    learning_starts: int = 0
+    best_window: int | None = None
+    exploration: Mapping[str, float | None] = field(
+        default_factory=lambda: {
+            "initial": 0.4,
+            "final": 0.05,
+            "decay_share": 0.5,
+            "decay_per_update": None,
+        }
     )
 
     def __post_init__(self) -> None:
@@ -99,6 +120,13 @@ class OffPolicySettings:
         check_fraction(self.final_lr_fraction)
         # Far more updates than that would be a training without end.
         require_in("agent", "(0, 1000]", updates_per_transition=self.updates_per_transition)
+        if not 0 <= self.learning_starts <= self.buffer_size:
+            raise ConfigError(
+                f"agent.learning_starts ({self.learning_starts}) must be between 0 and "
+                f"agent.buffer_size ({self.buffer_size}), or nothing is ever learned"
+            )
+        if self.best_window is not None:
+            require_whole("agent", 1, best_window=self.best_window)
         require_positive("agent", actor_lr=self.actor_lr, critic_lr=self.critic_lr)
         known = [item.name for item in fields(Exploration)]
         for key in self.exploration:
@@ -165,10 +193,9 @@ class OffPolicy(ABC):
         """
 
     def _complete(self, loss: LossModule, critic: str) -> None:
-        """Set discount, targets and optimizers of a loss with an actor and Q networks."""
+        """Set discount and optimizers of a loss with an actor and Q networks."""
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.settings.gamma)
-        self.targets = SoftUpdate(self.loss, tau=self.settings.tau)
         networks = {"actor": loss.actor_network_params, "value": getattr(loss, critic)}
         rates = {"actor": self.settings.actor_lr, "value": self.settings.critic_lr}
         self.optimizers = {

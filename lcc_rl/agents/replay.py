@@ -15,7 +15,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.agents.sizes import COPIES, Footprint
+from lcc_rl.agents.sizes import COPIES, Footprint, check_window
 from lcc_rl.config import require
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import pieces_of
@@ -60,6 +60,7 @@ class Trainer(TrainingLoop[OffPolicy]):
         )
 
     def _source(self) -> BaseCollector:
+        check_window(self.agent.settings.best_window, self.settings)
         return self._collector(self.settings.segment, self._compiled())
 
     def _collector(self, steps: int, compiled: bool) -> BaseCollector:
@@ -98,9 +99,9 @@ class Trainer(TrainingLoop[OffPolicy]):
 
     def _iterate(self, collector: BaseCollector) -> dict[str, float]:
         """Play one batch of episodes, learning after every segment of them."""
-        sigma = self.agent.exploration.sigma(self.iteration / self.iterations)
-        self.exploration.sigma.fill_(sigma)
-        rate = self.agent.anneal(self.iteration / self.iterations)
+        share = self.iteration / self.iterations
+        sigma = self.agent.exploration.sigma(share, self.updates)
+        rate = self.agent.anneal(share)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         self.sampler.manual_seed(derived_seed(self.seed, self.iteration, "replay"))
         collector.reset()
@@ -108,6 +109,7 @@ class Trainer(TrainingLoop[OffPolicy]):
         played, losses, spent = [], [], [0.0, 0.0]
         for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
+            self.exploration.sigma.fill_(self.agent.exploration.sigma(share, self.updates))
             batch = self._collect(collector, segments, part * self.settings.segment)
             new = transitions(batch)
             self.buffer.extend(new)
@@ -132,7 +134,20 @@ class Trainer(TrainingLoop[OffPolicy]):
             **{name: sum(loss[name] for loss in losses) / len(losses) for name in losses[0]},
         }
         self._record(row, *spent)
+        self._keep_best()
         return row
+
+    def _keep_best(self) -> None:
+        """Keep the policy if no window of episodes since learning began had a higher reward."""
+        window = (self.agent.settings.best_window or 0) // self.settings.environments
+        recent = self.rows[-window:]
+        if not window or len(recent) < window or not recent[0]["updates"]:
+            return
+        score = sum(row["episode_reward"] for row in recent) / window
+        if self.best is None or score > self.best["score"]:
+            state = self.agent.policy.state_dict()
+            weights = {name: value.clone() for name, value in state.items()}
+            self.best = {"score": score, "iteration": self.iteration, "weights": weights}
 
     def _collect(
         self, collector: BaseCollector, segments: Iterator[TensorDictBase], begun: int
@@ -155,7 +170,7 @@ class Trainer(TrainingLoop[OffPolicy]):
         """Take the updates that are due after ``new`` transitions on top of those ``before``."""
         settings = self.agent.settings
         ratio = settings.updates_per_transition
-        ready = len(self.buffer) >= settings.batch_size
+        ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
         count = int((before + new) * ratio) - int(before * ratio) if ready else 0
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
         for _ in range(count):
@@ -165,9 +180,10 @@ class Trainer(TrainingLoop[OffPolicy]):
         return {name: float(total) / max(count, 1) for name, total in sums.items()}
 
     def _memory(self) -> dict[str, Any]:
-        return {"buffer": self.buffer.state_dict()}
+        return {"buffer": self.buffer.state_dict(), "best": self.best}
 
     def _remember(self, memory: dict[str, Any]) -> None:
+        self.best = memory["best"]
         self.buffer.load_state_dict(memory["buffer"])
         self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
 

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
-from torchrl.objectives import SACLoss
+from torchrl.objectives import SACLoss, SoftUpdate
 
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
 from lcc_rl.errors import require_in, require_positive
@@ -78,8 +78,13 @@ class SACSettings(OffPolicySettings):
         ConfigError: if a setting is out of range or contradicts another.
     """
 
-    exploration: Mapping[str, float] = field(
-        default_factory=lambda: {"initial": 1.0, "final": 1.0, "decay_share": 1.0}
+    exploration: Mapping[str, float | None] = field(
+        default_factory=lambda: {
+            "initial": 1.0,
+            "final": 1.0,
+            "decay_share": 1.0,
+            "decay_per_update": None,
+        }
     )
     alpha_init: float = 0.1
     alpha_lr: float = 1e-3
@@ -132,6 +137,7 @@ class SAC(OffPolicy):
             delay_qvalue=True,
         ).to(device)
         self._complete(loss, "qvalue_network_params")
+        self.targets = SoftUpdate(loss, tau=self.settings.tau)
         self.optimizers["alpha"] = torch.optim.Adam([self.loss.log_alpha], lr=own.alpha_lr)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:

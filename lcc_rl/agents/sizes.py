@@ -66,6 +66,19 @@ def check_length(settings: TrainingConfig, horizon: int) -> None:
     )
 
 
+def check_window(window: int | None, settings: TrainingConfig) -> None:
+    """Check agent.best_window, the episodes whose mean reward rates a policy.
+
+    Raises:
+        ConfigError: if it is not a whole number of batches of episodes of the training.
+    """
+    require(
+        window is None or (window % settings.environments == 0 and window <= settings.episodes),
+        f"agent.best_window ({window}) must be a multiple of training.environments "
+        f"({settings.environments}) and at most training.episodes ({settings.episodes})",
+    )
+
+
 def nbytes(entries: Any) -> int:
     """Return the bytes of tensors."""
     return sum(entry.numel() * entry.element_size() for entry in entries)

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss
 
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
 from lcc_rl.errors import require_in, require_whole
@@ -69,6 +69,7 @@ class TD3(OffPolicy):
             delay_qvalue=True,
         )
         self._complete(loss, "qvalue_network_params")
+        self.targets = SoftUpdate(loss, tau=self.settings.tau)
         self.last_actor = torch.zeros(())
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
-from lcc_rl.agents.sizes import check_length
+from lcc_rl.agents.sizes import check_length, check_window
 from lcc_rl.config import CALLED, build_as, load, require
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
@@ -69,6 +69,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     if learns(cfg):
         agent = build_agent(cfg, population, cfg.device)
         check_length(cfg.training, horizon)
+        check_window(cfg.agent.get("best_window"), cfg.training)
         trial.training.environments, trial.training.episodes = 2, 2
         footprint = make_trainer(trial, agent, profiles, population, folder).footprint()
         require_memory(footprint.needs(cfg.training, horizon), cfg.device)

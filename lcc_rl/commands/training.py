@@ -37,7 +37,7 @@ from lcc_rl.runs.states import working
 
 log = logging.getLogger("lcc_rl")
 
-POLICIES, POLICY, CHECKPOINT = "policies", "policy.pt", "checkpoint.pt"
+POLICIES, POLICY, LAST, CHECKPOINT = "policies", "policy.pt", "policy_last.pt", "checkpoint.pt"
 RECORD, IDENTITY = "training.parquet", "lcc_rl.config"
 
 
@@ -48,7 +48,8 @@ def run(
 
     Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
     and, last, episodes.parquet; the first four after config.yaml only where something is learned,
-    and policies/<iteration>.pt where training.keep_every says so.
+    policies/<iteration>.pt where training.keep_every says so, and policy_last.pt where
+    agent.best_window makes policy.pt another one.
 
     Args:
         cfg: configuration of the entry point ``train``; with ``resume`` in it the run in that
@@ -139,7 +140,7 @@ def _given(cfg: DictConfig, inputs: Inputs, folder: Path) -> Strategy:
 
 
 def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
-    """Train an agent to the end and write its policy."""
+    """Train an agent to the end, write its policy and leave the agent with it."""
     trainer = make_trainer(cfg, agent, inputs.to_learn_from(), inputs.population, folder)
     if resume:
         trainer.load()
@@ -147,6 +148,10 @@ def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: 
     trainer.on_keep = partial(keep_policy, agent, cfg, folder)
     with build_logger(cfg).opened(folder) as trainer.on_row:
         trainer.run()
+    if trainer.best is not None:
+        save_policy(agent.policy.state_dict(), cfg, folder / LAST)
+        agent.policy.load_state_dict(trainer.best["weights"])
+        log.info("the policy is that of iteration %s of the training", trainer.best["iteration"])
     save_policy(agent.policy.state_dict(), cfg, folder / POLICY)
 
 

@@ -33,6 +33,7 @@ class Observation(Feature):
         relative_to: for views whose entries are seen as differences, from what, dotted:
             ``{"preview": "ahead.speed"}``, or one for each of as many equal parts; None: as they
             are. What matters is then not hidden in a small difference of large numbers.
+        raw: take every entry times 1, in SI units, whatever its scale.
         string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
@@ -48,6 +49,7 @@ class Observation(Feature):
         visible: int = 1,
         widths: Mapping[str, int | Sequence[float]] | None = None,
         relative_to: Mapping[str, str | Sequence[str] | None] | None = None,
+        raw: bool = False,
         string: VehicleString | None = None,
     ) -> None:
         string = VehicleString() if string is None else string
@@ -88,7 +90,7 @@ class Observation(Feature):
         }
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
-        self.register_buffer("constants", torch.tensor(values))
+        self.register_buffer("constants", torch.tensor([1.0] * len(values) if raw else values))
 
     def column(self, name: str) -> int:
         """Return the column of an entry, e.g. ``"self.gap"``.

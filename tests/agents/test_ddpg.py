@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
+from lcc_rl.errors import ConfigError
 
 
 def transitions(count: int, seed: int) -> TensorDict:
@@ -63,3 +64,58 @@ def test_a_restored_agent_goes_on_bit_for_bit() -> None:
         assert one == other
     state = second.loss.state_dict()
     assert all(torch.equal(value, state[key]) for key, value in first.loss.state_dict().items())
+
+
+def test_target_networks_move_only_at_multiples_and_are_copies_where_tau_is_one() -> None:
+    for fused in (True, False):
+        learner = agent(tau=1.0, target_every={"actor": 2, "critic": 3}, fused=fused)
+        loss = learner.loss
+        before = {}
+        for step in range(1, 7):
+            for name in ("actor", "value"):
+                before[name] = getattr(loss, f"target_{name}_network_params").clone()
+            learner.update(transitions(64, step))
+            for name, every in (("actor", 2), ("value", 3)):
+                online = getattr(loss, f"{name}_network_params")
+                target = getattr(loss, f"target_{name}_network_params")
+                expected = online if step % every == 0 else before[name]
+                assert (target.data == expected.data).all(), (fused, step, name)
+                assert step % every == 0 or not (target.data == online.data).all()
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_without_mask_a_value_is_expected_after_a_collision(fused: bool) -> None:
+    batch = transitions(64, 0)
+    alive = batch.clone()
+    alive["next", "terminated"] = torch.zeros_like(alive["next", "terminated"])
+
+    def value(mask: bool, given: TensorDict) -> torch.Tensor:
+        return agent(mask_terminal=mask, fused=fused).update(given)["loss_value"]
+
+    ends = batch["next", "terminated"].clone()
+    assert ends.any()
+    assert value(False, batch) == value(True, alive) != value(True, batch)
+    assert torch.equal(batch["next", "terminated"], ends)  # the caller's batch is left alone
+
+
+def test_a_restored_agent_keeps_count_of_its_target_steps() -> None:
+    settings = {"tau": 1.0, "target_every": {"actor": 3, "critic": 5}}
+    first, second = agent(**settings), agent(**settings)
+    for step in range(4):
+        first.update(transitions(64, step))
+    second.load_state_dict(deepcopy(first.state_dict()))
+    for step in range(4, 9):
+        assert first.update(transitions(64, step)) == second.update(transitions(64, step))
+
+
+@pytest.mark.parametrize(
+    ("every", "words"),
+    [
+        ({"actor": 1}, "entries actor and critic, got actor"),
+        ({"actor": 1, "critic": 0}, "critic"),
+        ({"actor": 1, "critc": 1}, "critc"),
+    ],
+)
+def test_target_every_is_checked(every: dict[str, int], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        agent(target_every=every)

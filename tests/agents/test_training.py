@@ -71,6 +71,91 @@ def test_resuming_equals_never_having_stopped(tmp_path) -> None:
     pd.testing.assert_frame_equal(stored, expected, check_exact=True)
 
 
+# Everything that the paper's learner as printed differs in, at the size of a test.
+LITERAL = (
+    "training.environments=1",
+    "training.segment=1",
+    "scenario.horizon=20",
+    "agent.updates_per_transition=1",
+    "agent.learning_starts=60",
+    "agent.tau=1",
+    "agent.target_every={actor: 3, critic: 5}",
+    "agent.mask_terminal=false",
+    "agent.best_window=4",
+    "agent.exploration={initial: 1, final: 0.1, decay_share: null, decay_per_update: 0.99}",
+)
+
+
+def test_learning_starts_and_noise_falls_with_every_update(tmp_path) -> None:
+    rows = make(tmp_path, *LITERAL).run()
+    assert rows["updates"].tolist() == [max(0, 20 * n - 59) for n in range(1, 21)]
+    done = [0, *rows["updates"].tolist()[:-1]]
+    expected = [max(0.1, 0.99**count) for count in done]
+    assert rows["exploration_sigma"].tolist() == pytest.approx(expected, rel=1e-12)
+    assert min(expected) == 0.1 < max(expected)
+
+
+def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
+    trainer = make(tmp_path, *LITERAL)
+    seen = {}
+    iterate = trainer._iterate
+
+    def watched(collector):
+        row = iterate(collector)
+        seen[trainer.iteration] = {
+            k: v.clone() for k, v in trainer.agent.policy.state_dict().items()
+        }
+        return row
+
+    trainer._iterate = watched
+    rows = trainer.run()
+    # Windows of four episodes that were played once learning had begun.
+    scores = rows["episode_reward"].rolling(4).mean()[rows["updates"].shift(3) > 0]
+    assert trainer.best["iteration"] == rows["iteration"][scores.idxmax()]
+    assert trainer.best["score"] == pytest.approx(scores.max())
+    best = seen[trainer.best["iteration"]]
+    assert all(torch.equal(value, best[key]) for key, value in trainer.best["weights"].items())
+
+
+def test_a_literal_training_resumes_bit_for_bit(tmp_path) -> None:
+    whole = make(tmp_path / "whole", *LITERAL)
+    expected = whole.run()
+    first = make(tmp_path / "parts", *LITERAL)
+    iterate = first._iterate
+
+    def dies(collector):
+        if first.iteration == 13:
+            raise MemoryError
+        return iterate(collector)
+
+    first._iterate = dies
+    with pytest.raises(MemoryError):
+        first.run()
+    second = make(tmp_path / "parts", *LITERAL)
+    second.load()
+    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
+    assert torch.equal(weights(second), weights(whole))
+    assert second.best["iteration"] == whole.best["iteration"]
+    kept = whole.best["weights"]
+    assert all(torch.equal(value, kept[key]) for key, value in second.best["weights"].items())
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("agent.best_window=6", "best_window .6. must be a multiple of training.environments"),
+        ("agent.best_window=24", "best_window .24."),
+        ("agent.best_window=0", "best_window"),
+        ("agent.learning_starts=201", "learning_starts .201. must be between 0 and"),
+        ("agent.exploration.decay_per_update=0.9", "either decay_share or decay_per_update"),
+        ("agent.exploration.decay_share=null", "either decay_share or decay_per_update"),
+    ],
+)
+def test_settings_of_the_literal_learner_are_checked(tmp_path, override, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make(tmp_path, override).run()
+
+
 def test_sigint_saves_and_says_how_to_go_on(tmp_path) -> None:
     expected = make(tmp_path / "whole").run()
     before = signal.getsignal(signal.SIGINT)

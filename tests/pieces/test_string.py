@@ -94,6 +94,14 @@ def test_a_ring_wraps() -> None:
     ]
 
 
+def test_a_raw_observation_is_in_si_units() -> None:
+    scales = {"self": {"speed": 0.1, "gap": 0.5}, "behind": {"speed": 0.1}}
+    pair = parse_string("automated human")
+    scaled, raw = (Observation(scales, raw=x, string=pair).constants for x in (False, True))
+    assert scaled.tolist() == pytest.approx([0.1, 0.5, 0.1])
+    assert raw.tolist() == [1.0, 1.0, 1.0]
+
+
 def test_an_entry_says_whether_somebody_is_behind_only_where_that_may_differ() -> None:
     scales = {"self": {"speed": 0.1}, "behind": {"speed": 0.1, "gap": 0.1}}
 

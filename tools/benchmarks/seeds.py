@@ -70,7 +70,7 @@ def check(device: str, data: TensorDictBase) -> None:
     alone, together = updates(device), Stacked(updates(device))
     together(data)
     for place, agent in enumerate(alone):
-        agent(data[place])
+        agent(data[place], (True, True))
         for own, stacked in zip(agent.online, together.online, strict=True):
             error = (own.detach() - stacked.detach()[place]).abs().max().item()
             if error > TOLERANCE:
