@@ -15,11 +15,10 @@ from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation import cases, episodes
+from lcc_rl.evaluation.naming import check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
     Strategy,
     baselines,
-    check_distinct,
-    named_apart,
     studied,
     trained,
 )

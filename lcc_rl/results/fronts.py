@@ -63,9 +63,10 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both at the same share of the time beyond the limit, or below it. The interval is a clustered bootstrap over
-    windows, which both meet, and training seeds, as of :func:`lcc_rl.results.intervals.saving`;
-    resamples in which a front does not reach the share are left out.
+    Both at the same share of the time beyond the limit, or below it. The interval is a clustered
+    bootstrap over windows, which both meet, and training seeds, as of
+    :func:`lcc_rl.results.intervals.saving`; resamples in which a front does not reach the share
+    are left out.
 
     Args:
         windows: see :func:`front`.
