@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import fuzz
 import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
@@ -74,13 +75,31 @@ def test_every_option_of_a_group_builds(group) -> None:
             node.source, node.split = (
                 files()[x] for x in ("data/stream.yaml", "split/single.yaml")
             )
+        if option == "mixture":
+            node.cycles = {**files()["leader/udds.yaml"]}
+            node.cycles.pop("defaults")
         given = {"time_step": 0.1, "observation_size": 7, "action_size": 1, "seed": 0}
         given["observation"] = build(load("train").observation, "observation")
         assert build(node, group, population=POPULATION, **given) is not None
 
 
-@pytest.mark.parametrize("variant", options("variant"))
-@pytest.mark.parametrize("experiment", options("experiment"))
+# Recipes that choose what learns serve those variants only in which it can.
+CHOOSING = {"limits": LEARNED, "limits_tuned": ("alcc", "reference", "own_energy")}
+RECIPES = [(e, v) for e in options("experiment") for v in options("variant")]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "variant"), [(e, v) for e, v in RECIPES if v not in CHOOSING.get(e, [v])]
+)
+def test_a_recipe_that_chooses_what_learns_is_refused_elsewhere(experiment, variant) -> None:
+    with pytest.raises(ConfigError) as caught:
+        fuzz.build_study((f"experiment={experiment}", f"variant={variant}", "scenario.horizon=20"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "variant"), [(e, v) for e, v in RECIPES if v in CHOOSING.get(e, [v])]
+)
 def test_every_recipe_serves_every_variant(experiment, variant) -> None:
     cfg = load("train", [f"experiment={experiment}", f"variant={variant}"])
     assert not learns(cfg) or build_agent(cfg, POPULATION).policy is not None
@@ -151,23 +170,35 @@ def as_lists(value: Any) -> Any:
 # A class that the files describe more than once has the defaults of its first use.
 EXCEPTIONS = {
     "agent/analytic.yaml": "nodes of pieces, of which a constructor has none",
+    "surrogates/limits.yaml.surrogates.cav_energy": "energy counts more beside the price of jerk",
     "surrogates/limits.yaml.surrogates.hdv_energy": "second use of PathEnergy",
     "surrogates/limits.yaml.surrogates.efficiency": "second use of SmoothEfficiency",
     "surrogates/prices.yaml.surrogates.hdv_energy": "second use of EnergyReward",
     "calibration/base.yaml": "which mode, and nodes, are the choice of a file",
     "calibration/base.yaml.global_genetic": "second use of GeneticSettings",
     "controller/idm.yaml": "one driver without noise; the class is that of drivers who differ",
+    "controller/acc.yaml": "tuned constants",
+    "controller/idm_acc.yaml": "tuned constants",
+    "controller/acc_filtered.yaml": "tuned constants",
+    "controller/idm_acc_filtered.yaml": "tuned constants",
+    "data/highway.yaml": "second use of StreamSource",
+    "data/highway.yaml.criteria": "second use of Criteria",
+    "data/highway.yaml.drivers": "second use of bootstrap",
+    "data/highway.yaml.leader": "second use of StopAndGo",
     "data/ngsim.yaml": "node of criteria, which are none by default",
     "data/stream.yaml": "nodes of leader and criteria; their own defaults are compared",
     "drivers/calibrated.yaml": "the path is asked for",
+    "drivers/highway.yaml": "second use of bootstrap",
     "drivers/i80.yaml": "the shipped table has both modes; null takes the same one",
     "drivers/kde.yaml": "as for i80",
     "leader/openacc.yaml": "the path is asked for; records are those of the file",
     "leader/paper.yaml": "the path is asked for; records are those of the file",
+    "leader/record.yaml": "second use of DriveLeaders",
     "leader/udds.yaml": "cases and records are those of the file",
     "reward/alcc.yaml.terms.hdv_energy": "second use of EnergyReward",
     "scenario/leading_cruise.yaml.pieces.predicted_power": "second use of MotorPower",
     "scenario/platoon.yaml.pieces.leader": "a platoon's leader; the first use is that of alcc",
+    "split/none.yaml": "second use of Split",
     "split/single_training.yaml": "node of another split",
     "split/vehicle.yaml": "second use of Split",
 }

@@ -13,7 +13,7 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.drawing import new_figure
 from lcc_rl.results.figures import style
-from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points, saving_at
+from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, energy_at, front, points, saving_at
 
 WINDOWS, EPISODES = "windows.parquet", "episodes.parquet"
 MEANS = (
@@ -66,14 +66,17 @@ def table_of_limits(folder: Path) -> pd.DataFrame:
 
 
 def comparisons(folder: Path, at: float) -> list[str]:
-    """Say what each kind of controller saves against each other at the same share of the time."""
+    """Say what each kind of controller saves against those that save less, at the same share."""
     windows = read_parquet(folder / WINDOWS)
     kinds = list(dict.fromkeys(windows[KINDS].itertuples(index=False, name=None)))
+    reached = {kind: [x.mean((1, 2)) for x in front(windows, kind)] for kind in kinds}
+    energy = {kind: energy_at(*means, at) for kind, means in reached.items()}
+    kinds = sorted((kind for kind in kinds if energy[kind] == energy[kind]), key=energy.__getitem__)
     lines = [f"path energy with too long a time gap for at most {at:.1%} of the time above 1 m/s:"]
     for one, other in combinations(kinds, 2):
         found = saving_at(windows, one, other, at)
         words = f"{' '.join(one)} against {' '.join(other)}"
-        lines.append(f"  {words}: {found.value:+.2%} ({found.low:+.2%} … {found.high:+.2%})")
+        lines.append(f"  {words}: {found.value:.2%} ({found.low:.2%} … {found.high:.2%})")
     return lines
 
 
