@@ -57,7 +57,6 @@ def fit(
     genetic: GeneticSettings | None = None,
     seed: int = 0,
     choose_constants: bool = False,
-    compiled: bool = False,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> Calibration:
@@ -71,7 +70,6 @@ def fit(
         genetic: settings of the genetic algorithm; defaults depend on the mode.
         seed: seed of all randomness; equal seeds give equal drivers.
         choose_constants: in local mode, first choose (a, b, s0) by the mean error of all drivers.
-        compiled: compile the simulation, see :class:`lcc_rl.drivers.speed_error.SpeedError`.
         device: where to simulate, in float32; the reported errors are evaluated in float64.
         progress: called as ``progress(generation, total, text)``.
 
@@ -86,7 +84,7 @@ def fit(
         raise ConfigError("choose_constants applies to local calibration only")
     limits, start = checked_bounds(bounds), constants or IDMConstants()
     observed = episodes if isinstance(episodes, Observed) else observe(episodes)
-    search = _Search(observed.to(device, torch.float32), limits, seed, compiled, progress)
+    search = _Search(observed.to(device, torch.float32), limits, seed, progress)
     return search.run(observed, mode, start, genetic or DEFAULT_GENETIC[mode], choose_constants)
 
 
@@ -98,14 +96,12 @@ class _Search:
         observed: the episodes, on the device and in the precision of the simulation.
         limits: bounds of every parameter.
         seed: seed of every search.
-        compiled: compile the simulation.
         progress: see :func:`fit`.
     """
 
     observed: Observed
     limits: Limits
     seed: int
-    compiled: bool
     progress: Progress | None
 
     def run(
@@ -125,7 +121,7 @@ class _Search:
                 f"b {constants.deceleration:.3g} m/s², s0 {constants.min_gap:.3g} m"
             )
         names = MODES[mode]
-        error = SpeedError(self.observed, constants, names, self.compiled)
+        error = SpeedError(self.observed, constants, names)
         lower, upper = self.box(names)
         found = minimise(error, lower, upper, exact.count, self.generator(), genetic, self.progress)
         drivers = _table(exact, found.best, constants, mode, self.limits)
@@ -147,7 +143,7 @@ class _Search:
             own = candidates[0].repeat_interleave(genes.shape[1], dim=0).unbind(-1)
             trial = constants.with_(**dict(zip(SHARED, own, strict=True)))
             side_by_side = genes.reshape(drivers, -1, genes.shape[-1])
-            found = SpeedError(self.observed, trial, MODES["local"], self.compiled)(side_by_side)
+            found = SpeedError(self.observed, trial, MODES["local"])(side_by_side)
             return found.reshape(genes.shape[:-1])
 
         lower, upper = self.box(MODES["local"])

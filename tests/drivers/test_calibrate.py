@@ -150,6 +150,7 @@ def test_command_writes_into_the_run_folder(source, command):
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
     assert "v0 on a bound" in done.stdout
+    assert done.stdout.count("drivers are simulated with ") >= 1
 
 
 @pytest.mark.parametrize(
