@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,6 +27,8 @@ from lcc_rl.drivers.parameters import (
 from lcc_rl.drivers.speed_error import SpeedError
 from lcc_rl.errors import ConfigError, DataError, unknown_name
 from lcc_rl.functional.idm import IDMConstants
+
+log = logging.getLogger("lcc_rl")
 
 DEFAULT_GENETIC = {
     "local": GeneticSettings(population=32, generations=20),
@@ -122,6 +125,7 @@ class _Search:
             )
         names = MODES[mode]
         error = SpeedError(self.observed, constants, names)
+        log.info("drivers are simulated with %s", error.simulator)
         lower, upper = self.box(names)
         found = minimise(error, lower, upper, exact.count, self.generator(), genetic, self.progress)
         drivers = _table(exact, found.best, constants, mode, self.limits)

@@ -105,9 +105,8 @@ def kernel_of(dtype: str) -> Kernel | None:
     try:
         import numba  # noqa: F401
     except ImportError as error:
-        log.info("drivers are simulated with torch, several times slower than numba: %s", error)
+        log.info("without numba, calibrations are several times slower: %s", error)
         return None
-    log.info("drivers are simulated with numba in %s", dtype)
     return Kernel(dtype)
 
 

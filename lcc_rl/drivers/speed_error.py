@@ -52,6 +52,11 @@ class SpeedError:
             simulate = self._by_tensors if self._kernel is None else self._by_kernel
             return (simulate(parameters) / self._norm).sqrt()
 
+    @property
+    def simulator(self) -> str:
+        """The package that simulates, ``numba`` or ``torch``."""
+        return "torch" if self._kernel is None else "numba"
+
     def _parameters(self, candidates: Tensor) -> tuple[Tensor, ...]:
         """Per candidate: 1/v0, T, a, 1/(2√(ab)), s0."""
         given = dict(zip(self.names, candidates.unbind(-1), strict=True))

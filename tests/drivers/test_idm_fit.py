@@ -85,6 +85,16 @@ def test_numba_and_torch_give_the_same_errors(numba, uneven_lengths, monkeypatch
             torch.testing.assert_close(by_numba, by_torch, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.parametrize("way", ["numba", "torch_only"])
+def test_the_log_says_which_package_simulates(way, request, uneven_lengths, caplog):
+    request.getfixturevalue(way)
+    for _ in range(2):
+        caplog.clear()
+        with caplog.at_level("INFO", logger="lcc_rl"):
+            fit(uneven_lengths, genetic=QUICK)
+        assert caplog.messages[-1] == f"drivers are simulated with {way.removesuffix('_only')}"
+
+
 def test_numba_and_torch_find_the_same_drivers(numba, known_episodes, monkeypatch):
     # The same draws; roundings may let another of two equally good individuals survive.
     found = {mode: fit(known_episodes, mode, seed=2).drivers for mode in MODES}
