@@ -43,11 +43,18 @@ RENAMED = (
     (r"agent\.(desired_speed|time_gap|lookahead|k[1-4])\b", rf"{AUTO}.\1"),
     (r"controller\.", "deployed."),
 )
+# Options that are gone, and why.
+REMOVED = (
+    (r"calibration\.compiled\b", "a calibration on a CPU is compiled wherever numba is installed"),
+)
 
 
 def renamed_option(overrides: Sequence[str]) -> ConfigError | None:
     """Return the error for an option of a former release, naming today's; None for none."""
     for item in overrides:
+        for old, reason in REMOVED:
+            if re.match(rf"[~+]*{old}", item):
+                return ConfigError(f"{item}: this option no longer exists: {reason}")
         for old, new in RENAMED:
             if re.match(rf"[~+]*{old}" if not old.startswith(r"\+") else old, item):
                 said = re.sub(rf"^[~+]*{old.lstrip(chr(92) + '+')}", new, item.lstrip("+~"))

@@ -165,6 +165,14 @@ def test_every_renamed_option_has_an_example() -> None:
     assert matched == [old for old, _ in RENAMED]
 
 
+@pytest.mark.parametrize("entry", ["calibrate", "pipeline"])
+def test_an_option_that_is_gone_says_why(entry) -> None:
+    with pytest.raises(
+        ConfigError, match=r"^calibration.compiled=true: .* no longer exists: .*numba"
+    ):
+        load(entry, ["calibration.compiled=true"])
+
+
 @pytest.mark.parametrize(("item", "new"), FORMER)
 def test_an_option_of_a_former_release_names_todays_in_one_line(item, new) -> None:
     with pytest.raises(ConfigError) as caught:

@@ -28,7 +28,6 @@ class Calibrator:
         local_genetic: genetic algorithm of the local mode.
         global_genetic: genetic algorithm of the global mode.
         choose_constants: first choose the local mode's constants over all drivers.
-        compiled: compile the simulation.
 
     Raises:
         ConfigError: if a mode is unknown, or named twice or not at all, or bounds are crossed.
@@ -41,7 +40,6 @@ class Calibrator:
     local_genetic: GeneticSettings = DEFAULT_GENETIC["local"]
     global_genetic: GeneticSettings = DEFAULT_GENETIC["global"]
     choose_constants: bool = False
-    compiled: bool = False
 
     def __post_init__(self) -> None:
         for mode in self.modes:
@@ -75,7 +73,6 @@ class Calibrator:
                 genetic[mode],
                 seed,
                 self.choose_constants and mode == "local",
-                self.compiled,
                 device,
                 progress,
             )

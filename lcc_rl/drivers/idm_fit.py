@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,6 +27,8 @@ from lcc_rl.drivers.parameters import (
 from lcc_rl.drivers.speed_error import SpeedError
 from lcc_rl.errors import ConfigError, DataError, unknown_name
 from lcc_rl.functional.idm import IDMConstants
+
+log = logging.getLogger("lcc_rl")
 
 DEFAULT_GENETIC = {
     "local": GeneticSettings(population=32, generations=20),
@@ -57,7 +60,6 @@ def fit(
     genetic: GeneticSettings | None = None,
     seed: int = 0,
     choose_constants: bool = False,
-    compiled: bool = False,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> Calibration:
@@ -71,7 +73,6 @@ def fit(
         genetic: settings of the genetic algorithm; defaults depend on the mode.
         seed: seed of all randomness; equal seeds give equal drivers.
         choose_constants: in local mode, first choose (a, b, s0) by the mean error of all drivers.
-        compiled: compile the simulation, see :class:`lcc_rl.drivers.speed_error.SpeedError`.
         device: where to simulate, in float32; the reported errors are evaluated in float64.
         progress: called as ``progress(generation, total, text)``.
 
@@ -86,7 +87,7 @@ def fit(
         raise ConfigError("choose_constants applies to local calibration only")
     limits, start = checked_bounds(bounds), constants or IDMConstants()
     observed = episodes if isinstance(episodes, Observed) else observe(episodes)
-    search = _Search(observed.to(device, torch.float32), limits, seed, compiled, progress)
+    search = _Search(observed.to(device, torch.float32), limits, seed, progress)
     return search.run(observed, mode, start, genetic or DEFAULT_GENETIC[mode], choose_constants)
 
 
@@ -98,14 +99,12 @@ class _Search:
         observed: the episodes, on the device and in the precision of the simulation.
         limits: bounds of every parameter.
         seed: seed of every search.
-        compiled: compile the simulation.
         progress: see :func:`fit`.
     """
 
     observed: Observed
     limits: Limits
     seed: int
-    compiled: bool
     progress: Progress | None
 
     def run(
@@ -125,7 +124,8 @@ class _Search:
                 f"b {constants.deceleration:.3g} m/s², s0 {constants.min_gap:.3g} m"
             )
         names = MODES[mode]
-        error = SpeedError(self.observed, constants, names, self.compiled)
+        error = SpeedError(self.observed, constants, names)
+        log.info("drivers are simulated with %s", error.simulator)
         lower, upper = self.box(names)
         found = minimise(error, lower, upper, exact.count, self.generator(), genetic, self.progress)
         drivers = _table(exact, found.best, constants, mode, self.limits)
@@ -147,7 +147,7 @@ class _Search:
             own = candidates[0].repeat_interleave(genes.shape[1], dim=0).unbind(-1)
             trial = constants.with_(**dict(zip(SHARED, own, strict=True)))
             side_by_side = genes.reshape(drivers, -1, genes.shape[-1])
-            found = SpeedError(self.observed, trial, MODES["local"], self.compiled)(side_by_side)
+            found = SpeedError(self.observed, trial, MODES["local"])(side_by_side)
             return found.reshape(genes.shape[:-1])
 
         lower, upper = self.box(MODES["local"])

@@ -71,19 +71,14 @@ class Observed:
         """Number of episodes."""
         return len(self.samples)
 
-    def segments(self, steps: int | None = None) -> Iterator[tuple[int, int, int]]:
+    def segments(self) -> Iterator[tuple[int, int, int]]:
         """Cut time where episodes end, so that none is simulated beyond its end.
-
-        Args:
-            steps: cut every so many steps instead; episodes may then end within a piece.
 
         Yields:
             First step, step after the last, number of episodes (a prefix) still running.
         """
-        last = int(self.samples[0]) - 1
-        ends = np.unique(self.samples) - 1 if steps is None else range(steps, last + steps, steps)
         start = 0
-        for stop in ends:
+        for stop in np.unique(self.samples) - 1:
             yield start, int(stop), int((self.samples - 1 > start).sum())
             start = int(stop)
 

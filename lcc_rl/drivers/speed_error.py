@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
+from lcc_rl.drivers.kernel import kernel_of
 from lcc_rl.drivers.observed import Observed
 from lcc_rl.drivers.parameters import COLUMNS, MODES
 from lcc_rl.functional.idm import IDMConstants, power
-
-CHUNK = 10  # steps of a compiled piece
 
 State = tuple[Tensor, Tensor, Tensor]
 
@@ -23,33 +21,26 @@ class SpeedError:
 
     A follower starts at its observed speed and gap and drives behind the observed leader. The
     trajectories are those of :func:`lcc_rl.functional.idm.simulate_follower`, but only the error
-    is kept, and no episode is simulated beyond its end.
+    is kept, and no episode is simulated beyond its end. On a CPU, the simulation is
+    :func:`lcc_rl.drivers.kernel.squared_errors` where numba is installed.
 
     Args:
         observed: the episodes; its device and dtype are those of the simulation.
         constants: parameters that are not among the candidates'.
         names: the candidates' parameters, in the order of the last dimension.
-        compiled: compile the simulation: about three times faster, after tens of seconds of
-            compilation, so worth it for thousands of drivers.
     """
 
     def __init__(
-        self,
-        observed: Observed,
-        constants: IDMConstants,
-        names: Sequence[str] = MODES["local"],
-        compiled: bool = False,
+        self, observed: Observed, constants: IDMConstants, names: Sequence[str] = MODES["local"]
     ) -> None:
-        self.constants, self.names = constants, tuple(names)
-        self.gap = observed.gap.unsqueeze(-1)
-        self.time_step = observed.time_step
-        self._run = _compiled_advance() if compiled else _advance
-        self._pieces = list(observed.segments(CHUNK if compiled else None))
-        spare = self._pieces[-1][1] + 1 - len(observed.leader_speed)
-        self._leader = pad(observed.leader_speed, (0, 0, 0, spare)).unsqueeze(-1)
-        self._follower = pad(observed.follower_speed, (0, 0, 0, spare)).unsqueeze(-1)
+        self.observed, self.constants, self.names = observed, constants, tuple(names)
         self._norm = observed.follower_speed.square().sum(0).unsqueeze(-1)
-        self._counts = self._weights(observed) if compiled else None
+        on_cpu = observed.gap.device.type == "cpu"
+        self._kernel = kernel_of(_name(observed.gap.dtype)) if on_cpu else None
+        if self._kernel is not None:
+            speeds = (observed.leader_speed, observed.follower_speed)
+            by_driver = [speed.T.contiguous().numpy() for speed in speeds]
+            self._episodes = (*by_driver, observed.gap.numpy(), np.array(observed.samples))
 
     def __call__(self, candidates: Tensor) -> Tensor:
         """Return RMSPE ``[drivers, candidates]`` (0.07 is 7 %) of ``[drivers, candidates, dims]``.
@@ -58,21 +49,13 @@ class SpeedError:
         """
         with torch.no_grad():
             parameters = self._parameters(candidates)
-            speed = self._follower[0].expand(candidates.shape[:-1]).contiguous()
-            gap = self.gap.expand_as(speed).contiguous()
-            total = torch.zeros_like(speed)
-            for start, stop, active in self._pieces:
-                window = slice(start, stop + 1)
-                speed, gap, part = self._run(
-                    (speed[:active], gap[:active], total[:active]),
-                    tuple(parameter[:active] for parameter in parameters),
-                    (self._leader[window, :active], self._follower[window, :active]),
-                    None if self._counts is None else self._counts[start:stop, :active],
-                    self.constants,
-                    self.time_step,
-                )
-                total[:active] = part
-            return (total / self._norm).sqrt()
+            simulate = self._by_tensors if self._kernel is None else self._by_kernel
+            return (simulate(parameters) / self._norm).sqrt()
+
+    @property
+    def simulator(self) -> str:
+        """The package that simulates, ``numba`` or ``torch``."""
+        return "torch" if self._kernel is None else "numba"
 
     def _parameters(self, candidates: Tensor) -> tuple[Tensor, ...]:
         """Per candidate: 1/v0, T, a, 1/(2√(ab)), s0."""
@@ -81,7 +64,7 @@ class SpeedError:
         values = [
             torch.as_tensor(
                 given.get(name, getattr(self.constants, name, None)),
-                dtype=candidates.dtype,
+                dtype=self.observed.gap.dtype,
                 device=candidates.device,
             )
             for name in COLUMNS
@@ -91,18 +74,54 @@ class SpeedError:
         ready = (desired_speed.reciprocal(), time_gap, acceleration, root.reciprocal(), min_gap)
         return tuple(value.expand(shape).contiguous() for value in ready)
 
-    def _weights(self, observed: Observed) -> Tensor:
-        """1 for the samples of an episode, 0 beyond its end; pieces of one length reach there."""
-        reached = torch.arange(1, len(self._leader), device=self.gap.device).unsqueeze(-1)
-        samples = torch.tensor(observed.samples.tolist(), device=self.gap.device)
-        return (reached < samples).to(self.gap.dtype).unsqueeze(-1)
+    def _by_tensors(self, parameters: tuple[Tensor, ...]) -> Tensor:
+        """Sums of squared errors, ``[drivers, candidates]``: all of them a step at a time."""
+        observed = self.observed
+        leader = observed.leader_speed.unsqueeze(-1)
+        follower = observed.follower_speed.unsqueeze(-1)
+        speed = follower[0].expand_as(parameters[0]).contiguous()
+        gap = observed.gap.unsqueeze(-1).expand_as(speed).contiguous()
+        total = torch.zeros_like(speed)
+        for start, stop, active in observed.segments():
+            window = slice(start, stop + 1)
+            speed, gap, part = _advance(
+                (speed[:active], gap[:active], total[:active]),
+                tuple(parameter[:active] for parameter in parameters),
+                (leader[window, :active], follower[window, :active]),
+                self.constants,
+                observed.time_step,
+            )
+            total[:active] = part
+        return total
+
+    def _by_kernel(self, parameters: tuple[Tensor, ...]) -> Tensor:
+        """The same: all steps of a driver at once."""
+        assert self._kernel is not None
+        constants, time_step = self.constants, self.observed.time_step
+        total = torch.empty_like(parameters[0])
+        settings = (
+            *(constants.gap_floor, constants.braking_limit, constants.acceleration_limit),
+            *(constants.exponent, time_step, 0.5 * time_step),
+            *(0.0, 1.0, 4.0),
+        )
+        self._kernel(
+            *self._episodes,
+            tuple(parameter.numpy() for parameter in parameters),
+            tuple(np.dtype(_name(total.dtype)).type(value) for value in settings),
+            total.numpy(),
+        )
+        return total
+
+
+def _name(dtype: torch.dtype) -> str:
+    """The name by which numpy knows a precision."""
+    return str(dtype).removeprefix("torch.")
 
 
 def _advance(
     state: State,
     parameters: tuple[Tensor, ...],
     speeds: tuple[Tensor, Tensor],
-    weights: Tensor | None,
     constants: IDMConstants,
     time_step: float,
 ) -> State:
@@ -127,13 +146,6 @@ def _advance(
         gap = torch.add(gap, ahead + ahead_reached, alpha=half)
         gap = gap.sub_(speed, alpha=half).sub_(reached, alpha=half)
         error = reached - observed[step + 1]
-        if weights is not None:
-            error = error * weights[step]
         total = torch.addcmul(total, error, error)
         speed = reached
     return speed, gap, total
-
-
-@lru_cache(maxsize=1)
-def _compiled_advance() -> Callable[..., State]:
-    return torch.compile(_advance, dynamic=True)

@@ -150,6 +150,8 @@ def test_command_writes_into_the_run_folder(source, command):
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
     assert "v0 on a bound" in done.stdout
+    (log,) = (source / "here").glob("*.log")
+    assert "drivers are simulated with " in log.read_text()
 
 
 @pytest.mark.parametrize(

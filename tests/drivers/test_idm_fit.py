@@ -20,6 +20,25 @@ from lcc_rl.functional.idm import IDMConstants, simulate_follower
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
 
 
+@pytest.fixture
+def numba():
+    """Calibrations simulate with numba."""
+    pytest.importorskip("numba")
+
+
+@pytest.fixture
+def torch_only(monkeypatch):
+    """Calibrations simulate with torch."""
+    monkeypatch.setattr(speed_error, "kernel_of", lambda name: None)
+
+
+def random_candidates(names, *shape):
+    """Parameters within the bounds, ``[*shape, names]``."""
+    low, high = torch.tensor([DEFAULT_BOUNDS[name] for name in names]).double().unbind(-1)
+    share = torch.rand(*shape, len(names), generator=torch.Generator().manual_seed(1)).double()
+    return low + share * (high - low)
+
+
 def reference_error(observed, candidates, constants, names):
     """The definition of A6, episode by episode, with the plain simulation."""
     result = torch.zeros(candidates.shape[:2], dtype=torch.float64)
@@ -41,30 +60,63 @@ def reference_error(observed, candidates, constants, names):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("pieces", ["exact", "padded"])
-def test_error_is_that_of_the_plain_simulation(mode, pieces, monkeypatch, uneven_lengths):
-    # The padded pieces are those of the compiled simulation, run here without the compiler.
-    monkeypatch.setattr(speed_error, "_compiled_advance", lambda: speed_error._advance)
-    observed = observe(uneven_lengths)
-    names = MODES[mode]
-    low = torch.tensor([DEFAULT_BOUNDS[name][0] for name in names]).double()
-    high = torch.tensor([DEFAULT_BOUNDS[name][1] for name in names]).double()
-    share = torch.rand(3, 6, len(names), generator=torch.Generator().manual_seed(1)).double()
-    candidates = low + share * (high - low)
-    error = SpeedError(observed, IDMConstants(), names, compiled=pieces == "padded")(candidates)
-    expected = reference_error(observed, candidates, IDMConstants(), names)
+@pytest.mark.parametrize("way", ["numba", "torch_only"])
+@pytest.mark.parametrize("exponent", [4.0, 2.5])
+def test_error_is_that_of_the_plain_simulation(mode, way, exponent, request, uneven_lengths):
+    request.getfixturevalue(way)
+    observed, names = observe(uneven_lengths), MODES[mode]
+    constants = IDMConstants(exponent=exponent)
+    candidates = random_candidates(names, 3, 6)
+    error = SpeedError(observed, constants, names)(candidates)
+    expected = reference_error(observed, candidates, constants, names)
     torch.testing.assert_close(error, expected, rtol=1e-9, atol=1e-12)
 
 
-# The compiler itself uses what its own package has deprecated.
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.slow
-def test_compiled_simulation_gives_the_same_errors(uneven_lengths):
-    observed = observe(uneven_lengths)
-    candidates = torch.tensor([[20.0, 1.0], [30.0, 1.7]]).double().expand(3, 2, 2)
-    plain = SpeedError(observed, IDMConstants())(candidates)
-    compiled = SpeedError(observed, IDMConstants(), compiled=True)(candidates)
-    torch.testing.assert_close(compiled, plain, rtol=1e-9, atol=1e-12)
+def test_numba_and_torch_give_the_same_errors(numba, uneven_lengths, monkeypatch):
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-4)):
+        observed = observe(uneven_lengths).to("cpu", dtype)
+        for names in MODES.values():
+            candidates = random_candidates(names, 3, 500)
+            by_numba = SpeedError(observed, IDMConstants(), names)(candidates.to(dtype))
+            with monkeypatch.context() as patch:
+                patch.setattr(speed_error, "kernel_of", lambda name: None)
+                by_torch = SpeedError(observed, IDMConstants(), names)(candidates.to(dtype))
+            assert by_numba.dtype == dtype
+            torch.testing.assert_close(by_numba, by_torch, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("way", ["numba", "torch_only"])
+def test_the_log_says_which_package_simulates(way, request, uneven_lengths, caplog):
+    request.getfixturevalue(way)
+    for _ in range(2):
+        caplog.clear()
+        with caplog.at_level("INFO", logger="lcc_rl"):
+            fit(uneven_lengths, genetic=QUICK)
+        assert caplog.messages[-1] == f"drivers are simulated with {way.removesuffix('_only')}"
+
+
+def test_numba_and_torch_find_the_same_drivers(numba, known_episodes, monkeypatch):
+    # The same draws; roundings may let another of two equally good individuals survive.
+    found = {mode: fit(known_episodes, mode, seed=2).drivers for mode in MODES}
+    monkeypatch.setattr(speed_error, "kernel_of", lambda name: None)
+    for mode, drivers in found.items():
+        expected = fit(known_episodes, mode, seed=2).drivers
+        columns = [COLUMNS[name] for name in ("desired_speed", "time_gap")]
+        off = (drivers[columns] / expected[columns] - 1.0).abs()
+        assert off.median().max() < (1e-3 if mode == "local" else 2e-2)
+        assert (drivers["rmspe"] - expected["rmspe"]).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("way", ["numba", "torch_only"])
+def test_what_is_no_number_stays_so_and_harms_no_other(way, request, uneven_lengths):
+    request.getfixturevalue(way)
+    candidates = random_candidates(MODES["global"], 3, 8)
+    for at in range(5):
+        candidates[1, at, at] = np.nan
+    error = SpeedError(observe(uneven_lengths), IDMConstants(), MODES["global"])(candidates)
+    assert error[1, :5].isnan().all()
+    assert error[1, 5:].isfinite().all()
+    assert error[[0, 2]].isfinite().all()
 
 
 def test_known_drivers_are_recovered(known_drivers, known_episodes):

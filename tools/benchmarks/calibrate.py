@@ -1,4 +1,4 @@
-"""Benchmark of the calibration, beside scipy driver by driver."""
+"""Benchmark of the calibration, beside scipy driver by driver and a search in numba."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ import pandas as pd
 from scipy.optimize import differential_evolution
 
 from benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
+from benchmarks.search import batched_search
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.drivers.idm_fit import fit
+from lcc_rl.drivers.idm_fit import DEFAULT_GENETIC, fit
 from lcc_rl.drivers.observed import Observed, observe
 from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants
 
 NAMES = ("desired_speed", "time_gap")
 IDENTITY = "episode"
-PYTHON, NUMBA = "scipy, scaled from few", "scipy and numba"
+OURS, PYTHON, NUMBA, SEARCH = "fit", "scipy, scaled from few", "scipy and numba", "numba search"
 
 
 def squared_error(
@@ -80,41 +81,45 @@ class Problem:
 
 
 def calibrate(options: Namespace) -> list[Row]:
-    """Seconds to fit (v0, T) of every driver, beside scipy driver by driver.
+    """Seconds to fit (v0, T) of every driver, beside scipy driver by driver and one numba search.
 
     scipy's differential evolution runs with its own defaults: with an objective that numba
     compiled (before the clock starts) for every driver, and with one in plain Python for a few,
-    scaled to all by the number of samples. Ours is the default search; the compiled one has
-    compiled in the untimed run before.
+    scaled to all by the number of samples. The numba search has our algorithm and as many
+    evaluations, and is one compiled function. Ours is the default search, compiled in the untimed
+    run before.
     """
     source = EpisodesSource(options.episodes) if options.episodes else stream(options.quick)
     observed = observe(source.load().episodes)
     found: dict[str, Any] = {}
     few = np.linspace(0, observed.count - 1, 2 if options.quick else 6).round().astype(int)
     limit = {"maxiter": 2} if options.quick else {}
-    runs: dict[str, Run] = {"fit": partial(ours, found, "fit", observed, options, False)}
-    if options.compile:
-        runs["fit, compiled"] = partial(ours, found, "fit, compiled", observed, options, True)
+    runs: dict[str, Run] = {OURS: partial(ours, found, observed, options)}
     runs[PYTHON] = partial(scipy, found, PYTHON, [Problem(observed, int(i)) for i in few], limit)
     if installed("numba"):
         runs[NUMBA] = partial(scipy, found, NUMBA, numba_problems(observed), limit)
+        run = batched_search(observed, NAMES, DEFAULT_GENETIC["local"])
+        runs[SEARCH] = partial(searched, found, run)
     spent = alternate(runs, options.repeats)
     spent[PYTHON] = spent[PYTHON] * (observed.samples.sum() / observed.samples[few].sum())
-    check_objective(found["fit"], observed, few)
+    check_objective(found[OURS], observed, few)
     rows = rows_of("calibrate", spent, "s", PYTHON, observed.count)
-    if NUMBA in spent:
-        named = {name: value for name, value in spent.items() if name.startswith("fit")}
-        compared = rows_of("calibrate", {**named, NUMBA: spent[NUMBA]}, "s", NUMBA, observed.count)
-        rows += compared[: len(named)]
+    for other in (NUMBA, SEARCH):
+        if other in spent:
+            pair = {OURS: spent[OURS], other: spent[other]}
+            rows += rows_of("calibrate", pair, "s", other, observed.count)[:1]
     return rows + errors(found, few, observed.count)
 
 
-def ours(
-    found: dict[str, Any], name: str, observed: Observed, options: Namespace, compiled: bool
-) -> None:
+def ours(found: dict[str, Any], observed: Observed, options: Namespace) -> None:
     """Fit every driver at once."""
-    result = fit(observed, compiled=compiled, device=options.device)
-    found[name] = result.drivers.set_index(IDENTITY).loc[observed.identity[IDENTITY]]
+    result = fit(observed, device=options.device)
+    found[OURS] = result.drivers.set_index(IDENTITY).loc[observed.identity[IDENTITY]]
+
+
+def searched(found: dict[str, Any], run: Callable[[], Any]) -> None:
+    """Fit every driver in one function of numba."""
+    found[SEARCH] = run()
 
 
 def scipy(
@@ -152,11 +157,9 @@ def errors(found: dict[str, Any], few: np.ndarray, count: int) -> list[Row]:
     def mean(values: Any) -> np.ndarray:
         return np.array([100 * np.mean(values)])
 
-    fits = {name: each["rmspe"].to_numpy() for name, each in found.items() if "fit" in name}
-    some = {name: mean(values[few]) for name, values in fits.items()}
-    some[PYTHON] = mean(found[PYTHON])
+    fitted = found[OURS]["rmspe"].to_numpy()
+    some = {OURS: mean(fitted[few]), PYTHON: mean(found[PYTHON])}
     rows = rows_of("calibrate", some, "% RMSPE", PYTHON, len(few))
-    whole = {name: mean(values) for name, values in fits.items()}
-    if NUMBA in found:
-        whole[NUMBA] = mean(found[NUMBA])
+    whole = {OURS: mean(fitted)}
+    whole |= {name: mean(found[name]) for name in (NUMBA, SEARCH) if name in found}
     return rows + rows_of("calibrate", whole, "% RMSPE", NUMBA if NUMBA in found else None, count)

@@ -16,7 +16,7 @@ from rich.table import Table
 from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
-EXTRA = ("stable_baselines3", "gymnasium", "numba")  # of the optional extra "bench"
+EXTRA = ("stable_baselines3", "gymnasium", "numba")  # the alternatives
 Row = dict[str, Any]
 Run = Callable[[], Any]
 Values = Mapping[str, np.ndarray]
@@ -67,7 +67,7 @@ def stream(quick: bool) -> StreamSource:
 
 
 def installed(*names: str) -> bool:
-    """Whether all these packages of the extra ``bench`` are at hand."""
+    """Whether all these packages, of the extra ``bench`` or numba, are at hand."""
     try:
         return all(find_spec(name) is not None for name in names)
     except ModuleNotFoundError:  # of a package within one that is missing
