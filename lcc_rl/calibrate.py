@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from lcc_rl.commands.calibration import run
 from lcc_rl.runs.cli import entry_point, run_folder
 
 
-@entry_point("calibrate")
+@entry_point("calibrate", "lcc_rl.commands.calibration")
 def main(cfg: DictConfig) -> None:
     """Calibrate and write into the run's folder."""
+    from lcc_rl.commands.calibration import run  # loads torch
+
     run(cfg, run_folder())
 
 

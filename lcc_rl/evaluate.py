@@ -6,15 +6,16 @@ import logging
 
 from omegaconf import DictConfig
 
-from lcc_rl.commands.evaluation import run
 from lcc_rl.runs.cli import entry_point, run_folder
 
 log = logging.getLogger("lcc_rl")
 
 
-@entry_point("evaluate")
+@entry_point("evaluate", "lcc_rl.commands.evaluation")
 def main(cfg: DictConfig) -> None:
     """Evaluate into the run's folder."""
+    from lcc_rl.commands.evaluation import run  # loads torch
+
     folder = run_folder()
     run(cfg, folder)
     log.info("results in %s", folder)

@@ -8,18 +8,19 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.runs import check_folder, check_links, save_config
 from lcc_rl.runs.cli import entry_point, root_key, run_folder
 
 log = logging.getLogger("lcc_rl")
 
 
-@entry_point("pipeline")
+@entry_point("pipeline", "lcc_rl.commands.pipeline")
 def main(cfg: DictConfig) -> None:
     """Run everything into the run's folder, or complete the one given by ``resume``."""
+    from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides  # loads torch
+    from lcc_rl.results.runs import check_folder, check_links, save_config
+
     overrides = list(HydraConfig.get().overrides.task)
     folder = run_folder()
     if cfg.resume is not None:

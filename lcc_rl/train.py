@@ -8,7 +8,6 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from lcc_rl.commands.training import complete, objective, run
 from lcc_rl.config import is_sweep
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.cli import entry_point, root_key, run_folder
@@ -16,9 +15,11 @@ from lcc_rl.runs.cli import entry_point, root_key, run_folder
 log = logging.getLogger("lcc_rl")
 
 
-@entry_point("train")
+@entry_point("train", "lcc_rl.commands.training")
 def main(cfg: DictConfig) -> float | list[float]:
     """Train into the run's folder; return the objective to a sweeper that optimises."""
+    from lcc_rl.commands.training import complete, objective, run  # loads torch
+
     own = ("resume", "trust", "logger")
     typed = HydraConfig.get().overrides.task
     others = [item for item in typed if root_key(item) not in own]

@@ -18,8 +18,10 @@ from lcc_rl.config_checks import AUTO, RENAMED
 from lcc_rl.config_errors import check_keys
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io import files
-from lcc_rl.io.files import read_parquet, read_torch, write_parquet, write_torch
-from lcc_rl.results.runs import load_config, load_policy, save_policy
+from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.io.tensors import read_torch, write_torch
+from lcc_rl.results.policies import load_policy, save_policy
+from lcc_rl.results.runs import load_config
 from lcc_rl.results.trust import check_targets
 
 

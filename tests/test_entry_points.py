@@ -31,7 +31,8 @@ from lcc_rl.commands import evaluation, pipeline, training
 from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.runs import load_config, load_policy
+from lcc_rl.results.policies import load_policy
+from lcc_rl.results.runs import load_config
 from lcc_rl.runs.states import inspect_run
 
 

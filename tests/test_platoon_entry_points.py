@@ -20,7 +20,7 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.policies import shared_policy
 from lcc_rl.policies.actor import ACTION
-from lcc_rl.results.runs import load_policy
+from lcc_rl.results.policies import load_policy
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
 

@@ -39,10 +39,11 @@ from lcc_rl.evaluation.naming import check_distinct
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.runs import load_policy
+from lcc_rl.results.policies import load_policy
 from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
-from lcc_rl.runs.cli import main_guard, prepare_torch
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.studies.runner import check_overrides
 

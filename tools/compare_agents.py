@@ -43,8 +43,9 @@ from lcc_rl.evaluation.strategies import trained
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.policies.rules import NETWORK
 from lcc_rl.results.drawing import save
-from lcc_rl.results.runs import load_policy
-from lcc_rl.runs.cli import main_guard, prepare_torch
+from lcc_rl.results.policies import load_policy
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.sweeps import key_of
 from lcc_rl.studies.runner import FINISHED, Run, check_overrides, run_all
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from lcc_rl.errors import LccError
-from lcc_rl.io.files import write_torch
-from lcc_rl.results.runs import load_policy
+from lcc_rl.io.tensors import write_torch
+from lcc_rl.results.policies import load_policy
 
 LOCAL = ("data", "drivers", "split", "resume", "policy", "compare")
 FOLDER = Path(__file__).parents[1] / "lcc_rl" / "assets" / "pretrained"

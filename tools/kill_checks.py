@@ -9,8 +9,9 @@ import pandas as pd
 from matplotlib.image import imread
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.io.files import read_parquet, read_torch
+from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
+from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.runs import read_settings
 from lcc_rl.runs.states import LOCK, RESULTS, read_progress
 

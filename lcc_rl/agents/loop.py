@@ -24,7 +24,8 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.checks import check_learner
 from lcc_rl.agents.sizes import Footprint, check_length
 from lcc_rl.errors import Diverged, Interrupted, ResultsError, require_in
-from lcc_rl.io.files import read_torch, write_parquet, write_torch
+from lcc_rl.io.files import write_parquet
+from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.pieces.rewards import REWARD, TERMS
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter

@@ -27,7 +27,7 @@ from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 from lcc_rl.results.drawing import save
 from lcc_rl.results.report import MISSING
 from lcc_rl.results.runs import check_folder, save_config
-from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import claim
 
 

@@ -23,14 +23,13 @@ from lcc_rl.evaluation.strategies import (
     trained,
 )
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.figures import write_study_figures
-from lcc_rl.results.runs import PRETRAINED, check_folder, load_policy, save_config
+from lcc_rl.results.policies import PRETRAINED, load_policy
+from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.results.savings import by_source
-from lcc_rl.results.string_figures import write_platoon_figures
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
-from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import check_present, claim
 
 log = logging.getLogger("lcc_rl")
@@ -83,9 +82,17 @@ def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet:
-        draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
-        draw(folder)
+        _draw(cfg, folder)
     return rows
+
+
+def _draw(cfg: DictConfig, folder: Path) -> None:
+    # Here: a training, which draws nothing, need not load matplotlib.
+    from lcc_rl.results.figures import write_study_figures
+    from lcc_rl.results.string_figures import write_platoon_figures
+
+    draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
+    draw(folder)
 
 
 def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:

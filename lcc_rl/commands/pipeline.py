@@ -23,13 +23,14 @@ from lcc_rl.config import load, plain, require
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source
 from lcc_rl.errors import Interrupted, ResultsError
-from lcc_rl.io.files import atomic_path
+from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.drawing import save
 from lcc_rl.results.figures import learning_curve
 from lcc_rl.results.trust import check_targets
-from lcc_rl.runs.cli import prepare_torch, root_key
+from lcc_rl.runs.cli import root_key
 from lcc_rl.runs.interrupts import INTERRUPTED
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
 from lcc_rl.targets import forget_places

@@ -21,18 +21,12 @@ from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import parquet_metadata, read_parquet
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import (
-    check_folder,
-    check_links,
-    load_config,
-    load_policy,
-    save_config,
-    save_policy,
-)
+from lcc_rl.results.policies import load_policy, save_policy
+from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
-from lcc_rl.runs.cli import prepare_torch
 from lcc_rl.runs.loggers import Silent
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
 
 log = logging.getLogger("lcc_rl")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.units import FOOT
 from lcc_rl.errors import DataError
-from lcc_rl.io.files import atomic_path
+from lcc_rl.io.atomic import atomic_path
 
 # Columns of the samples beside the recording.
 NUMBERS = ["vehicle", "frame", "position_m", "lane", "length_m", "vehicle_class"]

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 import lcc_rl.assets
@@ -100,6 +99,8 @@ def resample(
     Returns:
         Speeds, ``[steps]``, float32 [m/s].
     """
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
     begin, end = time[0] if begin is None else begin, time[-1] if end is None else end
     steps = int(np.floor((end - begin) / time_step + 1e-6)) + 1
     grid = np.minimum(begin + time_step * np.arange(steps), time[-1])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from scipy.stats import gaussian_kde
 from torch import Tensor
 
 from lcc_rl.drivers.parameters import (
@@ -211,6 +210,8 @@ def kde(
     table = load_drivers(path, mode)
     names = [name for name, column in COLUMNS.items() if np.ptp(table[column].to_numpy()) > 0.0]
     values = table[[COLUMNS[name] for name in names]].to_numpy(np.float64).T
+    from scipy.stats import gaussian_kde  # here: it loads for a second
+
     try:
         density = gaussian_kde(values, bw_method=bandwidth)
     except (np.linalg.LinAlgError, ValueError) as error:

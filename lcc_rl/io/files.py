@@ -1,13 +1,11 @@
-"""Atomic writing and checked reading of parquet tables and tensors."""
+"""Atomic writing and checked reading of parquet tables."""
 
 from __future__ import annotations
 
-import os
 import platform
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
 from functools import cache, partial
+from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
 
@@ -15,68 +13,16 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-import torch
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.memory import require_memory
 from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
 # Changes of a table from one schema version to the next, by the older version.
 MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
-SUBFOLDERS = ("figures", "policies")  # of a run; other folders in it are runs of their own
 PROCESSOR = "lcc_rl.processor"  # in a table's metadata
-
-
-@contextmanager
-def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that replaces it only when the block succeeds.
-
-    Args:
-        path: the final path; its folder is made where it does not exist.
-        durable: flush to disk, so that the file survives a power cut.
-
-    Raises:
-        ResultsError: if the file cannot be written (disk full, folder read-only …); a former
-            file at ``path`` is kept and the temporary one removed.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        if durable:
-            with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
-        os.replace(temporary, path)
-        if durable:
-            _sync_folder(path.parent)
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written: {error}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush a rename in a folder to disk, where the system supports it."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of killed writers from a run's folder and its own subfolders.
-
-    Call it only while no writer is active.
-    """
-    for place in (folder, *(folder / name for name in SUBFOLDERS)):
-        for path in place.glob(".*.tmp"):
-            with suppress(OSError):
-                path.unlink()
 
 
 def write_parquet(
@@ -98,7 +44,7 @@ def write_parquet(
     own = {
         "lcc_rl.schema": SCHEMA_VERSION,
         "lcc_rl.version": __version__,
-        "lcc_rl.torch": torch.__version__,
+        "lcc_rl.torch": installed("torch"),
         PROCESSOR: processor(),
     }
     table = pa.Table.from_pandas(frame, preserve_index=False)
@@ -172,77 +118,3 @@ def parquet_metadata(path: str | Path) -> dict[str, str]:
     """
     raw = _read(path, pq.read_schema).metadata or {}
     return {key.decode(): value.decode() for key, value in raw.items() if key != b"pandas"}
-
-
-def write_torch(content: Any, path: str | Path) -> None:
-    """Write tensors atomically, in a form that loads with ``weights_only=True``.
-
-    Raises:
-        ResultsError: if the file cannot be written.
-    """
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        try:
-            torch.save(content, file)
-        except RuntimeError as error:
-            # Torch hides what went wrong with the file behind a fault of its own.
-            if isinstance(error.__context__, OSError):
-                raise error.__context__ from None
-            raise
-
-
-def read_torch(path: str | Path) -> Any:
-    """Read tensors without running code in the file.
-
-    Raises:
-        ResultsError: if the file is missing, damaged or holds anything but tensors and plain
-            containers.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-    try:
-        _check_sums(path)
-        content = torch.load(path, weights_only=True, map_location="cpu")
-        _check_sizes(content, path)
-    except ResultsError:
-        raise
-    except Exception as error:  # torch raises many kinds for damaged or malicious files
-        raise ResultsError(
-            f"{path}: not a readable weights file: damaged, or made by something else"
-        ) from error
-    return content
-
-
-def _check_sums(path: Path) -> None:
-    """Check every part of a weights file against its checksum, which torch does not.
-
-    Torch stores parts as they are. Compressed or overlapping ones could claim any size, and so
-    could the format of former releases of torch, which is no archive.
-    """
-    with zipfile.ZipFile(path) as archive:
-        parts = archive.infolist()
-        packed = any(part.compress_type != zipfile.ZIP_STORED for part in parts)
-        if packed or sum(part.file_size for part in parts) > path.stat().st_size:
-            raise ResultsError(f"{path}: not a readable weights file: claims to be larger than it")
-        damaged = archive.testzip()
-    if damaged is not None:
-        raise ResultsError(f"{path}: not a readable weights file: damaged at {Path(damaged).name}")
-
-
-def _check_sizes(content: Any, path: Path) -> None:
-    """Check that no tensor claims more than the file holds, and that all else is plain."""
-    limit, seen, left = path.stat().st_size, set(), [content]
-    while left:
-        value = left.pop()
-        if isinstance(value, torch.Tensor):
-            size = value.numel() * value.element_size()
-            if value.device.type != "cpu" or value.layout is not torch.strided:
-                raise ResultsError(f"{path}: a tensor is not dense")
-            if max(size, value.untyped_storage().nbytes()) > limit:
-                raise ResultsError(f"{path}: a tensor claims {size} bytes, the file has {limit}")
-        elif isinstance(value, (dict, list, tuple)):
-            if id(value) not in seen:  # some are named many times over
-                seen.add(id(value))
-                left += [*value.keys(), *value.values()] if isinstance(value, dict) else value
-        elif not isinstance(value, (str, int, float, bool, type(None), torch.device, torch.dtype)):
-            raise ResultsError(f"{path}: holds {type(value).__name__}; expected plain values")

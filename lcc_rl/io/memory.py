@@ -6,10 +6,12 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from lcc_rl.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
 
 PROCESS, MEMORY, GROUPS = Path("/proc/self/cgroup"), Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 # Of a control group: files of its limit and its use, and the line of memory.stat on file pages.
@@ -33,7 +35,7 @@ def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu
         return
     worst = max(needs, key=lambda name: needs[name])
     more = f" ({amount(total)} with the rest)" if needs[worst] <= free else ""
-    place = "this machine" if torch.device(device).type == "cpu" else f"device {device}"
+    place = "this machine" if str(device).startswith("cpu") else f"device {device}"
     raise ConfigError(
         f"{worst} needs about {amount(needs[worst])} of memory{more}; {place} has {amount(free)} "
         "free"
@@ -46,7 +48,9 @@ def available(device: torch.device | str = "cpu") -> int | None:
     On the CPU the least of what the system calls available and what the process's control groups
     leave (Linux); the physical memory where the system says no more (macOS).
     """
-    if torch.device(device).type == "cuda":
+    if str(device).startswith("cuda"):
+        import torch  # here: reading a table needs no torch
+
         return int(torch.cuda.mem_get_info(torch.device(device))[0])
     return min([*_of_system(), *_of_groups()], default=None)
 

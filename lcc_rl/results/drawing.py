@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lcc_rl.io.files import atomic_path
+from lcc_rl.io.atomic import atomic_path
 
 
 def new_figure(width: float, height: float) -> Figure:

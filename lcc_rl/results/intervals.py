@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import bootstrap
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
@@ -112,6 +111,8 @@ def band(curves: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
 def _bounds(
     samples: list[NDArray[np.float64]], statistic: object, resamples: int = RESAMPLES, axis: int = 0
 ) -> tuple[Any, Any]:
+    from scipy.stats import bootstrap  # here: it loads for a second
+
     found = bootstrap(
         samples,
         statistic,

@@ -18,7 +18,8 @@ import pandas as pd
 from PIL import Image  # comes with matplotlib
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.io.files import PROCESSOR, atomic_path, parquet_metadata
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import PROCESSOR, parquet_metadata
 
 UNITS = {"kj": "kJ", "pct": "%", "s": "s", "m": "m", "mps": "m/s", "mps3": "m/s³"}
 UNITS |= {"kj_per_km": "kJ/km", "ms": "ms"}

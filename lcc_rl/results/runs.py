@@ -1,34 +1,25 @@
-"""Files of a run folder: configuration, policy, and tables of many runs as one."""
+"""Files of a run folder: configuration, and tables of many runs as one."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.config import plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.io.files import atomic_path, read_parquet, read_torch, write_torch
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
 
 log = logging.getLogger("lcc_rl")
 
 CONFIG = "config.yaml"
-PRETRAINED = "pretrained"
-# Variants that build on the policy of another one.
-BUILDS_ON = {"hcfs": "ddpg"}
-# What evaluating a policy reads of the configuration of its training.
-POLICY_KEYS = (
-    *("agent", "observation", "scenario.controllers.automated", "scenario.pieces"),
-    "scenario.filters",
-)
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # What no command of other settings may replace: results, and what a stopped run resumes from.
 KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "overrides.json")
@@ -101,81 +92,6 @@ def read_settings(path: Path) -> dict[str, Any]:
         ResultsError: if it is damaged.
     """
     return parse_yaml(read_text(path), str(path))
-
-
-def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None:
-    """Write a policy's weights and, as text, the configuration of its training."""
-    write_torch({"weights": dict(weights), "config": OmegaConf.to_yaml(plain(cfg))}, path)
-
-
-def pretrained_path(variant: str) -> Path:
-    """Return the policy that ships with the package for a variant.
-
-    Raises:
-        ConfigError: if none does.
-    """
-    shipped = Path(str(files("lcc_rl.assets"))) / "pretrained"
-    path = shipped / f"{BUILDS_ON.get(variant, variant)}.pt"
-    if not path.is_file():
-        names = sorted(file.stem for file in shipped.glob("*.pt"))
-        raise ConfigError(
-            f"no pretrained policy ships for variant {variant}, only for {', '.join(names)}; "
-            f"python -m lcc_rl.train variant={variant} makes one"
-        )
-    return path
-
-
-def load_policy(
-    path: str | Path, variant: str = "", trust: Sequence[str] = ()
-) -> tuple[dict[str, Any], DictConfig]:
-    """Read a policy file without running code from it.
-
-    Args:
-        path: the file or a run folder; ``"pretrained"`` for the policy that ships for
-            ``variant``, ``"pretrained/reference"`` for that of another one.
-        variant: name of a variant.
-        trust: modules outside this package that it may name.
-
-    Returns:
-        The weights and the configuration.
-
-    Raises:
-        ConfigError: if no policy ships for the variant.
-        ResultsError: if it is missing, damaged or no policy.
-    """
-    path = Path(path)
-    if path.parts[:1] == (PRETRAINED,) and not path.exists():
-        path = pretrained_path(path.name if len(path.parts) > 1 else variant)
-    if path.is_dir():
-        path = path / "policy.pt"
-    content = read_torch(path)
-    if not isinstance(content, dict) or not {"weights", "config"} <= set(content):
-        raise ResultsError(f"{path}: not a policy: expected the entries weights and config")
-    weights = content["weights"]
-    check_weights(weights, path)
-    cfg, _ = trusted(parse_yaml(str(content["config"]), f"{path} (config)"), str(path), trust)
-    if not (isinstance(cfg.get("agent"), DictConfig) and isinstance(cfg.get("seed"), int)):
-        raise ResultsError(f"{path}: not the configuration of a training: it has no agent or seed")
-    for key in POLICY_KEYS:
-        if not isinstance(OmegaConf.select(cfg, key), DictConfig):
-            raise ResultsError(f"{path}: its configuration is damaged: {key} is missing")
-    return weights, cfg
-
-
-def check_weights(weights: Any, path: Path) -> None:
-    """Check that weights are finite numbers by name.
-
-    Raises:
-        ResultsError: naming the file and the entry at fault.
-    """
-    if not isinstance(weights, dict) or not weights:
-        raise ResultsError(f"{path}: weights are {type(weights).__name__}, expected named tensors")
-    for name, value in weights.items():
-        if not isinstance(name, str) or not isinstance(value, torch.Tensor):
-            kind = type(value).__name__
-            raise ResultsError(f"{path}: weight {name!r} is {kind}, expected a named tensor")
-        if not bool(torch.isfinite(value).all()):
-            raise ResultsError(f"{path}: weight {name!r} holds values that are no numbers")
 
 
 def load(

@@ -1,18 +1,20 @@
-"""Hydra entry points: errors in one line, exit codes, setup of torch."""
+"""Hydra entry points: errors in one line, exit codes."""
 
 from __future__ import annotations
 
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial, wraps
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import patch
 
 import hydra
-import torch
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -23,9 +25,14 @@ from lcc_rl.config import explained, is_sweep, leave_out_foreign
 from lcc_rl.config_checks import check_ignored
 from lcc_rl.config_errors import check_keys, refused_by_hydra
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
-from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible, was_interrupted
+from lcc_rl.runs.interrupts import (
+    BAD_INPUT,
+    INTERRUPTED,
+    ending_quietly,
+    interruptible,
+    was_interrupted,
+)
 from lcc_rl.runs.output import unbroken_output
-from lcc_rl.runs.precision import set_precision
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
 from lcc_rl.schemas import check_ranges
@@ -33,11 +40,13 @@ from lcc_rl.schemas import check_ranges
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
 INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
-DEVICES = ("cpu", "cuda")
+SWEEP = {"-m", "--multirun"}
 NO_BEST = "No trials are completed"  # message of Optuna
 
 
-def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+def entry_point(
+    config_name: str, work: str
+) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Decorate a function of a configuration as a Hydra command.
 
     An input error (option, file, row) is one line on stderr, exit code 2 and ``error.txt`` in the
@@ -46,6 +55,9 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
     Args:
         config_name: the entry point's configuration in ``lcc_rl.conf``, without suffix.
+        work: the module that does the work and loads torch. It is imported once the options are
+            accepted, of a sweep before Hydra reads them: ``--help`` and a refused option need
+            no torch. The function imports from it inside its body.
     """
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
@@ -56,6 +68,9 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             check_ignored(config, typed, is_sweep())
             check_ranges(config)
             leave_out_foreign(config, typed)
+            if not is_sweep():
+                with ending_quietly():
+                    import_module(work)
             return function(config)
 
         @wraps(function)
@@ -70,6 +85,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
         @wraps(function)
         def main() -> None:
+            if SWEEP.intersection(sys.argv):
+                import_module(work)
             start(command, config_name)
 
         return main
@@ -93,8 +110,24 @@ def start(command: Callable[[], Any], config_name: str) -> None:
 
 def run_sorted(command: Callable[[], Any]) -> None:
     """Run a Hydra command whose flags may stand anywhere among the settings."""
-    with patch.object(sys, "argv", [sys.argv[0], *flags_first(sys.argv[1:])]):
+    with patch.object(sys, "argv", [sys.argv[0], *flags_first(sys.argv[1:])]), listed_once():
         sweep(command)
+
+
+@contextmanager
+def listed_once() -> Iterator[None]:
+    """Let Hydra's help read all choices from one copy of its sources: it makes one per group."""
+    make, copies = ConfigLoaderImpl._parse_overrides_and_create_caching_repo, {}
+
+    def parsed(loader: ConfigLoaderImpl, config_name: str | None, overrides: list[str]) -> Any:
+        if config_name is not None or overrides:
+            return make(loader, config_name, overrides)
+        if loader not in copies:
+            copies[loader] = make(loader, None, [])
+        return copies[loader]
+
+    with patch.object(ConfigLoaderImpl, make.__name__, parsed):
+        yield
 
 
 def flags_first(words: Sequence[str]) -> list[str]:
@@ -226,26 +259,3 @@ def root_key(override: str) -> str:
 def run_folder() -> Path:
     """Return the folder that Hydra made for the present run or job."""
     return Path(HydraConfig.get().runtime.output_dir)
-
-
-def prepare_torch(cfg: DictConfig) -> torch.device:
-    """Check the numbers of a configuration and its device, set up torch and return the device.
-
-    Raises:
-        ConfigError: if a number is out of range or the device impossible on this machine.
-    """
-    check_ranges(cfg)
-    try:
-        device = torch.device(cfg.device)
-        torch.empty(0, device=device)
-    # Which error torch raises depends on how it was built.
-    except (RuntimeError, AssertionError, TypeError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise ConfigError(f"device {cfg.device!r} is not available: {reason}") from error
-    if device.type not in DEVICES:
-        raise ConfigError(f"device must be cpu, cuda or one such as cuda:0, got {cfg.device!r}")
-    torch.set_num_threads(cfg.threads)
-    set_precision(cfg.get("matmul_precision", "highest"))
-    # TorchRL logs every buffer it allocates.
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-    return device

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 # Exit codes.
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -16,18 +16,18 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Restore = Callable[[], None]
 
 
+def _end(*_: Any) -> NoReturn:
+    os.write(2, b"lcc_rl: interrupted\n")
+    # An exception could be swallowed by whatever is being imported.
+    os._exit(INTERRUPTED)
+
+
 def end_quietly() -> None:
     """Exit with one line instead of a traceback while a command is still importing."""
-
-    def end(number: int, frame: Any) -> None:
-        os.write(2, b"lcc_rl: interrupted\n")
-        # An exception could be swallowed by whatever is being imported.
-        os._exit(INTERRUPTED)
-
     for kind in SIGNALS:
         # A shell may have started this process in the background with SIGINT ignored.
         if signal.getsignal(kind) is not signal.SIG_IGN:
-            signal.signal(kind, end)
+            signal.signal(kind, _end)
 
 
 def is_command() -> bool:
@@ -62,6 +62,13 @@ def interruptible() -> Iterator[None]:
         raise KeyboardInterrupt
 
     with _handled_by(interrupt, also_ignored=False):
+        yield
+
+
+@contextmanager
+def ending_quietly() -> Iterator[None]:
+    """Exit on SIGTERM and SIGINT as :func:`end_quietly` does, while a command imports more."""
+    with _handled_by(_end, also_ignored=False):
         yield
 
 

@@ -1,17 +1,43 @@
-"""Precision of float32 matrix products, with its error measured on this machine."""
+"""Setup of torch: device, threads, and precision of float32 matrix products, measured here."""
 
 from __future__ import annotations
 
 import logging
 
 import torch
+from omegaconf import DictConfig
 
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.schemas import check_ranges
 
 log = logging.getLogger("lcc_rl")
 
+DEVICES = ("cpu", "cuda")
 PRECISIONS = ("highest", "high", "medium")
 SINGLE = 1e-4  # relative error beyond which products are no longer single precision
+
+
+def prepare_torch(cfg: DictConfig) -> torch.device:
+    """Check the numbers of a configuration and its device, set up torch and return the device.
+
+    Raises:
+        ConfigError: if a number is out of range or the device impossible on this machine.
+    """
+    check_ranges(cfg)
+    try:
+        device = torch.device(cfg.device)
+        torch.empty(0, device=device)
+    # Which error torch raises depends on how it was built.
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise ConfigError(f"device {cfg.device!r} is not available: {reason}") from error
+    if device.type not in DEVICES:
+        raise ConfigError(f"device must be cpu, cuda or one such as cuda:0, got {cfg.device!r}")
+    torch.set_num_threads(cfg.threads)
+    set_precision(cfg.get("matmul_precision", "highest"))
+    # TorchRL logs every buffer it allocates.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    return device
 
 
 def set_precision(name: str) -> float:

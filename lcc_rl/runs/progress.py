@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from lcc_rl.config import is_sweep
-from lcc_rl.io.files import atomic_path
+from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")

@@ -16,7 +16,7 @@ from pathlib import Path
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.errors import Interrupted, LccError, ResultsError
-from lcc_rl.io.files import atomic_path, remove_leftovers
+from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 
 try:

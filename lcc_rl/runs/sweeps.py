@@ -26,7 +26,7 @@ from rich.live import Live
 
 from lcc_rl.config import NOT_IDENTITY, identity
 from lcc_rl.errors import Interrupted, LccError, ResultsError
-from lcc_rl.io.files import atomic_path, remove_leftovers
+from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT
 from lcc_rl.runs.overview import live

@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import NOT_IDENTITY, identity, load, plain, require
 from lcc_rl.errors import ConfigError, Interrupted
-from lcc_rl.io.files import atomic_path
+from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock

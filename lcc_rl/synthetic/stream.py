@@ -26,7 +26,8 @@ from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
-from lcc_rl.io.files import atomic_path, write_parquet
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import write_parquet
 from lcc_rl.io.memory import require_memory
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo

@@ -15,7 +15,8 @@ from lcc_rl.agents.replay import Trainer, transitions
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
-from lcc_rl.io.files import read_parquet, write_torch
+from lcc_rl.io.files import read_parquet
+from lcc_rl.io.tensors import write_torch
 
 SMALL = (
     "training.episodes=20",

@@ -23,9 +23,11 @@ from lcc_rl.commands.pipeline import stored_overrides
 from lcc_rl.config import identity, load
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
-from lcc_rl.io.files import read_parquet, read_torch, write_parquet
+from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.io.settings import DEEPEST, LARGEST_FILE, parse_yaml, read_json, read_text
-from lcc_rl.results.runs import load_config, load_policy
+from lcc_rl.io.tensors import read_torch
+from lcc_rl.results.policies import load_policy
+from lcc_rl.results.runs import load_config
 from lcc_rl.runs.states import inspect_run
 from lcc_rl.synthetic.stream import StreamSource
 

@@ -31,7 +31,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.errors import ResultsError
-from lcc_rl.io.files import atomic_path, read_torch, write_parquet, write_torch
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import write_parquet
+from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.drawing import new_figure, save
 from lcc_rl.results.report import Section, write_report
 from lcc_rl.results.runs import save_config

@@ -37,9 +37,9 @@ from lcc_rl.errors import DataError, Diverged, ResultsError
 from lcc_rl.evaluation.clairvoyant import clairvoyant
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import Strategy
-from lcc_rl.io.files import read_torch, write_torch
+from lcc_rl.io.tensors import read_torch, write_torch
+from lcc_rl.results.policies import load_policy, pretrained_path
 from lcc_rl.results.report import Section, write_report
-from lcc_rl.results.runs import load_policy, pretrained_path
 from lcc_rl.results.tables import strategies_side_by_side
 
 MODULE = """

@@ -15,7 +15,8 @@ from lcc_rl.commands import calibration
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import parquet_metadata
-from lcc_rl.runs.cli import main_guard, prepare_torch
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.runs.precision import prepare_torch
 
 CONF = Path(str(lcc_rl.conf.__file__)).parent
 

@@ -16,7 +16,7 @@ from lcc_rl.evaluation.clairvoyant import clairvoyant, misses, path_energy
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, trained
 from lcc_rl.functional.pattern import parse_string
-from lcc_rl.results.runs import load_policy
+from lcc_rl.results.policies import load_policy
 
 STEPS = 60
 BOTH = ["total_steady_energy_kj", "total_acceleration_loss_kj"]

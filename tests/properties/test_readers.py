@@ -18,7 +18,8 @@ from lcc_rl.config import config_hash, identity, load, plain
 from lcc_rl.data.episodes import COLUMNS, read_episodes, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.errors import DataError, LccError
-from lcc_rl.io.files import read_parquet, read_torch, write_parquet
+from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.runs import load_config, save_config
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))

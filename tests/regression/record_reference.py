@@ -35,7 +35,7 @@ from lcc_rl import evaluate, train
 from lcc_rl.config import load
 from lcc_rl.envs.factory import build_agent, build_env, build_policy
 from lcc_rl.policies import ConstantPolicy
-from lcc_rl.results.runs import load_policy
+from lcc_rl.results.policies import load_policy
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
 SHARED = "<shared>"  # stands for the folder of the real data in what is written

@@ -24,7 +24,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.policies import shared_policy
-from lcc_rl.results.runs import load_policy
+from lcc_rl.results.policies import load_policy
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS = json.loads((REFERENCE / "commands.json").read_text())

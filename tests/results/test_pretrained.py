@@ -11,8 +11,8 @@ import torch
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.io.files import read_torch
-from lcc_rl.results.runs import load_policy, pretrained_path, save_policy
+from lcc_rl.io.tensors import read_torch
+from lcc_rl.results.policies import load_policy, pretrained_path, save_policy
 from lcc_rl.results.savings import UNTRAINED
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "export_pretrained.py"

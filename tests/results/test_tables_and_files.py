@@ -12,14 +12,9 @@ import torch
 from rich.console import Console
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.io.files import (
-    atomic_path,
-    parquet_metadata,
-    read_parquet,
-    read_torch,
-    write_parquet,
-    write_torch,
-)
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
+from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.tables import as_rich, summary
 
 

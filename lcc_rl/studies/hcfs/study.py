@@ -21,8 +21,9 @@ from lcc_rl.evaluation.strategies import (
     driven_by,
     with_weights,
 )
-from lcc_rl.results.runs import load_policy, save_config
-from lcc_rl.runs.cli import prepare_torch
+from lcc_rl.results.policies import load_policy
+from lcc_rl.results.runs import save_config
+from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.studies.runner import (
     EPISODES,
     FINISHED,
