@@ -69,8 +69,10 @@ def comparisons(folder: Path, at: float) -> list[str]:
     """Say what each kind of controller saves against those that save less, at the same share."""
     windows = read_parquet(folder / WINDOWS)
     kinds = list(dict.fromkeys(windows[KINDS].itertuples(index=False, name=None)))
-    reached = {kind: [x.mean((1, 2)) for x in front(windows, kind)] for kind in kinds}
-    energy = {kind: energy_at(*means, at) for kind, means in reached.items()}
+    energy = {}
+    for kind in kinds:
+        used, missed = (x.mean((1, 2)) for x in front(windows, kind))
+        energy[kind] = energy_at(used, missed, at)
     kinds = sorted((kind for kind in kinds if energy[kind] == energy[kind]), key=energy.__getitem__)
     lines = [f"path energy with too long a time gap for at most {at:.1%} of the time above 1 m/s:"]
     for one, other in combinations(kinds, 2):
