@@ -179,8 +179,6 @@ EXCEPTIONS = {
     "controller/idm.yaml": "one driver without noise; the class is that of drivers who differ",
     "controller/acc.yaml": "tuned constants",
     "controller/idm_acc.yaml": "tuned constants",
-    "controller/acc_filtered.yaml": "tuned constants",
-    "controller/idm_acc_filtered.yaml": "tuned constants",
     "data/highway.yaml": "second use of StreamSource",
     "data/highway.yaml.criteria": "second use of Criteria",
     "data/highway.yaml.drivers": "second use of bootstrap",

@@ -30,7 +30,7 @@ def seeds(options: Namespace) -> list[Row]:
         data = transitions(batch, options.device)
         check(options.device, data)
         agents = updates(options.device)
-        each = [partial(agent, data[place]) for place, agent in enumerate(agents)]
+        each = [partial(agent, data[place], (True, True)) for place, agent in enumerate(agents)]
         runs: dict[str, Run] = {
             TOGETHER: partial(times, count, partial(Stacked(agents), data)),
             ONE_BY_ONE: partial(times, count, partial(call_all, each)),
