@@ -19,17 +19,18 @@ from lcc_rl.errors import LccError
 from lcc_rl.io.tensors import write_torch
 from lcc_rl.results.policies import load_policy
 
-LOCAL = ("data", "drivers", "split", "resume", "policy", "compare")
+LOCAL = ("data", "drivers", "leader", "split", "resume", "policy", "compare")
 FOLDER = Path(__file__).parents[1] / "lcc_rl" / "assets" / "pretrained"
 
 
-def export(run: str | Path, origin: str, folder: Path = FOLDER) -> Path:
+def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None = None) -> Path:
     """Write the policy of a run into the package.
 
     Args:
         run: a run folder or policy file.
         origin: data, recipe and seed, in a sentence.
-        folder: folder of the file, which is named by its variant.
+        folder: folder of the file.
+        name: of the file, without suffix; None: the variant's.
 
     Returns:
         The file's path.
@@ -41,7 +42,7 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER) -> Path:
     OmegaConf.set_struct(cfg, False)
     for key in LOCAL:
         cfg.pop(key, None)
-    path = folder / f"{cfg.variant}.pt"
+    path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
     content = {"weights": weights, "config": OmegaConf.to_yaml(cfg), "provenance": provenance}
     write_torch(content, path)
@@ -53,9 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", help="run folder or policy.pt")
     parser.add_argument("origin", help="data, recipe and seed, in a sentence")
+    parser.add_argument("--name", help="of the file; by default the variant's")
     options = parser.parse_args(arguments)
     try:
-        print(export(options.run, options.origin))
+        print(export(options.run, options.origin, name=options.name))
     except LccError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

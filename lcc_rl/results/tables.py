@@ -22,6 +22,7 @@ from lcc_rl.results.savings import (
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 FASTER = "share_leader_faster"
+WIDEST = 10_000  # characters
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
 CAR_COLUMNS = (
@@ -185,5 +186,6 @@ def show(table: Table) -> None:
     """Print a table, as wide as the terminal or, without one, as its content."""
     console = Console()
     if not console.is_terminal:
-        console = Console(width=max(console.measure(table).maximum, console.width))
+        wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width
+        console = Console(width=max(wide, console.width))
     console.print(table)

@@ -19,6 +19,20 @@ TOOL = Path(__file__).resolve().parents[2] / "tools" / "export_pretrained.py"
 TINY = ("experiment=smoke", "data.platoons=4", "data.recordings=2", "scenario.horizon=40")
 
 
+@pytest.mark.parametrize("name", ["alcc_limits", "alcc_mixture"])
+def test_policies_learned_within_limits_keep_their_filter_and_their_names(name, tmp_path) -> None:
+    weights, cfg = load_policy(f"pretrained/{name}")
+    assert cfg.scenario.filters.automated.time_gap == 2.45
+    assert not {"data", "drivers", "leader", "split"} & set(cfg)
+    how = ["variant=alcc", "policy=pretrained", f"compare=[pretrained/{name}]"]
+    how += ["evaluation.baselines=[idm]"]
+    rows = evaluation.run(load("evaluate", [*TINY, *how]), tmp_path, quiet=True)
+    # Two ways to learn are no seeds of one.
+    assert set(rows["strategy"]) == {"idm", "alcc pretrained", f"alcc {name}"}
+    kept = rows[rows["strategy"] == f"alcc {name}"]
+    assert (kept["share_ttc_unsafe"] - kept["share_ttc_unpromised"]).max() == 0.0
+
+
 @pytest.mark.parametrize("variant", ["alcc", "reference"])
 def test_a_shipped_policy_says_where_it_comes_from_and_names_no_path(variant) -> None:
     weights, cfg = load_policy("pretrained", variant)
