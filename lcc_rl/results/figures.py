@@ -136,7 +136,11 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
     for place, (label, total) in enumerate(totals.items()):
         known = label != "idm" and "idm" in totals
         saving = f"\n({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
-        right.annotate(f"{total:.0f}{saving}", (place, total), ha="center", va="bottom")
+        words = f"{total:.0f}{saving}"
+        right.annotate(words, (place, total), ha="center", va="bottom", fontsize=8)
+    # As written on the axis, names of two words would run into each other.
+    labels = [str(name).replace(" ", "\n") for name in totals.index]
+    right.set_xticks(range(len(labels)), labels, fontsize=8)
     right.set_ylim(0.0, 1.3 * totals.max())
     style(right, "", "path energy [kJ per episode]")
     right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
@@ -277,14 +281,15 @@ def write_study_figures(folder: str | Path) -> list[Path]:
     if len(steps) and "idm" in names and cars[-1] not in UNTRAINED:
         paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
     for name in cars:
+        stem = name.replace(" ", "_")
         if len(steps) and (steps["strategy"] == name).any():
-            paths.append(save(sample_episode(steps, name), target / f"episode_{name}.png"))
+            paths.append(save(sample_episode(steps, name), target / f"episode_{stem}.png"))
         if "direct" in names:
             figure = human_energy(episodes, name)
-            paths.append(save(figure, target / f"human_energy_{name}.png"))
+            paths.append(save(figure, target / f"human_energy_{stem}.png"))
         for baseline in BASELINES:
             if baseline in names and baseline != name and name not in UNTRAINED:
                 figure = paired_improvement(episodes, name, baseline)
-                path = target / f"improvement_{name}_vs_{baseline}.png"
+                path = target / f"improvement_{stem}_vs_{baseline.replace(' ', '_')}.png"
                 paths.append(save(figure, path))
     return paths
