@@ -111,6 +111,12 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     if not OmegaConf.is_dict(cfg.get("agent")) or "_target_" not in cfg.agent:
         for key in () if sweep else ("agent", "training"):
             yield key, f"variant {cfg.variant} learns nothing"
+    elif not sweep:
+        yield from _unused_by_agent(cfg.agent)
+    deployed = cfg.get("deployed")
+    if OmegaConf.is_dict(deployed) and deployed.get("spacing_weight") == 0:
+        for name in ("spacing_time", "gap_scale"):
+            yield f"deployed.{name}", "deployed.spacing_weight is 0"
     unused = {
         "episodes": ("evaluation.full_length", "leader.cases", "leader.full_length"),
         "vehicles": ("evaluation.batch_size", "evaluation.sample_episodes"),
@@ -125,6 +131,19 @@ def _plays_data(leader: Any) -> bool:
         return False
     known = (key for key in leader if not OmegaConf.is_missing(leader, key))
     return "source" in leader or any(_plays_data(leader[key]) for key in known)
+
+
+def _unused_by_agent(agent: DictConfig) -> Iterator[tuple[str, str]]:
+    """Yield settings of an agent that learns through the simulator which others switch off."""
+    policy = agent.get("policy")
+    if policy in ("idm", "acc"):
+        yield "agent.hidden", f"agent.policy={policy} has no layers"
+    if agent.get("bootstrap") is False:
+        for name in ("value_lr", "td_lambda", "tau"):
+            yield f"agent.{name}", "agent.bootstrap=false learns no value"
+    limits = agent.get("limits")
+    if OmegaConf.is_dict(limits) and not any(share is not None for share in limits.values()):
+        yield "agent.limit_rate", "there is no limit: agent.limits is empty"
 
 
 def string_of_scenario(scenario: Any) -> VehicleString:

@@ -197,6 +197,13 @@ def test_an_option_of_a_former_release_names_todays_in_one_line(item, new) -> No
         (["variant=cacc", "scenario.controllers.human.noise=0"], "no vehicle of the string is"),
         (["evaluation.full_length=true"], "unused with evaluation.rows=episodes"),
         (["variant=cacc", "evaluation.batch_size=9"], "unused with evaluation.rows=vehicles"),
+        (
+            ["experiment=limits", "agent.policy=idm", "agent.hidden=[32]"],
+            "policy=idm has no layers",
+        ),
+        (["experiment=limits", "agent.tau=0.3"], "bootstrap=false learns no value"),
+        (["agent=analytic", "agent.limit_rate=0.3"], "agent.limits is empty"),
+        (["variant=hcfs", "deployed.spacing_time=5"], "deployed.spacing_weight is 0"),
     ],
 )
 def test_options_without_effect_are_refused(overrides, words) -> None:

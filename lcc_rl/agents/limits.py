@@ -29,7 +29,8 @@ class Limits:
         known: the names that there are.
 
     Raises:
-        ConfigError: if a name is unknown, a share lies outside 0…1 or the rate is not positive.
+        ConfigError: if a name is unknown or of a term without weight, a share lies outside 0…1
+            or the rate is not positive.
     """
 
     def __init__(
@@ -43,6 +44,11 @@ class Limits:
                 kind = type(known[name]).__name__
                 raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")
             require_in("agent.limits", "[0, 1)", **{name: share})
+            if not known[name].weight:  # type: ignore[attr-defined]
+                raise ConfigError(
+                    f"agent.limits.{name}: agent.surrogates.{name}.weight is 0, which no price "
+                    f"can change; raise it, or say agent.limits.{name}=null"
+                )
         require_positive("agent", limit_rate=rate)
         self.rate = rate
         self.logarithms = dict.fromkeys(self.largest, 0.0)

@@ -75,7 +75,8 @@ def check_window(window: int | None, settings: TrainingConfig) -> None:
     require(
         window is None or (window % settings.environments == 0 and window <= settings.episodes),
         f"agent.best_window ({window}) must be a multiple of training.environments "
-        f"({settings.environments}) and at most training.episodes ({settings.episodes})",
+        f"({settings.environments}) and at most training.episodes ({settings.episodes}), or "
+        "null: the last policy is kept",
     )
 
 

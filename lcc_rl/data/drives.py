@@ -58,6 +58,8 @@ class DriveLeaders:
     def __post_init__(self) -> None:
         require_in("leader", "(0, 1]", evaluation_share=self.evaluation_share)
         require_in("leader", "[0, inf)", least_variation=self.least_variation)
+        if self.tuning and self.evaluation_share == 1:
+            raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
         try:
             re.compile(self.together or "")
         except re.error as error:
@@ -76,7 +78,7 @@ class DriveLeaders:
         profiles, report = read_drives(self.path, columns, time_step, self.plausible)
         divide = self._by_time if columns["drive"] is None else self._by_name
         training, held_out = divide(profiles)
-        if self.tuning and self.evaluation_share < 1:
+        if self.tuning:
             training, held_out = divide(training, again=True)
         windows = varying(held_out.at_least(horizon).windows(horizon), self.least_variation)
         if len(training):

@@ -167,7 +167,6 @@ def test_learns_to_keep_going(tmp_path, overrides) -> None:
         "training.episodes=480",
         "training.environments=16",
         "agent.learning_rate=0.01",
-        "agent.value_lr=0.001",
         "training.gap_range=[0.8,1.2]",
     ).run()
     # The objective, not the literal reward, is what a handful of steps is sure to improve.

@@ -50,6 +50,13 @@ def test_what_is_no_limit_is_refused(largest, words) -> None:
         Limits(largest, 0.1, KNOWN)
 
 
+def test_a_limit_of_a_term_without_weight_is_refused() -> None:
+    known = {"efficiency": SmoothEfficiency(weight=0.0)}
+    with pytest.raises(ConfigError, match="weight is 0, which no price can change"):
+        Limits({"efficiency": 0.01}, 0.1, known)
+    assert not Limits({"efficiency": None}, 0.1, known).largest
+
+
 def test_a_limit_that_is_null_is_a_fixed_price() -> None:
     agent = make_agent(
         compose("alcc", "agent=analytic", "surrogates@agent=limits", "agent.limits.safety=null")

@@ -91,6 +91,8 @@ def test_drives_of_one_day_are_on_one_side(tmp_path) -> None:
     ):
         with pytest.raises(error, match=words):
             DriveLeaders(str(tmp_path / "days.parquet"), together=together).load(0.1, 300)
+    with pytest.raises(ConfigError, match="leaves nothing to tune on"):
+        DriveLeaders("x.csv", evaluation_share=1, tuning=True)
     with pytest.raises(ConfigError, match="the table holds one record"):
         DriveLeaders("x.csv", {"drive": None}, together="x")
 
