@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from math import isfinite
 from pathlib import Path
 
 import pandas as pd
@@ -73,7 +74,7 @@ def comparisons(folder: Path, at: float) -> list[str]:
     for kind in kinds:
         used, missed = (x.mean((1, 2)) for x in front(windows, kind))
         energy[kind] = energy_at(used, missed, at)
-    kinds = sorted((kind for kind in kinds if energy[kind] == energy[kind]), key=energy.__getitem__)
+    kinds = sorted((kind for kind in kinds if isfinite(energy[kind])), key=energy.__getitem__)
     lines = [f"path energy with too long a time gap for at most {at:.1%} of the time above 1 m/s:"]
     for one, other in combinations(kinds, 2):
         found = saving_at(windows, one, other, at)
