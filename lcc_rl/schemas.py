@@ -81,6 +81,7 @@ class StudyConfig:
     drivers: Any = MISSING
     split: Any = MISSING
     leader: Any = None
+    energy: Any = None
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)

@@ -17,16 +17,17 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import require
 from lcc_rl.data.profiles import Profiles
+from lcc_rl.energy import Fleet, as_fleet, build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.evaluation.metrics import KILO, energy_measures, measured_ttc, safety_measures
 from lcc_rl.evaluation.rollout import Record, play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.functional.power import path_power
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.savings import LEADER, SOURCE
 from lcc_rl.results.tables import FASTER
 
@@ -101,17 +102,19 @@ def evaluate(
     samples = min(max(sample_episodes, 1), len(profile))
     kept = set(np.linspace(0, len(profile) - 1, samples).round().astype(int))
     cfg, time_step = any_leader(strategy.cfg), strategy.cfg.scenario.time_step
+    energy = build_energy(cfg)
     episodes, steps = [], []
     for start in range(0, len(profile), batch_size):
         who = profile[start : start + batch_size], driver[start : start + batch_size]
         env = build_env(cfg, profiles, inputs.population, len(who[0]), 0, device, True)
         given = reset_options(env, *who, seed, count)
-        keys = [*KEYS, INDEX, PROMISED]
+        keys = [*KEYS, INDEX, PROMISED, CLASS]
         record, alive = play(env, strategy.policy, given, keys, strategy.title)
         groups = grouped(record, string_of(cfg))
         described = describe(strategy, profiles, inputs.population, *who)
         described[FASTER] = leader_faster(profiles, who[0], desired_speeds(strategy, described))
-        parts = [described, leader_measures(profiles, who[0]), measure(groups, alive, time_step)]
+        parts = [described, leader_measures(profiles, who[0], energy)]
+        parts.append(measure(groups, alive, time_step, energy))
         table = pd.concat(parts, axis=1)
         episodes.append(table)
         if sample_episodes:
@@ -184,15 +187,27 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     return groups
 
 
-def measure(groups: Groups, alive: Tensor, time_step: float) -> pd.DataFrame:
+def measure(
+    groups: Groups, alive: Tensor, time_step: float, energy: Fleet | None = None
+) -> pd.DataFrame:
     """Turn the record of a batch into one row per episode; energies add up over vehicles (A20)."""
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
         series = groups[group]
         if "power" not in series:
             continue
-        measures = energy_measures(series["power"], series["speed"], alive.unsqueeze(-2), time_step)
-        columns |= {f"{group}_{name}": value.sum(-2) for name, value in measures.items()}
+        kinds = series.get(CLASS[1])
+        measures = energy_measures(
+            series["power"],
+            series["speed"],
+            alive.unsqueeze(-2),
+            time_step,
+            energy,
+            None if kinds is None else kinds[0],
+        )
+        for name, value in measures.items():
+            added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
+            columns[f"{group}_{name}"] = added
     own = groups["cav"]
     if "gap" in own:
         columns |= safety_measures(own, alive.unsqueeze(-2), time_step)
@@ -254,15 +269,21 @@ def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> n
     return shares
 
 
-def leader_measures(profiles: Profiles, profile: Tensor) -> pd.DataFrame:
-    """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode."""
+def leader_measures(
+    profiles: Profiles, profile: Tensor, energy: Fleet | None = None
+) -> pd.DataFrame:
+    """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
+
+    The leader has the first energy model.
+    """
+    energy = as_fleet(energy)
     ids, place = np.unique(profile.numpy(), return_inverse=True)
     rows = []
     for index in ids:
         speed = profiles.record(int(index))
-        power = path_power(speed[:-1], speed.diff() / profiles.time_step)
-        energy = power.sum() * profiles.time_step * KILO
-        rows.append((float(energy), float(speed.mean())))
+        power = energy.path_power(speed[:-1], speed.diff() / profiles.time_step)
+        drawn = power.sum() * profiles.time_step * KILO
+        rows.append((float(drawn), float(speed.mean())))
     return pd.DataFrame(np.array(rows)[place], columns=list(LEADER))
 
 

@@ -7,7 +7,7 @@ from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
 from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
 from lcc_rl.pieces.cruise import IDMACC, LinearACC
 from lcc_rl.pieces.estimator import DriverEstimator
-from lcc_rl.pieces.features import MotorPower, TimeGap, TimeToCollision
+from lcc_rl.pieces.features import EnergyClasses, MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.hybrid import HCFS
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
@@ -50,6 +50,7 @@ __all__ = [
     "DeadBeat",
     "DriverEstimator",
     "EfficiencyReward",
+    "EnergyClasses",
     "EnergyReward",
     "EquilibriumStart",
     "Feature",

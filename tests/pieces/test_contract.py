@@ -19,6 +19,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
 import lcc_rl.pieces as room
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet
 from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.envs.step import Pieces
 from lcc_rl.pieces import (
@@ -38,6 +39,7 @@ from lcc_rl.pieces import (
     DeadBeat,
     DriverEstimator,
     EfficiencyReward,
+    EnergyClasses,
     EnergyReward,
     EquilibriumStart,
     Feature,
@@ -74,6 +76,9 @@ from lcc_rl.pieces.base import as_key
 from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, shared_policy
 
 HORIZON, T = 12, 0.1
+FLEET = Fleet(
+    {"car": CirclesFuel(), "electric": ElectricCar()}, roles={"automated": {"electric": 1.0}}
+)
 CONNECTED = ("cacc", "beat", "hybrid")
 ROLES = ("human", "automated", "human", "cacc", "cacc", "automated", "beat", "stopper")
 ROLES = (
@@ -177,6 +182,7 @@ def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "Smoothness": lambda: Smoothness(**own),
         "Correction": lambda: Correction(**own),
         "PathEnergy": lambda: PathEnergy(T, "path_energy", **own),
+        "PathEnergy, mixed": lambda: PathEnergy(T, "path_mixed", energy=FLEET, **own),
         "PathEnergy, behind": lambda: PathEnergy(T, "path_behind", of="behind", **own),
     }
 
@@ -196,7 +202,9 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         "DriverEstimator": lambda: DriverEstimator(POPULATION, T, learning_time=0.5, **own),
         "TimeToCollision": lambda: TimeToCollision(string),
         "TimeGap": lambda: TimeGap(string),
+        "EnergyClasses": lambda: EnergyClasses(string, FLEET),
         "MotorPower": lambda: MotorPower(string),
+        "MotorPower, mixed": lambda: MotorPower(string, power="mixed_power", energy=FLEET),
         "MotorPower, estimated": lambda: MotorPower(
             string, "human", "predicted_acceleration", "predicted_power"
         ),
