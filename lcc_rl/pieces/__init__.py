@@ -13,6 +13,7 @@ from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.platoon_rewards import JerkReward, SpacingReward, VelocityReward
+from lcc_rl.pieces.ranges import RangeReward, SmoothRange
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
@@ -67,10 +68,12 @@ __all__ = [
     "PathEnergy",
     "Piece",
     "Places",
+    "RangeReward",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
     "SmoothEfficiency",
+    "SmoothRange",
     "SmoothSafety",
     "Smoothness",
     "SpacingReward",
