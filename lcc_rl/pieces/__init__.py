@@ -22,7 +22,7 @@ from lcc_rl.pieces.rewards import (
     SafetyReward,
     TotalReward,
 )
-from lcc_rl.pieces.rules import FollowerStopper, Handover
+from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
 from lcc_rl.pieces.surrogates import (
@@ -65,6 +65,7 @@ __all__ = [
     "NGSIMLeader",
     "Observation",
     "ObservationMemory",
+    "PISaturation",
     "PathEnergy",
     "Piece",
     "Places",
