@@ -95,7 +95,8 @@ class Clock(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(0 if seed is None else seed)
 
-    def _draw_seeds(self) -> torch.Tensor:
+    def draw_seeds(self) -> torch.Tensor:
+        """Draw a seed for a new episode in every place of the batch, ``[*batch, 1]``, int64."""
         shape = (*self.batch_size, 1)
         seeds = torch.randint(2**31, shape, generator=self.generator, dtype=torch.int64)
         return seeds.to(self.device)
@@ -103,7 +104,7 @@ class Clock(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         seeds = tensordict.get(SEED, None) if tensordict is not None else None
         if seeds is None:
-            seeds = self._draw_seeds()
+            seeds = self.draw_seeds()
         else:
             require_option(SEED, seeds, 2**32)  # of which all bits count
         return self._moment(seeds, torch.zeros_like(seeds))

@@ -10,8 +10,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.finite import ACTION
-from lcc_rl.envs.step import DONE, TERMINATED, Compiled, Step, closure, pieces_of, written
+from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, written
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import NEXT, SEED, STEP, Piece, State, StepTransform, as_key
 

@@ -108,6 +108,9 @@ def safety_measures(
     unsafe, long = series["ttc"] < UNSAFE_TTC, series["time_gap"] > LONG_TIME_GAP
     found = {
         "min_gap_m": lowest(series["gap"]),
+        "mean_gap_m": average(series["gap"]),
+        "max_gap_m": highest(series["gap"]),
+        "min_time_gap_s": lowest(series["time_gap"]),
         "min_ttc_s": measured_ttc(lowest(series["ttc"])),
         "max_time_gap_s": highest(series["time_gap"]),
         "share_ttc_unsafe": average(unsafe),

@@ -111,7 +111,7 @@ def test_without_a_compiler_one_line_and_the_plain_step(monkeypatch, caplog) -> 
         return fail
 
     expected = first(small_env("alcc", 2), frames_per_batch=10)
-    monkeypatch.setattr("lcc_rl.envs.step.compile", broken)
+    monkeypatch.setattr("lcc_rl.envs.compiled.compile", broken)
     caplog.set_level("INFO", "lcc_rl")
     segment = first(small_env("alcc", 2), frames_per_batch=10, compiled=True)
     assert torch.equal(

@@ -17,10 +17,10 @@ from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.estimation import Belief, predict_and_update
-from lcc_rl.functional.idm import idm_acceleration
+from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
-from lcc_rl.functional.random import uniform
+from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.pieces.base import SEED, STEP
 
@@ -30,6 +30,12 @@ def study(quick: bool) -> tuple[DictConfig, Inputs]:
     """Configuration and inputs of the ALCC study on the synthetic stream."""
     cfg = load("train", ["variant=alcc"])
     return cfg, load_inputs(cfg, stream(quick).load().episodes)
+
+
+def training(options: Namespace, batch: int) -> TransformedEnv:
+    """Build the ALCC environment of a training: gaps spread at the start, episodes that end."""
+    cfg, inputs = study(options.quick)
+    return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 
 
 def alcc(
@@ -59,6 +65,7 @@ class PlainLoop:
         self.human, self.estimator = pieces["IDM"], pieces["DriverEstimator"]
         self.scales, self.penalty = pieces["Observation"].constants, terms["collision"].weight
         self.safety, self.efficiency = terms["safety"], terms["efficiency"]
+        self.horizon, self.rows = env.base_env.horizon, env.batch_size.numel()
         energies = (terms["cav_energy"], terms["hdv_energy"])
         self.cav_price, self.hdv_price = (term.weight * term.factor for term in energies)
 
@@ -104,15 +111,85 @@ class PlainLoop:
             - self.hdv_price * motor_power(now["speed"], predicted)
             - self.penalty * ((cav_gap <= 0.0) | (gap <= 0.0)).float()
         )
-        seen = [leader, cav, leader - cav, cav_gap, speed, cav - speed, gap]
         written = {
-            "observation": torch.cat(seen, dim=-1) * self.scales,
             "reward": reward,
             "hdv_power": motor_power(now["speed"], acceleration),
         }
         reached = {"leader": leader, "cav": cav, "cav_gap": cav_gap, "speed": speed, "gap": gap}
         learned = {"estimate": belief.estimate, "covariance": belief.covariance}
-        return {**now, "step": now["step"] + 1, **reached, **learned}, written
+        after = {**now, "step": now["step"] + 1, **reached, **learned}
+        return after, {**written, "observation": self.observe(after)}
+
+    def observe(self, now: dict[str, Tensor]) -> Tensor:
+        """Return what the automated vehicle sees."""
+        leader, cav, speed = now["leader"], now["cav"], now["speed"]
+        seen = [leader, cav, leader - cav, now["cav_gap"], speed, cav - speed, now["gap"]]
+        return torch.cat(seen, dim=-1) * self.scales
+
+    def over(self, now: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return where an episode ends by a collision, and where it ends at all."""
+        crashed = (now["cav_gap"] <= 0.0) | (now["gap"] <= 0.0)
+        return crashed, crashed | (now["step"] >= self.horizon)
+
+    def begin(self, seed: Tensor) -> dict[str, Tensor]:
+        """Return the first moment of the episodes of some seeds, ``[n, 1]``."""
+        leader, human, believed = self.leader, self.human, self.estimator
+        starts = self.motion.start
+        profile = choose(seed, len(leader.offsets), leader.profile_stream)
+        first = choose(seed, leader.starts[profile], leader.start_stream)
+        place = leader.offsets[profile] + first
+        speed = leader.speeds[place]
+        driver = choose(seed, len(human.desired_speeds), human.driver_stream)
+        v0, headway = human.desired_speeds[driver], human.time_gaps[driver]
+        cap = starts["human"].cap_time_gap
+        own = starts["automated"]
+        factor = own.lowest + (own.highest - own.lowest) * uniform(seed, 0, own.stream)
+        return {
+            "seed": seed,
+            "step": torch.zeros_like(seed),
+            "place": place,
+            "leader": speed,
+            "cav": speed,
+            "cav_gap": factor * (own.standstill_gap + own.time_gap * speed),
+            "speed": speed,
+            "gap": equilibrium_gap(speed, v0, headway, human.drivers, cap),
+            "estimate": believed.prior_estimate.expand(len(seed), 2),
+            "covariance": believed.prior_covariance.expand(len(seed), 3),
+            "desired_speed": v0,
+            "desired_time_gap": headway,
+        }
+
+    def play(
+        self, now: dict[str, Tensor], action: Tensor, seeds: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+        """Take a step; return state and observation after resets, and what the step wrote.
+
+        Every episode is begun anew, where it is over that is taken: one kernel when compiled.
+        """
+        after, written = self.step(now, action)
+        crashed, over = self.over(after)
+        new = self.begin(seeds)
+        after = {name: torch.where(over, new[name], value) for name, value in after.items()}
+        written |= {"terminated": crashed, "done": over}
+        return after, written, torch.where(over, self.observe(new), written["observation"])
+
+    def play_eagerly(
+        self, now: dict[str, Tensor], action: Tensor, seeds: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+        """The same without a compiler: only episodes that are over are begun anew."""
+        after, written = self.step(now, action)
+        crashed, over = self.over(after)
+        written |= {"terminated": crashed, "done": over}
+        seen, rows = written["observation"], over.flatten().nonzero().flatten()
+        if len(rows):
+            new = self.begin(seeds[rows])
+            seen = seen.index_put((rows,), self.observe(new))
+            after = {name: value.index_put((rows,), new[name]) for name, value in after.items()}
+        return after, written, seen
+
+    def seeds(self) -> Tensor:
+        """Draw the seeds of new episodes."""
+        return torch.randint(2**31, (self.rows, 1)).to(self.leader.speeds.device)
 
 
 def check_physics(options: Namespace, steps: int) -> None:
@@ -129,3 +206,15 @@ def check_physics(options: Namespace, steps: int) -> None:
             if not off <= TOLERANCE:
                 raise RuntimeError(f"step {step}: {name} of the plain loop is off by {off:g}")
         td = step_mdp(td)
+    check_resets(options)
+
+
+def check_resets(options: Namespace) -> None:
+    """Hold the first moments of the plain loop against those of the environment."""
+    env = training(options, 64)
+    plain, td = PlainLoop(env), env.reset()
+    begun, wanted = plain.begin(td[SEED]), plain.start(td)
+    for name, value in wanted.items():
+        off = float((begun[name] - value).abs().max())
+        if not off <= TOLERANCE:
+            raise RuntimeError(f"first moment: {name} of the plain loop is off by {off:g}")
