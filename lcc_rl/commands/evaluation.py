@@ -21,7 +21,9 @@ from lcc_rl.evaluation.blocks import Store
 from lcc_rl.evaluation.naming import POLICY, check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
     Strategy,
-    baselines,
+    applies,
+    baseline,
+    rules,
     studied,
     trained,
 )
@@ -132,13 +134,16 @@ def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
     trust, policy = tuple(cfg.trust), None
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
-    compared = {path: load_policy(path, cfg.variant, trust) for path in cfg.compare}
+    rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
+    paths = [path for path in cfg.compare if path not in rivals]
+    compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
     check_evaluation(cfg, inputs)
-    strategies = baselines(cfg)
-    strategies += [trained(cfg, path, compared[path], inputs.population) for path in cfg.compare]
+    named = [*cfg.evaluation.baselines, *(x for x in rivals if x not in cfg.evaluation.baselines)]
+    strategies = [baseline(cfg, name) for name in named if applies(cfg, name)]
+    strategies += [trained(cfg, path, compared[path], inputs.population) for path in paths]
     if own:
         strategies += studied(cfg, policy, inputs.population)
     for strategy in (s for s in strategies if s.policy is not None):
