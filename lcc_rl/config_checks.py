@@ -101,7 +101,7 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
         for key in ("split",) if "calibration" in cfg else ("data", "split"):
             yield key, "the leader drives the records of leader=…; say leader=trajectories"
     if not ring:
-        for key in ("circumference", "vehicle_length", "initial_speed"):
+        for key in ("circumference", "initial_speed"):
             yield f"scenario.{key}", "it belongs to scenario.road=ring"
     if set(string.names) == {AUTOMATED} and not _is_human(scenario.controllers.get(AUTOMATED)):
         for key in ("drivers", "evaluation.drivers"):

@@ -86,6 +86,7 @@ class StudyConfig:
     split: Any = MISSING
     leader: Any = None
     energy: Any = None
+    task: Any = None
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)

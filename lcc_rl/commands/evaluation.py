@@ -13,7 +13,8 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_sizes, check_variant
-from lcc_rl.config import identity
+from lcc_rl.config import build_as, identity, plain
+from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
 from lcc_rl.evaluation import cases, episodes
@@ -30,18 +31,23 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
-from lcc_rl.results.savings import by_source
+from lcc_rl.results.savings import SOURCE, by_source
+from lcc_rl.results.scores import Task, scores
+from lcc_rl.results.scores import as_rich as scores_as_rich
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
+from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present, claim, forget
+from lcc_rl.targets import TARGET
 
 log = logging.getLogger("lcc_rl")
 
 EPISODES, STEPS, IDENTITY = "episodes.parquet", "steps.parquet", "lcc_rl.config"
 ROWS = ("episodes", "vehicles")
+TASK = "lcc_rl.results.scores.Task"
 
 
 def run(
@@ -103,10 +109,12 @@ def complete(cfg: DictConfig, folder: Path) -> None:
 def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
     prepare_torch(cfg)
     check_sizes(cfg)
-    if own:
-        check_variant(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+    if task_of(cfg) is not None and cfg.compare and cfg.policy is None and learns(cfg):
+        own = False  # of a task, those that are named
+    if own:
+        check_variant(cfg)
     strategies, inputs = _strategies(cfg, own)
     if replace:  # rows of other settings must never stand beside this configuration
         (folder / EPISODES).unlink(missing_ok=True)
@@ -245,19 +253,37 @@ def _play_missing(
     torch.compiler.reset()
 
 
+def task_of(cfg: DictConfig) -> Task | None:
+    """Return the task of a configuration; None without one.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    if cfg.get("task") is None:
+        return None
+    task: Task = build_as("a task", Task, {TARGET: TASK, **plain(cfg.task)}, "task")
+    check_unit(task.unit, build_energy(cfg))
+    return task
+
+
 def _show(rows: Rows, cfg: DictConfig, inputs: Inputs) -> None:
-    """Print the summary of an evaluation."""
+    """Print the summary of an evaluation, or the scores of its task."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
                 show(vehicles_as_rich(case_table(part, case), f"{of}{case}"))
         return
-    plan = episodes.plan_of(cfg, inputs)
+    plan, task = episodes.plan_of(cfg, inputs), task_of(cfg)
     drivers = f"{len(plan.chosen)} drivers"
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
     drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
     for source, count in Counter(inputs.evaluation.sources or [""] * plan.profiles).items():
         of = f"{source}: " if source else ""
         title = f"{of}{count} held-out profiles × {drivers}, {cfg.scenario.horizon} steps"
-        show(as_rich(summary(rows, source), title))
+        if task is not None and isinstance(rows, pd.DataFrame):
+            part = rows[rows[SOURCE] == source] if source else rows
+            table = scores(part, task, build_energy(cfg))
+            show(scores_as_rich(table, task, f"task {task.name}: {title}"))
+        else:
+            show(as_rich(summary(rows, source), title))

@@ -29,6 +29,7 @@ from lcc_rl.evaluation.rows import (
     leader_measures,
     measure,
     sample,
+    traffic,
 )
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.pieces.base import as_key
@@ -207,7 +208,8 @@ class Episodes:
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy)
         measured = measure(groups, alive, time_step, self.energy)
-        rows = pd.concat([described, leader, measured], axis=1)
+        whole = traffic(record, alive, self.cfg.scenario.vehicle_length)
+        rows = pd.concat([described, leader, measured, whole], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
         inside = [index for index in inside if 0 <= index < count]

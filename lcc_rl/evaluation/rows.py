@@ -16,7 +16,13 @@ from torch import Tensor
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.evaluation.metrics import KILO, energy_measures, measured_ttc, safety_measures
+from lcc_rl.evaluation.metrics import (
+    KILO,
+    energy_measures,
+    measured_ttc,
+    safety_measures,
+    string_measures,
+)
 from lcc_rl.evaluation.rollout import Record
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
@@ -113,6 +119,19 @@ def measure(
     frame["collided"] = np.minimum.reduce(lowest) <= 0.0
     frame["steps"] = alive.sum(0).squeeze(-1).cpu().numpy()
     return frame
+
+
+def traffic(record: Record, alive: Tensor, length: float) -> pd.DataFrame:
+    """Return what the whole string did, a row per episode; see :func:`string_measures`."""
+    steps, leader = len(alive), record.get(("leader", "speed"))
+    measures = string_measures(
+        record["vehicles", "speed"][-steps:],
+        record["vehicles", "gap"],
+        alive,
+        length,
+        None if leader is None else leader[-steps:],
+    )
+    return pd.DataFrame({key: x.squeeze(-1).cpu().numpy() for key, x in measures.items()})
 
 
 def describe(
