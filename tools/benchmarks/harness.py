@@ -33,6 +33,17 @@ def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
     return {name: np.array(seconds[1:]) for name, seconds in spent.items()}
 
 
+def first_calls(runs: Mapping[str, Run]) -> dict[str, np.ndarray]:
+    """Seconds of the first call of every run, with nothing kept of an earlier compilation."""
+    spent = {}
+    with torch.compiler.config.patch(force_disable_caches=True):
+        for name, run in runs.items():
+            begun = clock()
+            run()
+            spent[name] = np.array([clock() - begun])
+    return spent
+
+
 def clock() -> float:
     """Read the time [s] once the accelerator, if any, has done what it was given."""
     if torch.cuda.is_available():
