@@ -25,6 +25,7 @@ from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.rewards import TOUCH
 
 
 @cache
@@ -112,7 +113,8 @@ class PlainLoop:
         early = now["step"][:, None] < self.estimator.learning_steps
         predicted = torch.where(early, self.estimator.mean(*motion), predicted)
         threshold = self.safety.threshold
-        ttc = time_to_collision(cav_gap - self.safety.margin, cav - leader)
+        room = (cav_gap - self.safety.margin).clamp(min=TOUCH)
+        ttc = time_to_collision(torch.where(cav_gap > 0.0, room, cav_gap), cav - leader)
         late = time_gap(cav_gap, cav) >= self.efficiency.threshold
         reward = (
             self.safety.weight * (ttc.clamp(self.safety.floor, threshold) / threshold).log()
@@ -217,8 +219,8 @@ def chosen(over: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 def check_physics(options: Namespace, steps: int) -> None:
     """Hold the plain loop against the environment, whose episodes go on after a collision."""
-    for followers in (1, 3):
-        _check_steps(alcc(options, 64, followers=followers), steps)
+    _check_steps(alcc(options, 64), steps)
+    _check_steps(alcc(options, 64, 30, followers=3), steps)
     check_resets(options)
 
 
