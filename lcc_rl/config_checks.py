@@ -13,6 +13,8 @@ from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString, parse_stri
 
 AUTO = "scenario.controllers.automated"
 NO_AGENT = ("agent=none", "agent=null")
+# Settings of an evaluation whose rows are episodes.
+OF_EPISODES = ("batch_size", "sample_episodes", "repeats", "shards", "shard", "compiled")
 # Former spellings as regular expressions, and what to say instead; \1 is what the bracket holds.
 RENAMED = (
     (
@@ -119,7 +121,7 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
             yield f"deployed.{name}", "deployed.spacing_weight is 0"
     unused = {
         "episodes": ("evaluation.full_length", "leader.cases", "leader.full_length"),
-        "vehicles": ("evaluation.batch_size", "evaluation.sample_episodes"),
+        "vehicles": tuple(f"evaluation.{name}" for name in OF_EPISODES),
     }
     for name in unused.get(cfg.evaluation.rows, ()):
         yield name, f"it is unused with evaluation.rows={cfg.evaluation.rows}"

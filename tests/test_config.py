@@ -189,6 +189,11 @@ EXCEPTIONS = {
     "drivers/highway.yaml": "second use of bootstrap",
     "drivers/i80.yaml": "the shipped table has both modes; null takes the same one",
     "drivers/kde.yaml": "as for i80",
+    **{
+        f"energy/{name}.yaml": "another vehicle"
+        for name in ("bolt", "class4", "class8", "compact", "pickup", "suv")
+    },
+    "energy/mixture.yaml": "shares of its classes",
     "leader/openacc.yaml": "the path is asked for; records are those of the file",
     "leader/paper.yaml": "the path is asked for; records are those of the file",
     "leader/record.yaml": "second use of DriveLeaders",
@@ -226,7 +231,15 @@ def select(root: DictConfig, key: str) -> Any:
 
 
 OFFERED = {"profiles", "population", "time_step", "horizon", "string", "nominal", "name", "role"}
-OFFERED |= {"observation_size", "action_size", "seed", "settings", "device", "observation"}
+OFFERED |= {
+    "energy",
+    "observation_size",
+    "action_size",
+    "seed",
+    "settings",
+    "device",
+    "observation",
+}
 OFFERED |= {"max_acceleration"}
 # Arguments that name entries, and those that only some files choose to give.
 OPTIONAL = {"raw", "reads", "widths", "relative_to", "visible", "vehicles", "acceleration", "power"}

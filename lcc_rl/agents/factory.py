@@ -15,6 +15,7 @@ from lcc_rl.agents.replay import Trainer
 from lcc_rl.agents.tuned import SearchLoop, Tuned
 from lcc_rl.config import build_as, identity, short_name
 from lcc_rl.data.profiles import Profiles
+from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError
@@ -60,6 +61,7 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
         seed=cfg.seed,
         time_step=cfg.scenario.time_step,
         string=string,
+        energy=build_energy(cfg),
         device=device,
     )
     return agent

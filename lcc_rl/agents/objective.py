@@ -24,7 +24,7 @@ class Objective:
         settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
             :class:`lcc_rl.agents.simulated.SimulatedSettings`.
         device: where the terms compute.
-        **resources: what terms may need: ``time_step``, ``string``.
+        **resources: what terms may need: ``time_step``, ``string``, ``energy``.
 
     Raises:
         ConfigError: if a node or a limit is wrong.

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.objective import Objective
+from lcc_rl.energy import Fleet
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.functional.pattern import VehicleString
@@ -58,6 +59,7 @@ class SimulatedAgent(ABC):
         string: the string of vehicles, for terms of the objective.
         settings: see the class's ``Settings``; None for its defaults.
         device: where the networks live.
+        energy: the energy models, for terms of the objective; None for the ALCC paper's.
 
     Raises:
         ConfigError: if a setting is out of range.
@@ -74,11 +76,12 @@ class SimulatedAgent(ABC):
         string: VehicleString | None = None,
         settings: Any = None,
         device: str = "cpu",
+        energy: Fleet | None = None,
     ) -> None:
         self.settings: Any = self.Settings() if settings is None else settings
         self.seed, self.device = seed, device
         own = self.settings
-        self.objective = Objective(own, device, time_step=time_step, string=string)
+        self.objective = Objective(own, device, time_step=time_step, string=string, energy=energy)
         self.policy: TensorDictModule = make_policy(
             own.policy, observation, own.hidden, seed, own.constants, max_acceleration
         ).to(device)

@@ -13,13 +13,14 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import CALLED, build_as, load
 from lcc_rl.data.profiles import Profiles
+from lcc_rl.energy import build_energy
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.finite import ACTION
 from lcc_rl.envs.inputs import load_inputs, string_of
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
 from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces import (
@@ -27,6 +28,7 @@ from lcc_rl.pieces import (
     CBFFilter,
     Controller,
     Corrected,
+    EnergyClasses,
     Piece,
     Places,
     StringMotion,
@@ -99,19 +101,24 @@ def build_pieces(
     Raises:
         ConfigError: naming the option at fault.
     """
-    scenario, string = cfg.scenario, string_of(cfg)
+    scenario, string, energy = cfg.scenario, string_of(cfg), build_energy(cfg)
     resources = {
         "profiles": profiles,
         "population": population,
         "time_step": scenario.time_step,
         "horizon": scenario.horizon,
         "string": string,
+        "energy": energy,
         "nominal": nominal,
     }
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), resources)
     drivers = _drivers(scenario, string, resources)
-    pieces += [Places(string), *drivers, _motion(scenario, string, resources)]
+    for role in energy.roles:
+        if role not in scenario.controllers:
+            raise unknown_name("role (energy.roles)", role, list(scenario.controllers))
+    classes = [EnergyClasses(string, energy)] if len(energy.models) > 1 else []
+    pieces += [Places(string), *classes, *drivers, _motion(scenario, string, resources)]
     pieces += _watchers(drivers)
     pieces += [_build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
     check_spacing(pieces, profiles)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.config import require
+from lcc_rl.energy import Fleet, as_fleet, build_energy
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.envs.rollout import ACTION
@@ -28,8 +29,8 @@ from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.functional.power import path_power
 from lcc_rl.pieces.base import STEP
+from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.views import VEHICLES, Views
 
 MEASURED = ("gap", "relative_speed", "time_gap", "speed")
@@ -94,7 +95,7 @@ def clairvoyant(
         any_leader(strategy.cfg), inputs.evaluation, inputs.population, len(profile), nominal=True
     )
     given = reset_options(env, profile, driver, seed, count)
-    string = string_of(strategy.cfg)
+    string, fleet = string_of(strategy.cfg), build_energy(strategy.cfg)
     source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
@@ -105,7 +106,7 @@ def clairvoyant(
         _, record = source.play(source.start(given), network, steps, shifts)
         data = source.assemble(record)
         check_batch(data, pieces_of(env), who=strategy.title)
-        energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None)
+        energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
         missed = misses(data, string)
         _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
@@ -128,7 +129,10 @@ def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> N
 
 
 def path_energy(
-    data: TensorDictBase, time_step: float, string: VehicleString | None = None
+    data: TensorDictBase,
+    time_step: float,
+    string: VehicleString | None = None,
+    energy: Fleet | None = None,
 ) -> Tensor:
     """Return the energy without what the last speed stores, ``[batch]`` [kJ].
 
@@ -138,7 +142,11 @@ def path_energy(
     if string is not None:
         views = Views(string, AUTOMATED, ["self.speed", "next.self.speed"])
         now, then = views(*(data.get(key) for key in views.keys))
-    power = path_power(now, (then - now) / time_step)
+    kind = data.get(CLASS, None)
+    if string is not None and kind is not None:
+        views = Views(string, AUTOMATED, ["self.energy_class"])
+        (kind,) = views(*(data.get(key) for key in views.keys))
+    power = as_fleet(energy).path_power(now, (then - now) / time_step, kind)
     return power.flatten(1).sum(1) * time_step * KILO
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.power import acceleration_loss, kinetic_energy, steady_power
+from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.functional.safety import NEVER
 
 KILO = 1e-3
@@ -17,41 +17,59 @@ PACE = 1.0  # below it a long time gap is a matter of metres [m/s]
 
 
 def energy_measures(
-    power: Tensor, speed: Tensor, alive: Tensor, time_step: float
+    power: Tensor,
+    speed: Tensor,
+    alive: Tensor,
+    time_step: float,
+    energy: Fleet | None = None,
+    kind: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Energy of every vehicle (A20), raw, net of its change in kinetic energy, and its distance.
+    """Energy of every vehicle (A20), raw, net of what its motion stores, and its distance.
 
     Args:
-        power: motor power of each step, ``[time, *batch, n, 1]`` [W].
+        power: power of each step, ``[time, *batch, n, 1]`` [W].
         speed: speed at every moment, ``[time + 1, *batch, n, 1]`` [m/s].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
+        energy: the energy models; None for that of the ALCC paper.
+        kind: class of every vehicle, ``[*batch, n, 1]``; None: all have the first model.
 
     Returns:
         ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
         that it did not draw), what the speeds driven take without accelerating
-        (``steady_energy_kj``), what accelerating loses (``acceleration_loss_kj``, see
-        :func:`lcc_rl.functional.power.acceleration_loss`), both together
-        (``path_energy_kj``: A2 without what the motion stores) and ``distance_m``, each
+        (``steady_energy_kj``), what a path takes without what the motion stores
+        (``path_energy_kj``; of a model without such a part the net energy), ``distance_m``, and,
+        of models that know them, what accelerating loses (``acceleration_loss_kj``) and the share
+        of time in which the vehicle cannot accelerate as it does (``share_infeasible``), each
         ``[*batch, n, 1]``.
     """
+    energy = as_fleet(energy)
+    motion = speed[:-1], speed.diff(dim=0) / time_step
+    still = torch.zeros_like(motion[0])
 
     def total(rate: Tensor) -> Tensor:
         return (rate * alive).sum(0) * time_step
 
-    energy, steady = total(power) * KILO, total(steady_power(speed[:-1])) * KILO
+    drawn, steady = total(power) * KILO, total(energy.power(speed[:-1], still, kind)) * KILO
     steps = alive.sum(0, keepdim=True).long().expand(1, *speed.shape[1:])
     last = speed.gather(0, steps).squeeze(0)
-    stored = (kinetic_energy(last) - kinetic_energy(speed[0])) * KILO
-    lost = total(acceleration_loss(speed[:-1], speed.diff(dim=0) / time_step)) * KILO
-    return {
-        "energy_kj": energy,
-        "net_energy_kj": energy - stored,
+    stored = (energy.stored_energy(last, kind) - energy.stored_energy(speed[0], kind)) * KILO
+    lost = energy.acceleration_loss(*motion, kind)
+    found = {
+        "energy_kj": drawn,
+        "net_energy_kj": drawn - stored,
         "steady_energy_kj": steady,
-        "acceleration_loss_kj": lost,
-        "path_energy_kj": steady + lost,
+        "path_energy_kj": drawn - stored,
         "distance_m": total(0.5 * (speed[:-1] + speed[1:])),
     }
+    if lost is not None:
+        found["acceleration_loss_kj"] = total(lost) * KILO
+        found["path_energy_kj"] = steady + found["acceleration_loss_kj"]
+    strange = energy.infeasible(*motion, kind)
+    if strange is not None:
+        count = steps.squeeze(0).clamp(min=1)
+        found["share_infeasible"] = (strange * alive).sum(0) / count
+    return found
 
 
 def measured_ttc(ttc: Tensor) -> Tensor:
@@ -90,6 +108,9 @@ def safety_measures(
     unsafe, long = series["ttc"] < UNSAFE_TTC, series["time_gap"] > LONG_TIME_GAP
     found = {
         "min_gap_m": lowest(series["gap"]),
+        "mean_gap_m": average(series["gap"]),
+        "max_gap_m": highest(series["gap"]),
+        "min_time_gap_s": lowest(series["time_gap"]),
         "min_ttc_s": measured_ttc(lowest(series["ttc"])),
         "max_time_gap_s": highest(series["time_gap"]),
         "share_ttc_unsafe": average(unsafe),

@@ -7,12 +7,13 @@ from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
 from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
 from lcc_rl.pieces.cruise import IDMACC, LinearACC
 from lcc_rl.pieces.estimator import DriverEstimator
-from lcc_rl.pieces.features import MotorPower, TimeGap, TimeToCollision
+from lcc_rl.pieces.features import EnergyClasses, MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.hybrid import HCFS
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.platoon_rewards import JerkReward, SpacingReward, VelocityReward
+from lcc_rl.pieces.ranges import RangeReward, SmoothRange
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
@@ -21,7 +22,7 @@ from lcc_rl.pieces.rewards import (
     SafetyReward,
     TotalReward,
 )
-from lcc_rl.pieces.rules import FollowerStopper, Handover
+from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
 from lcc_rl.pieces.surrogates import (
@@ -50,6 +51,7 @@ __all__ = [
     "DeadBeat",
     "DriverEstimator",
     "EfficiencyReward",
+    "EnergyClasses",
     "EnergyReward",
     "EquilibriumStart",
     "Feature",
@@ -63,13 +65,16 @@ __all__ = [
     "NGSIMLeader",
     "Observation",
     "ObservationMemory",
+    "PISaturation",
     "PathEnergy",
     "Piece",
     "Places",
+    "RangeReward",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
     "SmoothEfficiency",
+    "SmoothRange",
     "SmoothSafety",
     "Smoothness",
     "SpacingReward",

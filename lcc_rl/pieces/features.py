@@ -1,14 +1,21 @@
-"""Features of vehicles: time-to-collision, time gap and motor power."""
+"""Features of vehicles: time-to-collision, time gap and power, and the class that it depends on."""
 
 from __future__ import annotations
 
-from torch import Tensor
+from collections.abc import Sequence
+from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+
+from lcc_rl.energy import EnergyModel, Fleet, as_fleet
 from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.functional.power import motor_power
+from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
-from lcc_rl.pieces.base import Feature, StepTransform, as_key, next_key
+from lcc_rl.pieces.base import SEED, Feature, Key, StepTransform, as_key, next_key
 from lcc_rl.pieces.views import VEHICLES, Views
 
 
@@ -56,8 +63,59 @@ class TimeGap(Feature):
         return time_gap(gap, speed, self.speed_floor)
 
 
+CLASS = (VEHICLES, "energy_class")
+
+
+class EnergyClasses(StepTransform):
+    """Draws the class of every vehicle at reset, ``("vehicles", "energy_class")``, int64.
+
+    By the episode's seed, so that whoever drives meets the same vehicles; numbers are those of
+    the fleet's models.
+
+    Args:
+        string: the string of vehicles.
+        energy: the classes and their shares.
+    """
+
+    def __init__(self, string: VehicleString, energy: Fleet) -> None:
+        super().__init__([], [], constants=[CLASS], event_shape=(len(string), 1))
+        self.string, self.energy = string, energy
+        self.stream = stream_id("vehicles.energy_class")
+
+    def compute(self) -> tuple[()]:
+        """Return nothing: classes are constant within an episode."""
+        return ()
+
+    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        shape = (*batch, *self.event_shape)
+        return {CLASS: Unbounded(shape=shape, dtype=torch.int64, device=device)}
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        count, seed = len(self.string), start.get(SEED).unsqueeze(-2)
+        place = torch.arange(count, device=seed.device).unsqueeze(-1)
+        draw = uniform(seed, 0, self.stream + place)
+        kinds = _drawn(draw, self.energy.shares)
+        for role, shares in self.energy.roles.items():
+            if role in self.string.names:
+                if self.string.drawn:
+                    index = start.get((role, "index"))
+                else:
+                    index = torch.tensor(self.string.places(role), device=seed.device)
+                own = (place == index.unsqueeze(-2)).any(-1, keepdim=True)
+                kinds = torch.where(own, _drawn(draw, shares), kinds)
+        start.set(CLASS, kinds.expand(*start.batch_size, count, 1).clone())
+
+
+def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:
+    """Return the number of the class that each draw from [0, 1) means; int64, same shape."""
+    bounds = torch.tensor(shares, device=draw.device).cumsum(0)[:-1]
+    # A class without a share is never met, also where rounding leaves a crumb at the end.
+    last = max(number for number, share in enumerate(shares) if share > 0.0)
+    return torch.bucketize(draw, bounds, right=True).clamp(max=last)
+
+
 class MotorPower(StepTransform):
-    """Writes the motor power of the step just taken [W] (A2): from the speed at its start.
+    """Writes the power of the step just taken [W], from the speed at its start (A2 by default).
 
     Args:
         string: the string of vehicles.
@@ -66,6 +124,7 @@ class MotorPower(StepTransform):
             for what an automated vehicle believes of a human driver (A16).
         power: entry of theirs that is written.
         recuperation: count negative (braking) power.
+        energy: the energy models; None for that of the ALCC paper.
     """
 
     def __init__(
@@ -75,16 +134,21 @@ class MotorPower(StepTransform):
         acceleration: str = "acceleration",
         power: str = "power",
         recuperation: bool = True,
+        energy: Fleet | EnergyModel | None = None,
     ) -> None:
         everybody = vehicles == VEHICLES
         speed = f"{VEHICLES}.speed" if everybody else "self.speed"
         source = next_key((vehicles, acceleration))
-        self.views = Views(string, vehicles, [speed, ".".join(source)])
+        self.energy = as_fleet(energy)
+        names = [speed, ".".join(source)]
+        if len(self.energy.models) > 1:
+            names.append(".".join(CLASS) if everybody else f"self.{CLASS[-1]}")
+        self.views = Views(string, vehicles, names)
         count = len(string) if everybody else string.count(vehicles)
         super().__init__(self.views.keys, [as_key((vehicles, power))], event_shape=(count, 1))
         self.recuperation = recuperation
 
     def compute(self, *entries: Tensor) -> Tensor:
-        """Return the motor power, ``[*batch, n, 1]``."""
-        speed, acceleration = self.views(*entries)
-        return motor_power(speed, acceleration, self.recuperation)
+        """Return the power, ``[*batch, n, 1]``."""
+        power = self.energy.power(*self.views(*entries))
+        return power if self.recuperation else power.clamp(min=0.0)

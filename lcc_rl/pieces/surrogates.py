@@ -13,9 +13,10 @@ import math
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from lcc_rl.energy import EnergyModel, Fleet, as_fleet
 from lcc_rl.errors import ConfigError, require_in, require_positive
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.functional.power import path_power
+from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
@@ -187,16 +188,21 @@ class Correction(RewardTerm):
 
 
 class PathEnergy(RewardTerm):
-    """−P/scale · T of the energy that a path takes: A2 without what the motion stores.
+    """−P/scale · T of the energy that a path takes: without what the motion stores.
 
     Of A2's three parts (:func:`lcc_rl.functional.power.acceleration_loss`) the steady power of the
-    speeds driven and what accelerating loses; who ends slower than he began gains nothing by it.
+    speeds driven and what accelerating loses; of another model what is drawn less what the
+    kinetic energy is worth (:meth:`lcc_rl.energy.EnergyModel.path_power`). Who ends slower than he
+    began gains nothing by it.
 
     Args:
         time_step: duration of a step [s].
         name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
         scale: power that costs 1 per second [W].
         of: ``"self"``, or ``"behind"``: all vehicles behind, back to the next automated one.
+        distance_price: energy that a metre driven is worth [J/m]: at what a metre takes, the
+            objective is energy per distance, and falling behind gains nothing.
+        energy: the energy models; None for that of the ALCC paper.
 
     Raises:
         ConfigError: if the scale is not positive, or ``of`` is unknown.
@@ -209,23 +215,31 @@ class PathEnergy(RewardTerm):
         weight: float = 1.0,
         scale: float = 20000.0,
         of: str = "self",
+        distance_price: float = 0.0,
         string: VehicleString | None = None,
+        energy: Fleet | EnergyModel | None = None,
     ) -> None:
         require_positive(f"agent.surrogates.{name}", scale=scale)
+        require_in(f"agent.surrogates.{name}", "[0, inf)", distance_price=distance_price)
         if of not in ("self", "behind"):
             raise ConfigError(f"agent.surrogates.{name}.of must be self or behind, got {of!r}")
         string = VehicleString() if string is None else string
         self.sections, self.behind = Sections(string, VEHICLES), of == "behind"
         space = VEHICLES if self.behind else "self"
         reads = [f"{space}.speed", f"{space}.acceleration"]
+        self.energy, self.distance_price = as_fleet(energy), distance_price
+        self.mixed = len(self.energy.models) > 1
+        if self.mixed:
+            reads.append(f"{space}.{CLASS[-1]}")
         reads += [".".join(key) for key in self.sections.keys if self.behind]
         super().__init__(name, weight, reads, string)
         self.time_step, self.factor = time_step, time_step / scale
 
-    def reward(self, speed: Tensor, acceleration: Tensor, *indices: Tensor) -> Tensor:
+    def reward(self, speed: Tensor, acceleration: Tensor, *more: Tensor) -> Tensor:
         """Return the unweighted term."""
         before = speed - acceleration * self.time_step
-        power = path_power(before, acceleration)
+        kind, indices = (more[0], more[1:]) if self.mixed else (None, more)
+        power = self.energy.path_power(before, acceleration, kind) - self.distance_price * before
         if self.behind:
             power = self.sections.sum(power, *indices)
         return power * -self.factor

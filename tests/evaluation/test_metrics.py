@@ -39,6 +39,9 @@ def test_safety() -> None:
     measures = safety_measures(series, ALIVE.view(2, 2, 1, 1), 0.1)
     expected = {
         "min_gap_m": [7.0, 3.0],
+        "mean_gap_m": [7.5, 3.0],
+        "max_gap_m": [8.0, 3.0],
+        "min_time_gap_s": [1.0, 1.0],
         "min_ttc_s": [3.0, 5.0],
         "max_time_gap_s": [2.6, 1.0],
         "share_ttc_unsafe": [0.5, 0.0],

@@ -19,6 +19,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
 import lcc_rl.pieces as room
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet
 from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.envs.step import Pieces
 from lcc_rl.pieces import (
@@ -38,6 +39,7 @@ from lcc_rl.pieces import (
     DeadBeat,
     DriverEstimator,
     EfficiencyReward,
+    EnergyClasses,
     EnergyReward,
     EquilibriumStart,
     Feature,
@@ -53,12 +55,15 @@ from lcc_rl.pieces import (
     ObservationMemory,
     PathEnergy,
     Piece,
+    PISaturation,
     Places,
+    RangeReward,
     RewardPiece,
     RewardTerm,
     SafetyReward,
     SmoothEfficiency,
     Smoothness,
+    SmoothRange,
     SmoothSafety,
     SpacingReward,
     StepTransform,
@@ -74,11 +79,15 @@ from lcc_rl.pieces.base import as_key
 from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, shared_policy
 
 HORIZON, T = 12, 0.1
+FLEET = Fleet(
+    {"car": CirclesFuel(), "electric": ElectricCar()}, roles={"automated": {"electric": 1.0}}
+)
 CONNECTED = ("cacc", "beat", "hybrid")
 ROLES = ("human", "automated", "human", "cacc", "cacc", "automated", "beat", "stopper")
 ROLES = (
     *ROLES,
     "handover",
+    "saturating",
     "constant",
     "plain",
     "following",
@@ -130,6 +139,7 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "CACC": lambda: CACC(T, k3=0.4, string=string, role="cacc"),
         "DeadBeat": lambda: DeadBeat(T, string=string, role="beat"),
         "FollowerStopper": lambda: stopper("stopper"),
+        "PISaturation": lambda: PISaturation(T, 0.5, string=string, role="saturating"),
         "Handover": lambda: Handover(
             human("handover"), stopper("handover"), 0.5, T, string, "handover"
         ),
@@ -169,6 +179,8 @@ def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         ),
         "EnergyReward, string": lambda: EnergyReward(T, "string_energy", of="string", **own),
         "CollisionPenalty": lambda: CollisionPenalty(**own),
+        "RangeReward": lambda: RangeReward("longest", largest=9.0, **own),
+        "SmoothRange": lambda: SmoothRange("shortest", 1.0, "time_gap", least=1.2, **own),
         "VelocityReward": lambda: VelocityReward(**own),
         "JerkReward": lambda: JerkReward(**own),
         "SpacingReward": lambda: SpacingReward(**own),
@@ -177,6 +189,7 @@ def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         "Smoothness": lambda: Smoothness(**own),
         "Correction": lambda: Correction(**own),
         "PathEnergy": lambda: PathEnergy(T, "path_energy", **own),
+        "PathEnergy, mixed": lambda: PathEnergy(T, "path_mixed", energy=FLEET, **own),
         "PathEnergy, behind": lambda: PathEnergy(T, "path_behind", of="behind", **own),
     }
 
@@ -196,7 +209,9 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         "DriverEstimator": lambda: DriverEstimator(POPULATION, T, learning_time=0.5, **own),
         "TimeToCollision": lambda: TimeToCollision(string),
         "TimeGap": lambda: TimeGap(string),
+        "EnergyClasses": lambda: EnergyClasses(string, FLEET),
         "MotorPower": lambda: MotorPower(string),
+        "MotorPower, mixed": lambda: MotorPower(string, power="mixed_power", energy=FLEET),
         "MotorPower, estimated": lambda: MotorPower(
             string, "human", "predicted_acceleration", "predicted_power"
         ),

@@ -1,0 +1,131 @@
+"""Which vehicle has which energy model: one for all, or classes drawn by share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lcc_rl.config import build_as
+from lcc_rl.energy.base import EnergyModel
+from lcc_rl.energy.motor import PaperMotor
+from lcc_rl.errors import ConfigError, require_in, unknown_name
+
+MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
+Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
+
+
+class Fleet:
+    """The energy models of the vehicles of a string.
+
+    Args:
+        models: by the name of the class.
+        shares: share of each class among the vehicles; None for equal shares.
+        roles: shares among the vehicles of a role, where they differ.
+
+    Raises:
+        ConfigError: if there is no model, or the shares name an unknown one or are all zero.
+    """
+
+    def __init__(
+        self,
+        models: Mapping[str, EnergyModel | Mapping[str, Any]],
+        shares: Mapping[str, float] | None = None,
+        roles: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:
+        if not models:
+            raise ConfigError("energy.models is empty: a mixture needs at least one model")
+        self.names = list(models)
+        self.models = [
+            model
+            if isinstance(model, EnergyModel)
+            else build_as("an energy model", EnergyModel, model, f"energy.models.{name}")
+            for name, model in models.items()
+        ]
+        shares = dict.fromkeys(self.names, 1.0) if shares is None else shares
+        self.shares = self._checked(shares, "energy.shares")
+        self.roles = {
+            role: self._checked(own, f"energy.roles.{role}") for role, own in (roles or {}).items()
+        }
+
+    def _checked(self, shares: Mapping[str, float], where: str) -> list[float]:
+        """Return the shares of all classes, which add up to one."""
+        for name in shares:
+            if name not in self.names:
+                raise unknown_name(f"class of {where}", name, self.names)
+        require_in(where, "[0, inf)", **dict(shares))
+        total = sum(shares.values())
+        if not total > 0.0:
+            raise ConfigError(f"{where}: at least one share must be above 0")
+        return [shares.get(name, 0.0) / total for name in self.names]
+
+    def power(self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None) -> Tensor:
+        """Return the power drawn [W], see :meth:`EnergyModel.power`.
+
+        Args:
+            speed: speed at the start of a step, any shape [m/s].
+            acceleration: executed acceleration, same shape [m/s²].
+            kind: number of each vehicle's class, same shape, int64; None: all have the first.
+        """
+        return self._of(lambda model, *motion: model.power(*motion), speed, acceleration, kind)
+
+    def path_power(self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None) -> Tensor:
+        """Return the power without what the motion stores [W]; arguments as of :meth:`power`."""
+        return self._of(lambda model, *motion: model.path_power(*motion), speed, acceleration, kind)
+
+    def stored_energy(self, speed: Tensor, kind: Tensor | None = None) -> Tensor:
+        """Return what a speed is worth [J], see :meth:`EnergyModel.stored_energy`."""
+        return self._of(lambda model, v, _: model.stored_energy(v), speed, speed, kind)
+
+    def acceleration_loss(
+        self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
+    ) -> Tensor | None:
+        """Return what accelerating loses [W]; None unless all models have such a part."""
+        return self._known(EnergyModel.acceleration_loss, speed, acceleration, kind)
+
+    def infeasible(
+        self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
+    ) -> Tensor | None:
+        """Return where a vehicle cannot accelerate like this; None unless all models say."""
+        return self._known(EnergyModel.infeasible, speed, acceleration, kind)
+
+    def _known(
+        self, method: Any, speed: Tensor, acceleration: Tensor, kind: Tensor | None
+    ) -> Tensor | None:
+        """Return what all models have; None if one has it not."""
+        name = method.__name__
+        if any(getattr(type(model), name) is method for model in self.models):
+            return None
+        return self._of(lambda model, *x: getattr(model, name)(*x), speed, acceleration, kind)
+
+    def _of(
+        self, quantity: Quantity, speed: Tensor, acceleration: Tensor, kind: Tensor | None
+    ) -> Tensor:
+        found = quantity(self.models[0], speed, acceleration)
+        if kind is not None:
+            for number, model in enumerate(self.models[1:], 1):
+                found = torch.where(kind == number, quantity(model, speed, acceleration), found)
+        return found
+
+
+def as_fleet(energy: EnergyModel | Fleet | None) -> Fleet:
+    """Return one model, or that of the ALCC paper for None, as that of a whole fleet."""
+    if isinstance(energy, Fleet):
+        return energy
+    return Fleet({"all": PaperMotor() if energy is None else energy})
+
+
+def build_energy(cfg: Any) -> Fleet:
+    """Build the energy models that the node ``energy`` of a configuration describes.
+
+    A configuration of a release without the node has the ALCC paper's.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    node = cfg.get("energy")
+    if node is None:
+        return as_fleet(None)
+    return as_fleet(build_as("an energy model", MEANT, node, "energy"))

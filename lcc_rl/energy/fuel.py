@@ -1,0 +1,117 @@
+"""Fuel of cars and trucks: the simplified models of the CIRCLES consortium, version 3.1."""
+
+from __future__ import annotations
+
+import csv
+from functools import cache
+from importlib.resources import files
+
+import torch
+from torch import Tensor
+
+from lcc_rl.energy.base import EnergyModel
+from lcc_rl.errors import require_positive, unknown_name
+
+FUEL = "circles_fuel.csv"
+GASOLINE, DIESEL = 0.745, 0.832  # [kg/L]
+TRUCKS = ("Class4PND", "Class8Tractor")
+STANDSTILL, STILL = 0.1, 0.01  # slower than the first [m/s], weaker than the second [m/s²]: idle
+# Fuel that gives a vehicle its kinetic energy: 15.4 kJ of it per gram, 35 % of 44 kJ.
+KINETIC = 15.4e3  # [J/g]
+KILOWATT = 1e3
+
+
+@cache
+def coefficients() -> dict[str, dict[str, float]]:
+    """Return the published coefficients of every vehicle; those that one lacks are zero."""
+    text = files("lcc_rl.assets").joinpath("energy", FUEL).read_text()
+    rows = csv.DictReader(text.splitlines())
+    return {
+        row.pop("vehicle"): {name: float(value or 0.0) for name, value in row.items()}
+        for row in rows
+    }
+
+
+class CirclesFuel(EnergyModel):
+    """Fuel rate of a vehicle as a polynomial of speed, acceleration and grade, as power [W].
+
+    Below a deceleration that grows with speed the engine gets no fuel: a jump, exact in
+    :meth:`power` and bridged over a ``width`` in :meth:`smooth_power`. An acceleration beyond
+    what the vehicle can do counts as the largest that it can (:meth:`infeasible` tells where).
+
+    Args:
+        vehicle: Compact, midBase, midSUV, Pickup, Class4PND or Class8Tractor.
+        grade: of the road [rad].
+        width: range over which the cut of the fuel is bridged [m/s²].
+
+    Raises:
+        ConfigError: if the vehicle is unknown or a setting is out of range.
+    """
+
+    def __init__(self, vehicle: str = "midBase", grade: float = 0.0, width: float = 0.1) -> None:
+        if vehicle not in coefficients():
+            raise unknown_name("vehicle (energy.vehicle)", vehicle, coefficients())
+        require_positive("energy", width=width)
+        self.own = coefficients()[vehicle]
+        self.heat = self.own["gs2kW"] * KILOWATT  # [J/g]
+        truck = vehicle in TRUCKS
+        density = DIESEL if truck else GASOLINE
+        super().__init__(self.own["mass_kg"], KINETIC / self.heat, grade, self.heat, density)
+        self.vehicle, self.truck, self.width = vehicle, truck, width
+
+    def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return the heat of the fuel burnt [W]."""
+        return self.fuel(speed, acceleration) * self.heat
+
+    def smooth_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return the same with the fuel cut bridged and without the state of idling."""
+        speed = speed.clamp(min=0.0)
+        rate = self._rate(speed, acceleration)
+        if not self.truck:
+            weaker = (self._cut(speed) - acceleration) / self.width
+            rate = rate * (1.0 - weaker.sigmoid() * (speed > self.own["vc"]))
+        return rate * self.heat
+
+    def fuel(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return the fuel rate [g/s], same shape; arguments as of :meth:`power`."""
+        own, idle = self.own, (speed.abs() < STANDSTILL) & (acceleration.abs() < STILL)
+        speed = speed.clamp(min=0.0)
+        # The cut looks at what is asked for, the engine gives what it can.
+        rate = self._rate(speed, acceleration)
+        if not self.truck:
+            cut = (speed > own["vc"]) & (acceleration <= self._cut(speed))
+            rate = rate.masked_fill(cut, 0.0)
+        return rate.masked_fill(idle, own["fc_idle"])
+
+    def infeasible(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return where the vehicle cannot accelerate like this."""
+        return acceleration > self._strongest(speed.clamp(min=0.0))
+
+    def _strongest(self, speed: Tensor) -> Tensor:
+        """Return the largest acceleration that is feasible [m/s²]."""
+        own = self.own
+        force = own["b2"] / speed.clamp(min=1e-6) - own["b3"] * speed.square()
+        uphill = (own["b5"] + own["b6"] * speed).clamp(max=own["b4"])
+        return force.clamp(max=own["b1"]) - uphill * self.grade
+
+    def _rate(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return the fuel rate [g/s] of an engine that gets fuel."""
+        own, grade = self.own, self.grade
+        acceleration = torch.minimum(acceleration, self._strongest(speed))
+        linear = own["p0"] + speed * (own["p1"] + speed * own["p2"])
+        quadratic = own["q0"] + own["q1"] * speed
+        vertex = -linear / (2.0 * quadratic).clamp(min=1e-9)
+        rate = own["C0"] + speed * (own["C1"] + speed * (own["C2"] + speed * own["C3"]))
+        rate = rate + acceleration * linear
+        rate = rate + torch.maximum(acceleration, vertex).square() * quadratic
+        rate = rate + grade * (own["z0"] + speed * (own["z1"] + speed * own["z2"]))
+        if self.truck:
+            return torch.maximum(rate, own["h0"] + own["h1"] * speed)
+        idling = own["beta0"] * (speed <= own["vc"])
+        return torch.maximum(rate, idling)
+
+    def _cut(self, speed: Tensor) -> Tensor:
+        """Return the acceleration below which the engine gets no fuel [m/s²]."""
+        own, grade = self.own, self.grade
+        cut = own["a0"] + speed * (own["a1"] + own["a3"] * speed)
+        return cut + grade * (own["a2"] + own["a4"] * speed)

@@ -1,0 +1,137 @@
+"""Energy models against published figures and their own parts."""
+
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from scipy.interpolate import PchipInterpolator
+
+from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, PaperMotor
+from lcc_rl.energy.fuel import coefficients
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.power import motor_power
+
+POINTS = Path(__file__).parent / "circles_fuel_check_points.csv"
+MODELS: dict[str, EnergyModel] = {
+    "motor": PaperMotor(),
+    "electric": ElectricCar(),
+    **{name: CirclesFuel(name) for name in coefficients()},
+}
+# Label figures of FASTSim's vehicle files, city and highway [kWh/mile].
+LABELS = {"electric": (0.265, 0.331), "bolt": (0.263, 0.306)}
+BOLT = {"mass": 1758.0, "drag": 0.29, "area": 2.845, "rolling": 0.0073, "regeneration_limit": 7e4}
+CARS = {"electric": ElectricCar(), "bolt": ElectricCar(**BOLT)}
+# A label counts 70 % of the range of the laboratory, and 86 % of the socket reaches the battery.
+LABORATORY, CHARGER, MILE = 0.7, 0.86, 1.609344
+
+
+@pytest.mark.parametrize("vehicle", coefficients())
+def test_fuel_equals_the_published_model_at_its_check_points(vehicle) -> None:
+    points = pd.read_csv(POINTS)
+    points = points[points["vehicle"] == vehicle]
+    assert len(points) == 13
+    for grade, part in points.groupby("grade_rad"):
+        model = CirclesFuel(vehicle, grade=grade)
+        motion = [
+            torch.tensor(part[name].to_numpy()) for name in ("speed_mps", "acceleration_mps2")
+        ]
+        torch.testing.assert_close(
+            model.fuel(*motion), torch.tensor(part["fuel_g_per_s"].to_numpy()), atol=1e-5, rtol=0.0
+        )
+        assert model.infeasible(*motion).tolist() == part["infeasible"].astype(bool).tolist()
+
+
+@pytest.mark.parametrize("car", CARS)
+@pytest.mark.parametrize(("cycle", "place"), [("udds", 0), ("hwfet", 1)])
+def test_electric_cars_use_what_their_label_says(car, cycle, place) -> None:
+    speed = shipped_cycle(cycle)
+    power = CARS[car].power(speed[:-1], speed.diff() / 0.1)
+    used = float(power.sum()) * 0.1 / 3600.0  # [Wh]
+    kilometres = float((speed[1:] + speed[:-1]).sum()) / 2.0 * 0.1 / 1e3
+    published = LABELS[car][place] * LABORATORY * CHARGER / MILE * 1e3
+    assert used / kilometres == pytest.approx(published, rel=0.15)
+
+
+def test_braking_returns_no_more_than_the_limits_allow() -> None:
+    car = ElectricCar(auxiliary=0.0, regeneration_limit=20e3, efficiency=0.9)
+    speed = torch.tensor([30.0, 20.0, 2.5, 0.0])
+    power = car.power(speed, torch.full((4,), -3.0))
+    assert power[:2].tolist() == pytest.approx([-18e3, -18e3])
+    whole = ElectricCar(auxiliary=0.0, efficiency=0.9, fade_speed=0.1)
+    assert power[2] == pytest.approx(0.5 * float(whole.power(speed, torch.full((4,), -3.0))[2]))
+    assert power[3] == 0.0
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_path_takes_what_is_drawn_less_what_is_stored(name) -> None:
+    model, speed = MODELS[name], torch.linspace(8.0, 22.0, 2001, dtype=torch.float64)
+    motion = speed[:-1], speed.diff() / 0.01
+    drawn, path = (
+        float(part(*motion).sum()) * 0.01 for part in (model.smooth_power, model.path_power)
+    )
+    stored = float(model.stored_energy(speed[-1]) - model.stored_energy(speed[0]))
+    if name == "motor":  # whose own stored energy is not the kinetic one
+        loss = float(model.acceleration_loss(*motion).sum()) * 0.01
+        steady = float(model.power(speed[:-1], torch.zeros_like(speed[:-1])).sum()) * 0.01
+        assert path == pytest.approx(steady + loss, rel=1e-9)
+    else:
+        assert path == pytest.approx(drawn - stored, abs=2e-3 * stored)
+        assert model.acceleration_loss(*motion) is None
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "motor"])
+def test_power_has_a_finite_gradient_everywhere(name) -> None:
+    speed, acceleration = torch.meshgrid(
+        torch.linspace(0.0, 35.0, 71), torch.linspace(-5.0, 3.0, 81), indexing="ij"
+    )
+    speed, acceleration = (x.clone().requires_grad_() for x in (speed, acceleration))
+    for function in (MODELS[name].power, MODELS[name].smooth_power, MODELS[name].path_power):
+        found = torch.autograd.grad(function(speed, acceleration).sum(), (speed, acceleration))
+        assert all(part.isfinite().all() for part in found)
+
+
+def test_the_bridge_over_the_fuel_cut_is_narrow() -> None:
+    model = CirclesFuel("midBase")
+    speed = torch.full((2,), 20.0)
+    far = torch.tensor([-2.0, 0.5])  # a width or more from the cut at −0.26 m/s²
+    torch.testing.assert_close(
+        model.smooth_power(speed, far), model.power(speed, far), atol=30.0, rtol=1e-3
+    )
+    near = torch.linspace(-0.4, -0.1, 301)
+    smooth = model.smooth_power(torch.full((301,), 20.0), near)
+    exact = model.power(torch.full((301,), 20.0), near)
+    assert exact.diff().abs().max() > 5e3
+    assert smooth.diff().abs().max() < 0.1 * exact.diff().abs().max()
+
+
+def test_the_motor_of_the_paper_is_unchanged() -> None:
+    speed, acceleration = torch.rand(2, 100).mul(20.0)
+    torch.testing.assert_close(
+        PaperMotor().power(speed, acceleration), motor_power(speed, acceleration), rtol=0, atol=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: CirclesFuel("midbase"), "energy.vehicle.*midBase"),
+        (lambda: CirclesFuel(grade=0.5), r"energy.grade.*0\.3.*0\.5"),
+        (lambda: CirclesFuel(width=0.0), "energy.width"),
+        (lambda: ElectricCar(mass=-1.0), "energy.mass"),
+        (lambda: ElectricCar(efficiency=1.2), "energy.efficiency"),
+        (lambda: ElectricCar(regeneration_limit=float("nan")), "energy.regeneration_limit"),
+    ],
+)
+def test_settings_out_of_range_are_named(make, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make()
+
+
+def shipped_cycle(name: str) -> torch.Tensor:
+    table = pd.read_csv(str(files("lcc_rl.assets").joinpath("cycles", f"{name}.csv")))
+    times = np.arange(0.0, table["time_s"].iloc[-1] + 0.05, 0.1)
+    speeds = PchipInterpolator(table["time_s"], table["speed_mps"])(times)
+    return torch.from_numpy(np.maximum(speeds, 0.0))

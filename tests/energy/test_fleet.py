@@ -1,0 +1,105 @@
+"""Classes of vehicles: who has which energy model, and what an environment makes of it."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import lcc_rl
+from lcc_rl.config import load
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor, build_energy
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.pieces.features import CLASS
+
+MODELS = {"car": CirclesFuel(), "truck": CirclesFuel("Class8Tractor"), "electric": ElectricCar()}
+MIXED = ["energy=mixture", "scenario.string=automated human*3"]
+
+
+def test_every_vehicle_has_the_power_of_its_class() -> None:
+    fleet = Fleet(MODELS)
+    speed, acceleration = torch.rand(2, 60) * 20.0
+    kind = torch.arange(60) % 3
+    found = fleet.power(speed, acceleration, kind)
+    for number, model in enumerate(MODELS.values()):
+        own = kind == number
+        torch.testing.assert_close(found[own], model.power(speed[own], acceleration[own]))
+    assert fleet.acceleration_loss(speed, acceleration, kind) is None
+    assert fleet.infeasible(speed, acceleration, kind) is None  # the electric car does not say
+    cars = Fleet({name: MODELS[name] for name in ("car", "truck")})
+    strange = cars.infeasible(speed, acceleration + 2.0, kind % 2)
+    assert strange.any()
+    assert not strange.all()
+    assert Fleet({"all": PaperMotor()}).acceleration_loss(speed, acceleration).min() >= 0.0
+
+
+@pytest.mark.parametrize("string", ["automated*2 human*6", "{size: 8, penetration: 0.25}"])
+def test_classes_are_drawn_by_share_and_constant(string) -> None:
+    overrides = [
+        "energy=mixture",
+        f"scenario.string={string}",
+        "energy.shares={midsize: 3, suv: 1, compact: 0, pickup: 0, class8: 0, electric: 0}",
+    ]
+    env = lcc_rl.make_env("alcc", 2000, [*overrides, "+energy.roles.automated={electric: 1}"])
+    data = env.rollout(2, break_when_any_done=False)
+    kinds = data[CLASS]
+    assert (kinds[:, 0] == kinds[:, 1]).all()
+    names = list(load("train", overrides).energy.models)
+    index = data["automated", "index"][:, 0]
+    own = kinds[:, 0].squeeze(-1).gather(-1, index)
+    assert (own == names.index("electric")).all()
+    place = torch.arange(8)
+    human = kinds[:, 0].squeeze(-1)[~(place == index.unsqueeze(-1)).any(-2)]
+    share = (human == names.index("midsize")).float().mean()
+    assert share == pytest.approx(0.75, abs=0.02)
+    assert (human[human != names.index("midsize")] == names.index("suv")).all()
+
+
+def test_an_episode_has_the_same_vehicles_whoever_drives() -> None:
+    seeds = torch.arange(5).unsqueeze(-1)
+    kinds = []
+    for variant in ("alcc", "idm"):
+        env = lcc_rl.make_env(variant, 5, MIXED, single=False)
+        first = env.reset(
+            env.state_spec.zero().select(("episode", "seed")).set(("episode", "seed"), seeds)
+        )
+        kinds.append(first[CLASS])
+    assert (kinds[0] == kinds[1]).all()
+    assert len(kinds[0].unique()) > 2
+
+
+@pytest.mark.parametrize("energy", ["mixture", "midsize", "electric"])
+def test_environments_fit_their_specs(energy) -> None:
+    check_env_specs(lcc_rl.make_env("alcc", 3, [f"energy={energy}"]), seed=0)
+
+
+def test_power_of_an_environment_is_that_of_the_models() -> None:
+    env = lcc_rl.make_env("alcc", 4, MIXED)
+    data = env.rollout(20, break_when_any_done=False)
+    fleet = build_energy(load("train", MIXED))
+    after = data["next", "vehicles"]
+    wanted = fleet.power(data["vehicles", "speed"], after["acceleration"], data[CLASS])
+    torch.testing.assert_close(after["power"], wanted)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Fleet({}), "energy.models is empty"),
+        (lambda: Fleet(MODELS, {"cart": 1.0}), r"energy.shares.*'cart'.*car"),
+        (lambda: Fleet(MODELS, {"car": 0.0}), "energy.shares: at least one"),
+        (lambda: Fleet(MODELS, {"car": -1.0}), "energy.shares.car"),
+        (lambda: Fleet(MODELS, None, {"human": {"bus": 1.0}}), r"energy.roles.human.*'bus'"),
+        (lambda: build_energy(load("train", ["energy._target_=builtins.dict"])), "energy"),
+        (lambda: lcc_rl.make_env("alcc", 1, ["energy=petrol"]), "petrol"),
+        (lambda: lcc_rl.make_env("alcc", 1, ["energy=midsize", "energy.vehicle=van"]), "van"),
+    ],
+)
+def test_mistakes_are_named(make, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make()
+
+
+def test_unknown_roles_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"energy.roles.*lorry.*automated, human"):
+        lcc_rl.make_env("alcc", 1, [*MIXED, "+energy.roles.lorry={class8: 1}"])
+    assert VehicleString(("human",)).names == ("human",)
