@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
+from lcc_rl.envs.compiled import settings
 from lcc_rl.envs.step import tick
 from lcc_rl.errors import ConfigError, require_whole
 from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
@@ -132,6 +133,16 @@ class Traffic(TransformedEnv):
         if tensordict is not None:
             self._check_options(tensordict)
         return super()._reset(tensordict, **settings)
+
+    def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
+        """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
+
+        Settings of pieces are not compared at every step, unless a ``mode``, a ``backend`` or
+        ``options`` are given.
+        """
+        own = {} if {"mode", "backend", "options"} & set(given) else settings()
+        super().compile(warmup=warmup, **{**own, **given})
+        return self
 
     def _moment_keys(self) -> set[Key]:
         """Return the keys of everything that a reset writes."""

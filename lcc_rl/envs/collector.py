@@ -92,7 +92,7 @@ class StringCollector(BaseCollector):
         self.advance = Compiled(self._advance, "the environment", compiled)
         self.renew = Compiled(self._renewed, "its resets", compiled)
         # A compiled reset takes so many episodes at once, about twice as many as end in a step.
-        self.rows = min(episodes, max(16, episodes // 64)) if compiled else 0
+        self.rows = min(episodes, max(32, episodes // 64)) if compiled else 0
 
     def _inner(self, key: Key) -> Key:
         """Return the key under which the pieces know an entry."""

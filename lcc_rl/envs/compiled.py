@@ -13,8 +13,9 @@ from torch._inductor.exc import InductorError
 log = logging.getLogger("lcc_rl")
 
 COMPILER_ERRORS = (TorchDynamoException, InductorError)
-# Where an object whose method is compiled keeps the environment and its pieces.
-CONSTANT = ("self.env", "self.step", "self.first")
+# Where an object whose method is compiled keeps the environment and its pieces, and an environment
+# its pieces.
+CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
 
 
 class Compiled:
@@ -30,9 +31,9 @@ class Compiled:
     """
 
     def __init__(self, function: Callable[..., Any], what: str, compiled: bool) -> None:
-        self.plain, self.what, self.function = function, what, function
-        if compiled:
-            self.function = _compiled(function)
+        self.plain, self.what = function, what
+        # One graph for each size: a graph for any size would be slower.
+        self.function = compile(function, dynamic=False, **settings()) if compiled else function
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
@@ -46,22 +47,22 @@ class Compiled:
             return self.plain(*arguments)
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function, apart from all other objects' compilations of the same code.
-
-    One graph for each size: a graph for any size would be slower.
-    """
-    options: Any = {"guard_filter_fn": _checked}
-    return compile(function, dynamic=False, isolate_recompiles=True, options=options)
-
-
 def _checked(guards: Sequence[Any]) -> list[bool]:
     """Return which of a graph's guards to check before each use.
 
-    Pieces do not change (lcc_rl.envs.checks refuses those that do); to check a thousand settings
-    of them takes 0.1 ms, as long as a step of a small batch. Arguments, the policy, and whether
+    Pieces do not change (:mod:`lcc_rl.envs.checks` refuses those that do); to check a thousand
+    settings of them takes as long as a step of a small batch. Arguments, the policy, and whether
     gradients are kept are checked.
     """
     return [
         not guard.is_global and not any(name in guard.name for name in CONSTANT) for guard in guards
     ]
+
+
+def settings() -> dict[str, Any]:
+    """Return settings of ``torch.compile`` for functions of an environment.
+
+    Apart from other objects' compilations of the same code, whose guards would be tried first and
+    count towards the compiler's limit of graphs. New at each call: torch takes entries out.
+    """
+    return {"isolate_recompiles": True, "options": {"guard_filter_fn": _checked}}

@@ -101,7 +101,8 @@ class PlainEvaluation(PlainLoop):
     def measure(self, given: TensorDictBase) -> Sums:
         """Play all episodes to the horizon; return their measures, each ``[batch, 1]``."""
         now = self.start(self.env.reset(given))
-        now = {key: now[key] for key in now if key not in ("estimate", "covariance")}
+        # Of one human driver: [batch, 1] as of the other vehicles.
+        now = {key: now[key].flatten(1) for key in now if key not in ("estimate", "covariance")}
         now |= {"alive": torch.ones_like(now["cav"]), "cav_last": torch.zeros_like(now["cav"])}
         none = torch.zeros_like(now["cav"])
         sums = dict.fromkeys(SUMMED, none) | {
