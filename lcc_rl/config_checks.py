@@ -141,7 +141,7 @@ def _unused_by_agent(agent: DictConfig) -> Iterator[tuple[str, str]]:
     if policy in ("idm", "acc"):
         yield "agent.hidden", f"agent.policy={policy} has no layers"
     if agent.get("bootstrap") is False:
-        for name in ("value_lr", "td_lambda", "tau"):
+        for name in ("value_lr", "td_lambda", "value_every", "tau"):
             yield f"agent.{name}", "agent.bootstrap=false learns no value"
     limits = agent.get("limits")
     if OmegaConf.is_dict(limits) and not any(share is not None for share in limits.values()):

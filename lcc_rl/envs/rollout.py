@@ -63,15 +63,10 @@ class DifferentiableRollout:
         td = self.env.reset(given)
         return {key: td.get(key) for key in sorted(self.carried)}
 
-    def _advance(
-        self, network: Network, state: State, shift: Tensor | None = None
-    ) -> tuple[State, Tensor]:
-        """Return the moment reached and the action taken."""
-        action = network(state[OBSERVATION])
-        if shift is not None:
-            action = (action + shift).clamp(-1.0, 1.0)
+    def _advance(self, state: State, action: Tensor) -> State:
+        """Return the moment reached."""
         reached = self.step({**state, ACTION: action})
-        return {key: reached[key] for key in state}, action
+        return {key: reached[key] for key in state}
 
     def play(
         self, state: State, network: Network, steps: int, shifts: Tensor | None = None
@@ -90,10 +85,12 @@ class DifferentiableRollout:
         """
         record = []
         for step in range(steps):
-            shift = None if shifts is None else shifts[step]
-            reached, action = self.advance(network, state, shift)
+            # Not compiled: in a compiled graph with its gradient, ReLU is many times slower.
+            action = network(state[OBSERVATION])
+            if shifts is not None:
+                action = (action + shifts[step]).clamp(-1.0, 1.0)
             record.append(self._entries(state, action))
-            state = reached
+            state = self.advance(state, action)
         record.append(self._entries(state, torch.zeros_like(action)))
         return state, record
 

@@ -121,7 +121,7 @@ def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
     _, expected = unrolled.play(unrolled.start(), network, 3)
 
     def no_compiler(function, **settings):
-        def fail(network, state, shift):
+        def fail(state, action):
             raise torch._dynamo.exc.TorchDynamoException("no C++ compiler found\nmore")
 
         return fail
