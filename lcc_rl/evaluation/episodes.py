@@ -21,12 +21,13 @@ from lcc_rl.evaluation.rows import (
     INDEX,
     KEYS,
     PROMISED,
+    as_frame,
     describe,
     desired_speeds,
     grouped,
     leader_faster,
     leader_measures,
-    measure,
+    measures,
     sample,
 )
 from lcc_rl.evaluation.strategies import Strategy
@@ -203,7 +204,8 @@ class Episodes:
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired)
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile)
-        rows = pd.concat([described, leader, measure(groups, alive, time_step)], axis=1)
+        measured = as_frame(measures(groups, alive, time_step))
+        rows = pd.concat([described, leader, measured], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
         inside = [index for index in inside if 0 <= index < count]

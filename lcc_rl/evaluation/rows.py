@@ -62,7 +62,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
         elif space == "vehicles" and not string.drawn:
             for group, places in (("cav", own), ("hdv", others)):
                 if places:
-                    groups[group][name] = entry[..., places, :]
+                    groups[group][name] = entry[..., _slice(places), :]
         elif space == "vehicles":
             index = record[INDEX][0]
             place = torch.arange(len(string), device=index.device)
@@ -75,15 +75,27 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     return groups
 
 
-def measure(groups: Groups, alive: Tensor, time_step: float) -> pd.DataFrame:
-    """Turn the record of a batch into one row per episode; energies add up over vehicles (A20)."""
+def _slice(places: list[int]) -> slice | list[int]:
+    """Return neighbouring places as a slice, which copies nothing."""
+    first, end = places[0], places[-1] + 1
+    return slice(first, end) if len(places) == end - first else places
+
+
+def measures(groups: Groups, alive: Tensor, time_step: float) -> dict[str, Tensor]:
+    """Return the measures of a batch, each ``[batch, 1]``; energies add up over vehicles (A20).
+
+    Args:
+        groups: the record of each group of vehicles.
+        alive: whether each step belongs to a running episode, ``[time, batch, 1]``.
+        time_step: duration of a step [s].
+    """
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
         series = groups[group]
         if "power" not in series:
             continue
-        measures = energy_measures(series["power"], series["speed"], alive.unsqueeze(-2), time_step)
-        columns |= {f"{group}_{name}": value.sum(-2) for name, value in measures.items()}
+        found = energy_measures(series["power"], series["speed"], alive.unsqueeze(-2), time_step)
+        columns |= {f"{group}_{name}": value.sum(-2) for name, value in found.items()}
     own = groups["cav"]
     if "gap" in own:
         columns |= safety_measures(own, alive.unsqueeze(-2), time_step)
@@ -95,10 +107,14 @@ def measure(groups: Groups, alive: Tensor, time_step: float) -> pd.DataFrame:
     if "gap" in groups["hdv"]:
         gap = groups["hdv"]["gap"].amin(-2)
         columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)
+    return {**columns, "steps": alive.sum(0)}
+
+
+def as_frame(columns: dict[str, Tensor]) -> pd.DataFrame:
+    """Return the measures of a batch as one row per episode."""
     frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
     lowest = [frame[key] for key in ("min_gap_m", "hdv_min_gap_m") if key in frame]
-    frame["collided"] = np.minimum.reduce(lowest) <= 0.0
-    frame["steps"] = alive.sum(0).squeeze(-1).cpu().numpy()
+    frame.insert(len(frame.columns) - 1, "collided", np.minimum.reduce(lowest) <= 0.0)
     return frame
 
 
@@ -168,8 +184,8 @@ def sample(
         columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
         for group, series in groups.items():
             for name, values in series.items():
-                values = measured_ttc(values) if name == "ttc" else values
                 rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
+                rows = measured_ttc(rows) if name == "ttc" else rows
                 for place in range(rows.shape[1]):
                     label = group if rows.shape[1] == 1 else f"{group}{place + 1}"
                     columns[f"{label}_{name}"] = rows[:, place].cpu().numpy()
