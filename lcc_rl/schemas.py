@@ -146,8 +146,9 @@ WHOLE: dict[str, tuple[int, ...]] = {
     },
     **{
         f"evaluation.{name}": (1,)
-        for name in ("profiles", "drivers", "batch_size", "repeats", "shards")
+        for name in ("profiles", "drivers", "batch_size")
     },
+    **{f"evaluation.{name}": (1, 1_000_000) for name in ("repeats", "shards")},
     **dict.fromkeys(("evaluation.sample_episodes", "evaluation.shard"), (0,)),
 }
 

@@ -36,6 +36,7 @@ from lcc_rl.results.tables import FASTER
 
 # Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
 WORTH_COMPILING = 20_000_000
+MOST = 10**9  # episodes of a run: each is a row of its table
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Plan:
         shard: which part is played, from 0.
 
     Raises:
-        ConfigError: if there is no such shard, or more shards than blocks.
+        ConfigError: if there is no such shard, more shards than blocks, or too many episodes.
     """
 
     profiles: int
@@ -79,6 +80,11 @@ class Plan:
             self.shards <= self.blocks,
             f"evaluation.shards={self.shards}: the {len(self)} episodes are {self.blocks} blocks "
             f"of up to evaluation.batch_size={self.batch_size}; say fewer shards or smaller blocks",
+        )
+        require(
+            len(self.own) * self.size <= MOST + self.size,
+            f"evaluation.repeats={self.repeats}: {len(self)} episodes; a run has at most {MOST}: "
+            "divide them, evaluation.shards=…",
         )
 
     @cached_property
