@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-import torch
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
@@ -249,8 +248,6 @@ def _play_missing(
             done += counts[block]
             if where is not None:
                 progress.update(done)
-    # Of compiled steps torch keeps eight, all strategies counted.
-    torch.compiler.reset()
 
 
 def task_of(cfg: DictConfig) -> Task | None:

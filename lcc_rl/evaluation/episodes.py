@@ -22,12 +22,13 @@ from lcc_rl.evaluation.rows import (
     INDEX,
     KEYS,
     PROMISED,
+    as_frame,
     describe,
     desired_speeds,
     grouped,
     leader_faster,
     leader_measures,
-    measure,
+    measures,
     sample,
     traffic,
 )
@@ -38,6 +39,7 @@ from lcc_rl.results.tables import FASTER
 
 # Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
 WORTH_COMPILING = 20_000_000
+MOST = 10**9  # episodes of a run: each is a row of its table
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Plan:
         shard: which part is played, from 0.
 
     Raises:
-        ConfigError: if there is no such shard, or more shards than blocks.
+        ConfigError: if there is no such shard, more shards than blocks, or too many episodes.
     """
 
     profiles: int
@@ -81,6 +83,11 @@ class Plan:
             self.shards <= self.blocks,
             f"evaluation.shards={self.shards}: the {len(self)} episodes are {self.blocks} blocks "
             f"of up to evaluation.batch_size={self.batch_size}; say fewer shards or smaller blocks",
+        )
+        require(
+            len(self.own) * self.size <= MOST + self.size,
+            f"evaluation.repeats={self.repeats}: {len(self)} episodes; a run has at most {MOST}: "
+            "divide them, evaluation.shards=…",
         )
 
     @cached_property
@@ -207,9 +214,9 @@ class Episodes:
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired)
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy)
-        measured = measure(groups, alive, time_step, self.energy)
-        whole = traffic(record, alive, self.cfg.scenario.vehicle_length)
-        rows = pd.concat([described, leader, measured, whole], axis=1)
+        measured = measures(groups, alive, time_step, self.energy)
+        measured |= traffic(record, alive, self.cfg.scenario.vehicle_length)
+        rows = pd.concat([described, leader, as_frame(measured)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
         inside = [index for index in inside if 0 <= index < count]

@@ -12,15 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.finite import ACTION, Written, check_moment
-from lcc_rl.envs.step import (
-    TERMINATED,
-    Step,
-    closure,
-    entries,
-    pieces_of,
-    written,
-    written_by,
-)
+from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written, written_by
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import MASK, STREAM, hash_bits
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
@@ -76,6 +68,7 @@ class Player:
         needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
         self.step = Step(needed, self.horizon)
         self.compiled = compiled
+        self.record: Record = {}
         self.advance = Compiled(self._advance, "the evaluation", compiled)
 
     @torch.no_grad()
@@ -88,7 +81,7 @@ class Player:
         Returns:
             The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
             ``[time + 1, …]``, and whether each step belongs to a running episode,
-            ``[time, batch, 1]``.
+            ``[time, batch, 1]``. The next call writes into the same tensors.
 
         Raises:
             Diverged: if the action, or an entry that is written, is not a number; what the policy
@@ -101,16 +94,17 @@ class Player:
 
     def _played(self, state: State, advance: Callable[..., Any]) -> tuple[Record, Tensor, bool]:
         """Return the record, who runs at each step, and whether anything is not a number."""
-        record: Record = {}
+        record = self.record
         running, alive, sums = torch.ones_like(state[TERMINATED]), [], []
         for step in range(self.horizon):
             alive.append(running)
             before, (state, kept, running, total) = state, advance(state, running)
             for key, value in zip(self.kept, kept, strict=True):
                 first = int(key[-1] == "speed")
-                if step == 0:  # written in place: a stack would hold everything twice
+                if key not in record:  # written in place: a stack would hold everything twice
                     record[key] = value.new_empty((self.horizon + first, *value.shape))
-                    record[key][:first] = before[key] if first else 0
+                if first and step == 0:
+                    record[key][0] = before[key]
                 record[key][step + first] = value
             sums.append(total)
         return record, torch.stack(alive), not bool(torch.stack(sums).isfinite().all())

@@ -69,7 +69,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
         elif space == "vehicles" and not string.drawn:
             for group, places in (("cav", own), ("hdv", others)):
                 if places:
-                    groups[group][name] = entry[..., places, :]
+                    groups[group][name] = entry[..., _slice(places), :]
         elif space == "vehicles":
             index = record[INDEX][0]
             place = torch.arange(len(string), device=index.device)
@@ -82,17 +82,30 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     return groups
 
 
-def measure(
+def _slice(places: list[int]) -> slice | list[int]:
+    """Return neighbouring places as a slice, which copies nothing."""
+    first, end = places[0], places[-1] + 1
+    return slice(first, end) if len(places) == end - first else places
+
+
+def measures(
     groups: Groups, alive: Tensor, time_step: float, energy: Fleet | None = None
-) -> pd.DataFrame:
-    """Turn the record of a batch into one row per episode; energies add up over vehicles (A20)."""
+) -> dict[str, Tensor]:
+    """Return the measures of a batch, each ``[batch, 1]``; energies add up over vehicles (A20).
+
+    Args:
+        groups: the record of each group of vehicles.
+        alive: whether each step belongs to a running episode, ``[time, batch, 1]``.
+        time_step: duration of a step [s].
+        energy: the energy models; None for that of the ALCC paper.
+    """
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
         series = groups[group]
         if "power" not in series:
             continue
         kinds = series.get(CLASS[1])
-        measures = energy_measures(
+        found = energy_measures(
             series["power"],
             series["speed"],
             alive.unsqueeze(-2),
@@ -100,7 +113,7 @@ def measure(
             energy,
             None if kinds is None else kinds[0],
         )
-        for name, value in measures.items():
+        for name, value in found.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
             columns[f"{group}_{name}"] = added
     own = groups["cav"]
@@ -114,24 +127,27 @@ def measure(
     if "gap" in groups["hdv"]:
         gap = groups["hdv"]["gap"].amin(-2)
         columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)
+    return {**columns, "steps": alive.sum(0)}
+
+
+def as_frame(columns: dict[str, Tensor]) -> pd.DataFrame:
+    """Return the measures of a batch as one row per episode."""
     frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
     lowest = [frame[key] for key in ("min_gap_m", "hdv_min_gap_m") if key in frame]
-    frame["collided"] = np.minimum.reduce(lowest) <= 0.0
-    frame["steps"] = alive.sum(0).squeeze(-1).cpu().numpy()
+    frame.insert(len(frame.columns) - 1, "collided", np.minimum.reduce(lowest) <= 0.0)
     return frame
 
 
-def traffic(record: Record, alive: Tensor, length: float) -> pd.DataFrame:
-    """Return what the whole string did, a row per episode; see :func:`string_measures`."""
+def traffic(record: Record, alive: Tensor, length: float) -> dict[str, Tensor]:
+    """Return what the whole string did, each ``[batch, 1]``; see :func:`string_measures`."""
     steps, leader = len(alive), record.get(("leader", "speed"))
-    measures = string_measures(
+    return string_measures(
         record["vehicles", "speed"][-steps:],
         record["vehicles", "gap"],
         alive,
         length,
         None if leader is None else leader[-steps:],
     )
-    return pd.DataFrame({key: x.squeeze(-1).cpu().numpy() for key, x in measures.items()})
 
 
 def describe(
@@ -206,8 +222,8 @@ def sample(
         columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
         for group, series in groups.items():
             for name, values in series.items():
-                values = measured_ttc(values) if name == "ttc" else values
                 rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
+                rows = measured_ttc(rows) if name == "ttc" else rows
                 for place in range(rows.shape[1]):
                     label = group if rows.shape[1] == 1 else f"{group}{place + 1}"
                     columns[f"{label}_{name}"] = rows[:, place].cpu().numpy()

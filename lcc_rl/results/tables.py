@@ -65,7 +65,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         row |= {name: mean[name] for name in (PATH, LOST)}
         kilometres = (total["cav_distance_m"] + total["hdv_distance_m"]) / 1e3
         whose = "hdv" if np.isnan(mean["total_energy_kj"]) else "total"
-        row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres
+        row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
         for baseline in BASELINES:
             row |= _against(windows, found, strategy, baseline)
         row["collisions"] = int(total["collided"])
