@@ -62,6 +62,8 @@ def configurations() -> Iterator[DictConfig]:
         yield cfg
     handover = "controller@scenario.controllers.automated=handover"
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
+    saturation = "controller@scenario.controllers.automated=pi_saturation"
+    yield load("train", ["variant=reference", "energy=mixture", saturation, SIZES])
 
 
 def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:

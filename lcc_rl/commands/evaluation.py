@@ -110,11 +110,10 @@ def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
-    if task_of(cfg) is not None and cfg.compare and cfg.policy is None and learns(cfg):
-        own = False  # of a task, those that are named
+    own = own and not _only_named(cfg)
     if own:
         check_variant(cfg)
-    strategies, inputs = _strategies(cfg, own)
+    strategies, inputs = strategies_of(cfg, own)
     if replace:  # rows of other settings must never stand beside this configuration
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
@@ -135,14 +134,33 @@ def _draw(cfg: DictConfig, folder: Path) -> None:
     draw(folder)
 
 
-def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
-    """Build all strategies of an evaluation, and read what they are evaluated on."""
+def _only_named(cfg: DictConfig) -> bool:
+    """Whether a task compares those that are named only: nobody's policy is its own variant's."""
+    return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
+
+
+def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
+    """Build all strategies of an evaluation, and read what they are evaluated on.
+
+    Args:
+        cfg: configuration of the entry point ``evaluate``.
+        own: whether the configuration's own variant is among them; None: as the command decides.
+
+    Raises:
+        LccError: one clear error for whatever is wrong with settings, data or files.
+    """
+    own = not _only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust, policy = tuple(cfg.trust), None
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
-    paths = [path for path in cfg.compare if path not in rivals]
+    task = task_of(cfg)
+    paths = [
+        f"{PRETRAINED}/{task.name}" if task is not None and path == PRETRAINED else path
+        for path in cfg.compare
+        if path not in rivals
+    ]
     compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
     inputs = load_inputs(cfg)
     for line in inputs.report:
