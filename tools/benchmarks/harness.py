@@ -37,7 +37,8 @@ def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
 def first_calls(runs: Mapping[str, Run]) -> dict[str, np.ndarray]:
     """Seconds of the first call of every run, with nothing kept of an earlier compilation."""
     spent = {}
-    with torch.compiler.config.patch(force_disable_caches=True), warnings.catch_warnings():
+    config: Any = torch.compiler.config  # torch adds its method patch on import
+    with config.patch(force_disable_caches=True), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that caches are disabled
         for name, run in runs.items():
             begun = clock()
