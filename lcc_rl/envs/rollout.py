@@ -90,7 +90,8 @@ class DifferentiableRollout:
             if shifts is not None:
                 action = (action + shifts[step]).clamp(-1.0, 1.0)
             record.append(self._entries(state, action))
-            state = self.advance(state, action)
+            # The first moment carries no gradient; compiled, it would need a graph of its own.
+            state = (self.advance if step else self._advance)(state, action)
         record.append(self._entries(state, torch.zeros_like(action)))
         return state, record
 
