@@ -144,10 +144,7 @@ WHOLE: dict[str, tuple[int, ...]] = {
         f"training.{name}": (1,)
         for name in ("episodes", "environments", "segment", "checkpoint_every", "keep_every")
     },
-    **{
-        f"evaluation.{name}": (1,)
-        for name in ("profiles", "drivers", "batch_size")
-    },
+    **{f"evaluation.{name}": (1,) for name in ("profiles", "drivers", "batch_size")},
     **{f"evaluation.{name}": (1, 1_000_000) for name in ("repeats", "shards")},
     **dict.fromkeys(("evaluation.sample_episodes", "evaluation.shard"), (0,)),
 }
