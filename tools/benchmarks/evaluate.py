@@ -75,7 +75,7 @@ def check(episodes: Episodes, plain: PlainEvaluation, given: TensorDictBase) -> 
     """Hold what the plain loop adds up against the rows of the evaluation."""
     rows, sums = episodes.play(0)[0], plain.measure(given)
     for name in ("cav_path_energy_kj", "hdv_energy_kj", "min_gap_m", "share_time_gap_long"):
-        expected = torch.from_numpy(rows[name].to_numpy())
+        expected = torch.tensor(rows[name].tolist())
         off = float((sums[name].cpu().flatten()[: len(expected)] - expected).abs().max())
         if not off <= 10.0 * TOLERANCE * max(1.0, float(expected.abs().max())):
             raise RuntimeError(f"{name} of the plain evaluation is off by {off:g}")
