@@ -62,6 +62,7 @@ def configurations() -> Iterator[DictConfig]:
         yield cfg
     handover = "controller@scenario.controllers.automated=handover"
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
+    yield load("train", ["variant=idm", handover.replace("handover", "mpc"), SIZES])
 
 
 def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:

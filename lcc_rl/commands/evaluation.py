@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import check_evaluation, check_sizes, check_variant
+from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
 from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
@@ -135,6 +135,7 @@ def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
+    check_installed(cfg, [x for x in (*cfg.evaluation.baselines, *rivals) if applies(cfg, x)])
     paths = [path for path in cfg.compare if path not in rivals]
     compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
     inputs = load_inputs(cfg)
