@@ -36,19 +36,19 @@ class MPCSettings:
         iterations: after which it gives up.
     """
 
-    horizon: float = 10.0
-    step: float = 0.5
-    acceleration_time: float = 1.0
-    margin: float = 2.0
-    least_time_gap: float = 1.0
-    longest_time_gap: float = 2.3
-    longest_gap: float = 0.0
-    least_ttc: float = 5.0
-    steady_price: float = 0.5
+    horizon: float = 5.0
+    step: float = 0.25
+    acceleration_time: float = 1.5
+    margin: float = 1.0
+    least_time_gap: float = 0.5
+    longest_time_gap: float = 2.8
+    longest_gap: float = -8.5
+    least_ttc: float = 4.1
+    steady_price: float = 1.0
     jerk_price: float = 0.1
-    near_price: float = 1.0
-    far_price: float = 1.0
-    ttc_price: float = 1.0
+    near_price: float = 3.0
+    far_price: float = 0.1
+    ttc_price: float = 30.0
     max_acceleration: float = 3.0
     tolerance: float = 1e-4
     iterations: int = 4000

@@ -197,12 +197,16 @@ class TestWithOSQP:
     @pytest.mark.parametrize(
         ("key", "value"),
         [
-            *((key, -1) for key in asdict(MPCSettings()) if key not in ("tolerance", "longest_gap")),
+            *(
+                (key, -1)
+                for key in asdict(MPCSettings())
+                if key not in ("tolerance", "longest_gap")
+            ),
             *((key, float("nan")) for key in asdict(MPCSettings())),
             ("horizon", 10.3),
             ("horizon", 1000.0),
             ("step", 0),
-            ("longest_time_gap", 1.0),
+            ("longest_time_gap", 0.5),
             ("near_price", 0),
             ("tolerance", 1.0),
             ("iterations", 2.5),
@@ -217,5 +221,7 @@ class TestWithOSQP:
 def driven(speeds: torch.Tensor):
     """A rollout of 30 s behind a leader of given speeds, [1, 300]."""
     profiles = from_records([speeds.float()], ["a"], ["a"], 0.1)
-    cfg = compose("idm", f"{PLACE}=mpc", "scenario.horizon=300", "scenario.pieces.leader.start=first")
+    cfg = compose(
+        "idm", f"{PLACE}=mpc", "scenario.horizon=300", "scenario.pieces.leader.start=first"
+    )
     return build_env(cfg, profiles, POPULATION, 1, seed=0, nominal=True).rollout(300)
