@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from importlib.util import find_spec
 from typing import Any, ClassVar
 
@@ -140,12 +141,13 @@ def _check(settings: MPCSettings, where: str) -> None:
     """Check settings of the node ``where``."""
     s = settings
     require_positive(where, horizon=s.horizon, step=s.step, max_acceleration=s.max_acceleration)
-    names = ("acceleration_time", "margin", "least_time_gap", "least_ttc")
-    names += ("steady_price", "jerk_price")
-    require_in(where, "[0, inf)", **{name: getattr(s, name) for name in names})
+    values = asdict(s)
+    names = ["acceleration_time", "margin", "least_time_gap", "least_ttc"]
+    names += ["steady_price", "jerk_price"]
+    require_in(where, "[0, inf)", **{name: values[name] for name in names})
     require_in(where, "(-inf, inf)", longest_gap=s.longest_gap)
     prices = ("near_price", "far_price", "ttc_price")
-    require_positive(where, **{name: getattr(s, name) for name in prices})
+    require_positive(where, **{name: values[name] for name in prices})
     require_in(where, f"({s.least_time_gap}, inf)", longest_time_gap=s.longest_time_gap)
     require_in(where, "[1e-10, 0.1]", tolerance=s.tolerance)
     require_whole(where, 1, 1_000_000, iterations=s.iterations)
