@@ -20,7 +20,7 @@ from lcc_rl.envs.inputs import (
 )
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader, needed
-from lcc_rl.evaluation.strategies import DIRECT, baseline_controller, deployed
+from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
@@ -58,6 +58,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         ConfigError: naming the option.
     """
     check_sizes(cfg)
+    check_installed(cfg)
     check_objective(cfg)
     build_logger(cfg)
     build_source(cfg.data)
@@ -88,19 +89,19 @@ def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
     require_memory(needed(env, cfg, inputs), cfg.device)
 
 
-def check_installed(cfg: DictConfig, baselines: Sequence[str] = ()) -> None:
+def check_installed(cfg: DictConfig, compared: Sequence[str] = ()) -> None:
     """Refuse controllers whose package is not installed, before data are read.
 
     Args:
-        cfg: configuration of a study.
-        baselines: names of further controllers.
+        cfg: configuration of a study, of which the baselines are checked, too.
+        compared: names of further controllers.
 
     Raises:
         ConfigError: saying how to install it.
     """
-    others = [baseline_controller(name) for name in baselines if name != DIRECT]
-    nodes = [plain(cfg.scenario.controllers), *others]
-    for key, _, target in settings_at(nodes):
+    names = {*cfg.evaluation.baselines, *compared} - {DIRECT}
+    others = [baseline_controller(name) for name in sorted(names) if applies(cfg, name)]
+    for key, _, target in settings_at([plain(cfg.scenario.controllers), *others]):
         if key.endswith(f".{TARGET}"):
             getattr(find_target(str(target), key), "check_installed", lambda: None)()
 

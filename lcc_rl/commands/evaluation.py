@@ -135,7 +135,7 @@ def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
-    check_installed(cfg, [x for x in (*cfg.evaluation.baselines, *rivals) if applies(cfg, x)])
+    check_installed(cfg, rivals)
     paths = [path for path in cfg.compare if path not in rivals]
     compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
     inputs = load_inputs(cfg)

@@ -12,6 +12,8 @@ import torch
 from helpers import POPULATION, compose, wavy_profiles
 from scipy.optimize import minimize
 
+from lcc_rl.commands.checks import check_settings
+from lcc_rl.commands.evaluation import run
 from lcc_rl.config import build, load, plain
 from lcc_rl.data.profiles import from_records
 from lcc_rl.envs import build_env
@@ -26,9 +28,7 @@ DRIVEN = (f"controller@{AUTO}=mpc", "agent=none")
 PLACE = f"controller@{AUTO}"
 
 
-def test_without_the_extra_one_error_says_how_to_install_it(monkeypatch) -> None:
-    from lcc_rl.commands.evaluation import run
-
+def test_without_the_extra_one_error_says_how_to_install_it(monkeypatch, tmp_path) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(
         "lcc_rl.pieces.mpc.find_spec", lambda name: None if name == "osqp" else found(name)
@@ -40,7 +40,11 @@ def test_without_the_extra_one_error_says_how_to_install_it(monkeypatch) -> None
     for words in (["compare=[mpc]"], ["evaluation.baselines=[mpc]"], [f"{PLACE}=mpc"]):
         more = ["variant=idm", "data=ngsim", "data.path=nowhere.csv", *words]
         with pytest.raises(ConfigError, match=expected):
-            run(load("evaluate", more), "unused", quiet=True)
+            run(load("evaluate", more), tmp_path, quiet=True)
+    # Before a training, not after it.
+    cfg = load("train", ["evaluation.baselines=[mpc]", "data=ngsim", "data.path=nowhere.csv"])
+    with pytest.raises(ConfigError, match=expected):
+        check_settings(cfg, tmp_path)
 
 
 def rows(count: int = 64, seed: int = 0) -> tuple[torch.Tensor, ...]:
