@@ -64,6 +64,7 @@ def configurations() -> Iterator[DictConfig]:
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
     saturation = "controller@scenario.controllers.automated=pi_saturation"
     yield load("train", ["variant=reference", "energy=mixture", saturation, SIZES])
+    yield load("train", ["variant=idm", handover.replace("handover", "mpc"), SIZES])
 
 
 def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
 from lcc_rl.agents.sizes import check_length, check_window
-from lcc_rl.config import CALLED, build_as, load, require
+from lcc_rl.config import CALLED, build_as, load, plain, require
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
     build_drivers,
@@ -19,12 +20,12 @@ from lcc_rl.envs.inputs import (
 )
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader, needed
-from lcc_rl.evaluation.strategies import deployed
+from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.schemas import TrainConfig
-from lcc_rl.targets import TARGET
+from lcc_rl.targets import TARGET, find_target, settings_at
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
 OBJECTIVES = {
@@ -57,6 +58,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         ConfigError: naming the option.
     """
     check_sizes(cfg)
+    check_installed(cfg)
     check_objective(cfg)
     build_logger(cfg)
     build_source(cfg.data)
@@ -85,6 +87,23 @@ def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
     own, profiles = deployed(any_leader(cfg)), inputs.evaluation
     env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
     require_memory(needed(env, cfg, inputs), cfg.device)
+
+
+def check_installed(cfg: DictConfig, compared: Sequence[str] = ()) -> None:
+    """Refuse controllers whose package is not installed, before data are read.
+
+    Args:
+        cfg: configuration of a study, of which the baselines are checked, too.
+        compared: names of further controllers.
+
+    Raises:
+        ConfigError: saying how to install it.
+    """
+    names = {*cfg.evaluation.baselines, *compared} - {DIRECT}
+    others = [baseline_controller(name) for name in sorted(names) if applies(cfg, name)]
+    for key, _, target in settings_at([plain(cfg.scenario.controllers), *others]):
+        if key.endswith(f".{TARGET}"):
+            getattr(find_target(str(target), key), "check_installed", lambda: None)()
 
 
 def build_logger(cfg: DictConfig) -> Any:

@@ -11,7 +11,7 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import check_evaluation, check_sizes, check_variant
+from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
 from lcc_rl.config import build_as, identity, plain
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
@@ -155,6 +155,7 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
+    check_installed(cfg, rivals)
     task = task_of(cfg)
     paths = [
         f"{PRETRAINED}/{task.name}" if task is not None and path == PRETRAINED else path

@@ -11,6 +11,7 @@ from lcc_rl.pieces.features import EnergyClasses, MotorPower, TimeGap, TimeToCol
 from lcc_rl.pieces.hybrid import HCFS
 from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
+from lcc_rl.pieces.mpc import MPC
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.platoon_rewards import JerkReward, SpacingReward, VelocityReward
 from lcc_rl.pieces.ranges import RangeReward, SmoothRange
@@ -39,6 +40,7 @@ __all__ = [
     "HCFS",
     "IDM",
     "IDMACC",
+    "MPC",
     "Action",
     "CBFFilter",
     "Collision",

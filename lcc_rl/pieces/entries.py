@@ -51,6 +51,7 @@ ENTRIES: dict[Key, tuple[str, str]] = {
     (ROLE, "covariance"): ("–, s, s²", "its covariance (C_qq, C_qT, C_TT)"),
     (ROLE, "speed_history"): ("m/s", "own speeds of the last steps, latest first"),
     (ROLE, "commanded_speed"): ("m/s", "speed that PI with saturation commanded last"),
+    (ROLE, "unsolved"): ("–", "1 where the plan of MPC had no solution, and it brakes"),
     ("command", ROLE): ("m/s²", "acceleration that the role's controller commands"),
     ("hybrid", "winner"): ("–", "candidate chosen: 0 rule, 1 policy, −1 at reset"),
     ("hybrid", "switches"): ("–", "changes of the winner since the start"),

@@ -18,6 +18,7 @@ from lcc_rl.pieces.entries import ENTRIES
 
 @pytest.fixture(scope="module")
 def environments():
+    pytest.importorskip("osqp", reason="extra mpc")
     return list(tool.environments())
 
 
