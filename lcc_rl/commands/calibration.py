@@ -17,7 +17,7 @@ from rich.table import Table
 
 from lcc_rl.config import CALLED, build_as, config_hash, plain
 from lcc_rl.drivers.calibrator import Calibrator
-from lcc_rl.drivers.idm_fit import Calibration
+from lcc_rl.drivers.fit import Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
-from lcc_rl.drivers.idm_fit import fit
+from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.population import bootstrap, fixed
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
