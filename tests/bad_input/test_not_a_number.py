@@ -29,8 +29,8 @@ from tensordict.nn import TensorDictSequential
 from lcc_rl.agents.factory import make_trainer
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
-from lcc_rl.drivers.genetic import GeneticSettings, minimise
 from lcc_rl.drivers.fit import fit
+from lcc_rl.drivers.genetic import GeneticSettings, minimise
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.envs import Inputs, StringCollector
 from lcc_rl.errors import DataError, Diverged, ResultsError

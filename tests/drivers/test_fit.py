@@ -9,9 +9,9 @@ import torch
 
 from lcc_rl.drivers import fit_error
 from lcc_rl.drivers.calibrator import Calibrator
-from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.fit_error import FitError
+from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, MODES, fitted
 from lcc_rl.errors import ConfigError, DataError
