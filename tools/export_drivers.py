@@ -36,8 +36,7 @@ FIXED = {"carFollowModel": "IDM", "sigma": "0", "speedFactor": "1", "speedDev": 
 def vehicle_types(drivers: pd.DataFrame, name: str) -> ElementTree.Element:
     """Return SUMO's vehicle types of a driver table.
 
-    ``maxSpeed`` and ``desiredMaxSpeed`` are v0: ``speedFactor`` 1 keeps the road's limit, which
-    must not be below it where drivers are to reach v0.
+    ``maxSpeed`` and ``desiredMaxSpeed`` are v0; in SUMO a lower speed limit of the road binds.
 
     Args:
         drivers: calibrated drivers of one mode.
@@ -52,9 +51,9 @@ def vehicle_types(drivers: pd.DataFrame, name: str) -> ElementTree.Element:
     models = models_of(drivers, name)
     foreign = (models != IDM).to_numpy()
     if foreign.any():
-        row = int(foreign.argmax())
+        place = int(foreign.argmax())
         raise DataError(
-            f"{name}: row {row}: SUMO has no car-following model {models.iloc[row]!r}; expected "
+            f"{name}: row {place}: SUMO has no car-following model {models.iloc[place]!r}; expected "
             "drivers of the model 'idm'"
         )
     root = ElementTree.Element("additional")

@@ -11,6 +11,15 @@ import pytest
 
 from lcc_rl.drivers.tables import load_drivers
 
+NETWORK = """<net version="1.9">
+  <location netOffset="0,0" convBoundary="0,0,100,0" origBoundary="0,0,100,0" projParameter="!"/>
+  <edge id="e" from="a" to="b">
+    <lane id="e_0" index="0" speed="50" length="100" shape="0,0 100,0"/>
+  </edge>
+  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0"/>
+  <junction id="b" type="dead_end" x="100" y="0" incLanes="e_0" intLanes="" shape="100,0"/>
+</net>"""
+
 
 @pytest.fixture
 def drivers(tmp_path) -> str:
@@ -47,8 +56,7 @@ def test_the_types_are_those_that_sumo_knows(drivers, tmp_path) -> None:
     libsumo = pytest.importorskip("libsumo", reason="extra sumo")
     target = tmp_path / "vtypes.xml"
     assert export_drivers.main([drivers, str(target)]) == 0
-    network = '<net version="1.9"><location netOffset="0,0" convBoundary="0,0,1,1"/></net>'
-    (tmp_path / "net.xml").write_text(network)
+    (tmp_path / "net.xml").write_text(NETWORK)
     libsumo.start(["sumo", "-n", str(tmp_path / "net.xml"), "-a", str(target)])
     try:
         known = libsumo.vehicletype.getIDList()
