@@ -71,17 +71,22 @@ class FitError:
 
         The constants may be tensors that broadcast to ``[drivers, candidates]``.
         """
-        measures = self.measures(candidates)
+        measures = self.measures(candidates, self.objective != SPEED)
         if self.objective in measures:
             return measures[self.objective]
         return measures[SPEED] + measures[GAP_SHARE]
 
-    def measures(self, candidates: Tensor) -> dict[str, Tensor]:
-        """Return every error by name, each as :meth:`__call__` does."""
+    def measures(self, candidates: Tensor, apart: bool = True) -> dict[str, Tensor]:
+        """Return every error by name, each as :meth:`__call__` does.
+
+        Args:
+            candidates: see there.
+            apart: whether the errors of the gap are wanted; without them they are zero.
+        """
         with torch.no_grad():
             parameters = self._parameters(candidates)
             simulate = self._by_tensors if self._kernel is None else self._by_kernel
-            speed, gap = simulate(parameters)
+            speed, gap = simulate(parameters, apart)
             return {
                 SPEED: (speed / self._norms[0]).sqrt(),
                 GAP: (gap / self._samples).sqrt(),
@@ -108,7 +113,7 @@ class FitError:
         ready = READY[NUMBERS[self.model]](values)
         return tuple(value.expand(shape).contiguous() for value in ready)
 
-    def _by_tensors(self, parameters: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    def _by_tensors(self, parameters: tuple[Tensor, ...], apart: bool) -> tuple[Tensor, Tensor]:
         """Sums of squared errors, ``[drivers, candidates]``: all of them a step at a time."""
         observed = self.observed
         series = [
@@ -123,13 +128,18 @@ class FitError:
                 (speed[:active], gap[:active], totals[0][:active], totals[1][:active]),
                 tuple(parameter[:active] for parameter in parameters),
                 [values[window, :active] for values in series],
+                apart,
             )
             for total, part in zip(totals, parts, strict=True):
                 total[:active] = part
         return totals
 
     def _advance(
-        self, state: State, parameters: tuple[Tensor, ...], series: Sequence[Tensor]
+        self,
+        state: State,
+        parameters: tuple[Tensor, ...],
+        series: Sequence[Tensor],
+        apart: bool,
     ) -> State:
         """Drive followers through a piece of time (A18).
 
@@ -148,13 +158,15 @@ class FitError:
             reached = torch.add(speed, command, alpha=time_step).clamp_(min=0.0)
             gap = torch.add(gap, ahead + ahead_reached, alpha=half)
             gap = gap.sub_(speed, alpha=half).sub_(reached, alpha=half)
-            error, apart = reached - observed[step + 1], gap - gaps[step + 1]
+            error = reached - observed[step + 1]
             total = torch.addcmul(total, error, error)
-            distance = torch.addcmul(distance, apart, apart)
+            if apart:
+                error = gap - gaps[step + 1]
+                distance = torch.addcmul(distance, error, error)
             speed = reached
         return speed, gap, total, distance
 
-    def _by_kernel(self, parameters: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    def _by_kernel(self, parameters: tuple[Tensor, ...], apart: bool) -> tuple[Tensor, Tensor]:
         """The same: all steps of a driver at once."""
         assert self._kernel is not None
         constants, time_step = self.constants, self.observed.time_step
@@ -166,6 +178,7 @@ class FitError:
         )
         self._kernel(
             NUMBERS[self.model],
+            apart,
             *self._episodes,
             tuple(parameter.numpy() for parameter in parameters),
             tuple(np.dtype(_name(totals.dtype)).type(value) for value in settings),

@@ -20,6 +20,7 @@ FOLDER = "lcc_rl"  # in the user's cache folder
 
 def squared_errors(
     law: Any,
+    apart: Any,
     leader: Any,
     follower: Any,
     gaps: Any,
@@ -36,6 +37,7 @@ def squared_errors(
 
     Args:
         law: 0 for the IDM, 1 for optimal velocities, 2 for Gipps' model.
+        apart: whether the errors of the gap are summed up; else they are zero.
         leader: observed speeds, ``[drivers, time]`` [m/s].
         follower: the same of the followers [m/s].
         gaps: observed gaps, ``[drivers, time]`` [m].
@@ -95,7 +97,9 @@ def squared_errors(
                 gap[i] += advance - half * (speed[i] + reached)
                 speed[i] = reached
                 error[i] += (reached - truth) * (reached - truth)
-                distance[i] += (gap[i] - seen) * (gap[i] - seen)
+            if apart:
+                for i in range(len(speed)):
+                    distance[i] += (gap[i] - seen) * (gap[i] - seen)
 
 
 class Kernel:

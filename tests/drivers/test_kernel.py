@@ -21,7 +21,7 @@ def episode(dtype="float32"):
     settings = tuple(one(x) for x in numbers)
     total = np.full((2, 1, 2), np.nan, dtype)
     series = (speed, speed.copy(), np.full((1, 30), 20.0, dtype))
-    return 0, *series, np.array([30]), parameters, settings, total
+    return 0, True, *series, np.array([30]), parameters, settings, total
 
 
 @pytest.fixture
