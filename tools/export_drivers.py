@@ -53,8 +53,8 @@ def vehicle_types(drivers: pd.DataFrame, name: str) -> ElementTree.Element:
     if foreign.any():
         place = int(foreign.argmax())
         raise DataError(
-            f"{name}: row {place}: SUMO has no car-following model {models.iloc[place]!r}; expected "
-            "drivers of the model 'idm'"
+            f"{name}: row {place}: SUMO has no car-following model {models.iloc[place]!r}; "
+            "expected drivers of the model 'idm'"
         )
     root = ElementTree.Element("additional")
     for number, row in enumerate(drivers.to_dict("records")):
