@@ -13,6 +13,8 @@ from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString, parse_stri
 
 AUTO = "scenario.controllers.automated"
 NO_AGENT = ("agent=none", "agent=null")
+# Settings of an evaluation whose rows are episodes.
+OF_EPISODES = ("batch_size", "sample_episodes", "repeats", "shards", "shard", "compiled")
 # Former spellings as regular expressions, and what to say instead; \1 is what the bracket holds.
 RENAMED = (
     (
@@ -99,7 +101,7 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
         for key in ("split",) if "calibration" in cfg else ("data", "split"):
             yield key, "the leader drives the records of leader=…; say leader=trajectories"
     if not ring:
-        for key in ("circumference", "vehicle_length", "initial_speed"):
+        for key in ("circumference", "initial_speed"):
             yield f"scenario.{key}", "it belongs to scenario.road=ring"
     if set(string.names) == {AUTOMATED} and not _is_human(scenario.controllers.get(AUTOMATED)):
         for key in ("drivers", "evaluation.drivers"):
@@ -119,7 +121,7 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
             yield f"deployed.{name}", "deployed.spacing_weight is 0"
     unused = {
         "episodes": ("evaluation.full_length", "leader.cases", "leader.full_length"),
-        "vehicles": ("evaluation.batch_size", "evaluation.sample_episodes"),
+        "vehicles": tuple(f"evaluation.{name}" for name in OF_EPISODES),
     }
     for name in unused.get(cfg.evaluation.rows, ()):
         yield name, f"it is unused with evaluation.rows={cfg.evaluation.rows}"
@@ -139,7 +141,7 @@ def _unused_by_agent(agent: DictConfig) -> Iterator[tuple[str, str]]:
     if policy in ("idm", "acc"):
         yield "agent.hidden", f"agent.policy={policy} has no layers"
     if agent.get("bootstrap") is False:
-        for name in ("value_lr", "td_lambda", "tau"):
+        for name in ("value_lr", "td_lambda", "value_every", "tau"):
             yield f"agent.{name}", "agent.bootstrap=false learns no value"
     limits = agent.get("limits")
     if OmegaConf.is_dict(limits) and not any(share is not None for share in limits.values()):

@@ -6,7 +6,8 @@ import logging
 
 from omegaconf import DictConfig
 
-from lcc_rl.runs.cli import entry_point, run_folder
+from lcc_rl.config import is_sweep
+from lcc_rl.runs.cli import entry_point, resumed_folder
 
 log = logging.getLogger("lcc_rl")
 
@@ -14,10 +15,13 @@ log = logging.getLogger("lcc_rl")
 @entry_point("evaluate", "lcc_rl.commands.evaluation")
 def main(cfg: DictConfig) -> None:
     """Evaluate into the run's folder."""
-    from lcc_rl.commands.evaluation import run  # loads torch
+    from lcc_rl.commands.evaluation import complete, run  # loads torch
 
-    folder = run_folder()
-    run(cfg, folder)
+    folder = resumed_folder(cfg, ("resume", "trust"))
+    if is_sweep():
+        complete(cfg, folder)
+    else:
+        run(cfg, folder)
     log.info("results in %s", folder)
 
 

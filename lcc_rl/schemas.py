@@ -65,6 +65,10 @@ class EvaluationConfig:
     batch_size: int = MISSING
     seed: int = MISSING
     sample_episodes: int = MISSING
+    repeats: int = MISSING
+    shards: int = MISSING
+    shard: int = MISSING
+    compiled: bool | None = None
     full_length: bool = False
 
 
@@ -82,6 +86,7 @@ class StudyConfig:
     split: Any = MISSING
     leader: Any = None
     energy: Any = None
+    task: Any = None
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     observation: Any = MISSING
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -110,6 +115,8 @@ class TrainConfig(StudyConfig):
 class EvaluateConfig(StudyConfig):
     """``python -m lcc_rl.evaluate``."""
 
+    resume: str | None = None
+    sweep: str | None = None
     policy: str | None = None
     compare: list[str] = field(default_factory=list)
 
@@ -140,7 +147,8 @@ WHOLE: dict[str, tuple[int, ...]] = {
         for name in ("episodes", "environments", "segment", "checkpoint_every", "keep_every")
     },
     **{f"evaluation.{name}": (1,) for name in ("profiles", "drivers", "batch_size")},
-    "evaluation.sample_episodes": (0,),
+    **{f"evaluation.{name}": (1, 1_000_000) for name in ("repeats", "shards")},
+    **dict.fromkeys(("evaluation.sample_episodes", "evaluation.shard"), (0,)),
 }
 
 

@@ -64,6 +64,8 @@ def configurations() -> Iterator[DictConfig]:
     yield load("train", ["variant=alcc", SIZES, *late])
     handover = "controller@scenario.controllers.automated=handover"
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
+    saturation = "controller@scenario.controllers.automated=pi_saturation"
+    yield load("train", ["variant=reference", "energy=mixture", saturation, SIZES])
 
 
 def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:

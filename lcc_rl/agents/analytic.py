@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from lcc_rl.agents.loop import anneal, check_fraction
 from lcc_rl.agents.simulated import SimulatedAgent, SimulatedSettings
 from lcc_rl.config import require
-from lcc_rl.errors import require_in, require_positive
+from lcc_rl.errors import require_in, require_positive, require_whole
 from lcc_rl.policies.actor import seeded_mlp
 
 
@@ -35,7 +35,9 @@ class AnalyticSettings(SimulatedSettings):
         bootstrap: learn a value and add it at the end of every segment; without it the segment is
             all that counts, and should be the whole episode.
         value_lr: learning rate of the value network.
-        td_lambda: weight of longer returns in the value's targets.
+        td_lambda: weight of longer returns in the value's targets, per step.
+        value_every: steps from one moment at which the value is learned to the next; moments a
+            tenth of a second apart tell hardly more than one of them. 1 takes all.
         tau: share by which the value's target network follows at every update.
         compiled: compile the step of the simulator; None: where the training is long enough to
             pay for it. Without a compiler the plain step is used.
@@ -51,12 +53,14 @@ class AnalyticSettings(SimulatedSettings):
     bootstrap: bool = True
     value_lr: float = 1e-3
     td_lambda: float = 0.95
+    value_every: int = 5
     tau: float = 0.05
     compiled: bool | None = None
 
     def __post_init__(self) -> None:
         require_in("agent", "(0, 1]", gamma=self.gamma, tau=self.tau)
         require_in("agent", "[0, 1]", td_lambda=self.td_lambda)
+        require_whole("agent", 1, value_every=self.value_every)
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
         require_positive(
             "agent",
@@ -122,16 +126,25 @@ class Analytic(SimulatedAgent):
 
     def _fit(self, rewards: Tensor, running: Tensor, observation: Tensor) -> Tensor:
         """Take one step of the value towards the λ-returns of a segment and move its target."""
+        own, steps = self.settings, rewards.shape[1]
+        begins = range(0, steps, own.value_every)
+        ends = [*begins[1:], steps]
+        gamma = own.gamma ** torch.arange(own.value_every, device=rewards.device).unsqueeze(-1)
         with torch.no_grad():
-            ahead = self.target(observation[:, 1:]).squeeze(-1) * running
-            wanted, future = torch.empty_like(rewards), ahead[:, -1]
-            for step in range(rewards.shape[1] - 1, -1, -1):
-                mixed = torch.lerp(ahead[:, step], future, self.settings.td_lambda)
-                future = rewards[:, step] + self.settings.gamma * mixed * running[:, step]
-                wanted[:, step] = future
+            after = running[:, [end - 1 for end in ends]]
+            ahead = self.target(observation[:, ends]).squeeze(-1) * after
+            wanted, future = rewards.new_empty(ahead.shape), ahead[:, -1]
+            for place in range(len(ends) - 1, -1, -1):
+                begin, end = begins[place], ends[place]
+                length = end - begin
+                mixed = torch.lerp(ahead[:, place], future, own.td_lambda**length)
+                reward = (rewards[:, begin:end] * gamma[:length]).sum(1)
+                future = reward + own.gamma**length * mixed * after[:, place]
+                wanted[:, place] = future
         # What follows a collision is no state of any episode.
-        begun = torch.cat([torch.ones_like(running[:, :1]), running[:, :-1]], 1)
-        error = (self.value(observation[:, :-1]).squeeze(-1) - wanted) * begun
+        begun = torch.cat([torch.ones_like(running[:, :1]), after[:, :-1]], 1)
+        seen = observation[:, : steps : own.value_every]
+        error = (self.value(seen).squeeze(-1) - wanted) * begun
         loss = error.square().mean()
         self.value_optimizer.zero_grad(set_to_none=True)
         loss.backward()

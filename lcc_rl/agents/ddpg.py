@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import DDPGLoss, HardUpdate
+from torchrl.objectives import DDPGLoss
 
 from lcc_rl.agents.fused import FusedUpdate
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings, leaves
@@ -68,9 +68,7 @@ class DDPG(OffPolicy):
         loss = DDPGLoss(
             self.policy, self.values[0], loss_function="l2", delay_actor=True, delay_value=True
         )
-        # TorchRL asks for an updater; _follow does its work, for each network in its own time.
-        HardUpdate(loss)
-        self._complete(loss, "value_network_params")
+        self._complete(loss, "value_network_params", ("actor", "value"))
         self.fused: FusedUpdate | None = None
         if self.settings.fused:
             self.fused = FusedUpdate(
@@ -98,12 +96,5 @@ class DDPG(OffPolicy):
         # still carries a gradient.
         (losses["loss_actor"] + losses["loss_value"] + self._penalty(batch)).backward()
         self._step("actor", "value")
-        self._follow(due)
+        self._follow(*(name for name, now in zip(("actor", "value"), due, strict=True) if now))
         return {key: losses[key].detach() for key in ("loss_actor", "loss_value")}
-
-    def _follow(self, due: tuple[bool, bool]) -> None:
-        """Move the target networks of actor and critic that are due, as ``SoftUpdate`` does."""
-        for name, now in zip(("actor_network_params", "value_network_params"), due, strict=True):
-            if now:
-                target = getattr(self.loss, f"target_{name}").data
-                target.lerp_(getattr(self.loss, name).data, self.settings.tau)

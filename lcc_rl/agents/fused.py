@@ -2,7 +2,8 @@
 
 For networks this small, half of an update by automatic differentiation is bookkeeping. Here each
 pair of networks lives in one vector, so that Adam and the soft target update are one operation
-each, and the backward pass writes straight into the vector's gradient.
+each, the backward pass writes straight into the vector's gradient, and what is computed on the way
+is written into tensors that are made once for a size of the batch.
 """
 
 from __future__ import annotations
@@ -11,78 +12,83 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from lcc_rl.agents.off_policy import OffPolicySettings
+from lcc_rl.agents.vectors import join, take_step, vector_adam, views
 
-Layers = list[tuple[Tensor, Tensor]]
-
-
-def join(tensors: Sequence[Tensor]) -> nn.Parameter:
-    """Move tensors into one vector, of which they become views, and return it."""
-    vector = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
-    place = 0
-    for tensor in tensors:
-        tensor.data = vector[place : place + tensor.numel()].view(tensor.shape)
-        place += tensor.numel()
-    joined = nn.Parameter(vector)
-    joined.grad = torch.zeros_like(vector)
-    return joined
+Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, the same transposed, biases
 
 
 def layers(tensors: Sequence[Tensor]) -> Layers:
-    """Pair the weights and biases of a network, given in order."""
-    return list(zip(tensors[::2], tensors[1::2], strict=True))
+    """Group the weights and biases of a network, given in order."""
+    pairs = zip(tensors[::2], tensors[1::2], strict=True)
+    return [(weight.data, weight.data.t(), bias.data) for weight, bias in pairs]
 
 
-def gradients(joined: nn.Parameter, tensors: Sequence[Tensor]) -> Layers:
-    """Return the views of a vector's gradient that belong to a network's weights and biases."""
-    assert joined.grad is not None
-    parts = joined.grad.split([tensor.numel() for tensor in tensors])
-    return layers([part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)])
+def forward(network: Layers, x: Tensor, into: list[Tensor]) -> Tensor:
+    """Apply a ReLU network, writing each layer's output to ``into``; return the last one."""
+    for (_, weight, bias), output in zip(network[:-1], into, strict=False):
+        x = torch.addmm(bias, x, weight, out=output).relu_()
+    _, weight, bias = network[-1]
+    return torch.addmm(bias, x, weight, out=into[-1])
 
 
-def forward(network: Layers, x: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Apply a ReLU network; return its output and the input of every layer."""
-    inputs = []
-    for weight, bias in network[:-1]:
-        inputs.append(x)
-        x = torch.addmm(bias, x, weight.t()).relu_()
-    inputs.append(x)
-    weight, bias = network[-1]
-    return torch.addmm(bias, x, weight.t()), inputs
-
-
-def backward(network: Layers, inputs: list[Tensor], slope: Tensor, into: Layers | None) -> Tensor:
-    """Propagate the slope of a loss from a ReLU network's output to its input.
+def backward(
+    network: Layers, inputs: list[Tensor], slope: Tensor, into: Layers | None, spare: list[Tensor]
+) -> Tensor:
+    """Propagate the slope of a loss from a ReLU network's output to its first layer's.
 
     Args:
         network: weights and biases.
-        inputs: the input of every layer, from :func:`forward`.
+        inputs: the input of every layer, ``[batch, …]``.
         slope: derivative by the output, ``[batch, outputs]``.
         into: where the derivatives by weights and biases are written; None: not wanted.
+        spare: where the derivatives by the outputs of all layers but the last are written.
 
     Returns:
-        The derivative by the network's input, ``[batch, inputs]``; by the input of its second
-        layer where only the weights' derivatives are wanted.
+        The derivative by the first layer's output before its ReLU.
     """
     for place in range(len(network) - 1, -1, -1):
+        x = inputs[place]
         if into is not None:
-            torch.mm(slope.t(), inputs[place], out=into[place][0])
-            torch.sum(slope, 0, out=into[place][1])
-            if place == 0:
-                break
-        slope = torch.mm(slope, network[place][0])
+            torch.mm(slope.t(), x, out=into[place][0])
+            torch.sum(slope, 0, out=into[place][2])
         if place:
             # ReLU passes the slope where its output, the next layer's input, is positive.
-            slope = torch.ops.aten.threshold_backward(slope, inputs[place], 0)
+            below = torch.mm(slope, network[place][0], out=spare[place - 1])
+            slope = torch.ops.aten.threshold_backward.grad_input(below, x, 0, grad_input=below)
     return slope
+
+
+class Workspace:
+    """Tensors that an update writes into, for one size of the batch.
+
+    Args:
+        rows: transitions of an update.
+        actor: the actor's layers.
+        critic: the critic's layers.
+    """
+
+    def __init__(self, rows: int, actor: Layers, critic: Layers) -> None:
+        make = critic[0][0].new_empty
+
+        def columns(network: Layers, count: int) -> list[Tensor]:
+            return [make(count, len(weight)) for weight, _, _ in network]
+
+        self.actor, self.spare = columns(actor, rows), columns(critic, rows)
+        self.reached = make(rows, critic[0][0].shape[1])
+        # The critic judges the actions of the data and, below them, those of the actor.
+        self.judged, self.critic = make(2 * rows, self.reached.shape[1]), columns(critic, 2 * rows)
+        halves = [entry.split(rows) for entry in (self.judged, *self.critic)]
+        self.data, self.own = ([half[part] for half in halves] for part in (0, 1))
+        self.slope = make(rows, 1).fill_(-1.0 / rows)
 
 
 class FusedUpdate:
     """One gradient step of DDPG on actor and critic, and one soft step of the targets due.
 
-    Takes the parameters over: they become views of one vector per network.
+    Takes the parameters over: they become views of one vector, as do the targets'.
 
     Args:
         actor: weights and biases in order; a ReLU network before a tanh.
@@ -103,16 +109,18 @@ class FusedUpdate:
     ) -> None:
         self.gamma, self.tau = settings.gamma, settings.tau
         self.saturation = settings.saturation
-        self.online = [join(actor), join(critic)]
-        self.following = [join(target_actor).data, join(target_critic).data]
+        online, following = join([*actor, *critic]), join([*target_actor, *target_critic])
+        slopes = torch.zeros_like(online)
+        sizes = [sum(map(Tensor.numel, network)) for network in (actor, critic)]
+        self.online, self.following = online.split(sizes), following.split(sizes)
+        self.whole = following, online
         self.actor, self.critic = layers(actor), layers(critic)
         self.target_actor, self.target_critic = layers(target_actor), layers(target_critic)
-        self.actor_slopes = gradients(self.online[0], actor)
-        self.critic_slopes = gradients(self.online[1], critic)
-        groups = zip(self.online, (settings.actor_lr, settings.critic_lr), strict=True)
-        self.optimizer = torch.optim.Adam(
-            [{"params": [vector], "lr": rate} for vector, rate in groups], fused=True
-        )
+        both = layers(views(slopes, [*actor, *critic]))
+        self.actor_slopes, self.critic_slopes = both[: len(self.actor)], both[len(self.actor) :]
+        rates = [settings.actor_lr, settings.critic_lr]
+        self.optimizer = vector_adam(online, slopes, sizes, rates)
+        self.workspaces: dict[int, Workspace] = {}
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase, due: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
@@ -125,33 +133,43 @@ class FusedUpdate:
         Returns:
             The losses of actor and critic.
         """
-        observation = batch["observation"]
-        loss_value = self._critic(batch, observation)
-        loss_actor = self._actor(observation)
-        self.optimizer.step()
-        for target, vector, now in zip(self.following, self.online, due, strict=True):
+        rows = len(batch)
+        if rows not in self.workspaces:
+            self.workspaces[rows] = Workspace(rows, self.actor, self.critic)
+        space = self.workspaces[rows]
+        observation = batch.get("observation")
+        wanted = self._wanted(batch.get("next"), space)
+        raw = forward(self.actor, observation, space.actor)
+        action = raw.tanh()
+        torch.cat([observation, batch.get("action")], -1, out=space.data[0])
+        torch.cat([observation, action], -1, out=space.own[0])
+        forward(self.critic, space.judged, space.critic)
+        error, value = space.data[-1].sub_(wanted), space.own[-1]
+        losses = -value.mean(), error.square().mean()
+        backward(self.critic, space.data, error.mul_(2.0 / rows), self.critic_slopes, space.spare)
+        slope = self._through_critic(space, raw, action)
+        backward(self.actor, [observation, *space.actor], slope, self.actor_slopes, space.spare)
+        take_step(self.optimizer)
+        parts = [*zip(self.following, self.online, due, strict=True), (*self.whole, True)]
+        for target, vector, now in parts[2:] if all(due) else parts[:2]:
             if now:
                 target.lerp_(vector, self.tau)
-        return loss_actor, loss_value
+        return losses
 
-    def _critic(self, batch: TensorDictBase, observation: Tensor) -> Tensor:
-        after = batch["next"]
-        ahead = after["observation"]
-        action = forward(self.target_actor, ahead)[0].tanh_()
-        future = forward(self.target_critic, torch.cat([ahead, action], -1))[0]
+    def _wanted(self, after: TensorDictBase, space: Workspace) -> Tensor:
+        """Return what the critic is to answer, ``[batch, 1]``."""
+        seen = after.get("observation")
+        action = forward(self.target_actor, seen, space.actor).tanh_()
+        torch.cat([seen, action], -1, out=space.reached)
+        future = forward(self.target_critic, space.reached, space.spare)
         # A time limit is no end of the world: only a collision stops the sum of rewards.
-        wanted = after["reward"] + self.gamma * future.masked_fill_(after["terminated"], 0.0)
-        value, inputs = forward(self.critic, torch.cat([observation, batch["action"]], -1))
-        error = value.sub_(wanted)
-        backward(self.critic, inputs, error * (2.0 / len(error)), self.critic_slopes)
-        return error.square_().mean()
+        future.masked_fill_(after.get("terminated"), 0.0)
+        return future.mul_(self.gamma).add_(after.get("reward"))
 
-    def _actor(self, observation: Tensor) -> Tensor:
-        raw, inputs = forward(self.actor, observation)
-        action = raw.tanh()
-        value, judged = forward(self.critic, torch.cat([observation, action], -1))
-        slope = torch.full_like(value, -1.0 / len(value))
-        slope = backward(self.critic, judged, slope, None)[:, observation.shape[-1] :]
-        slope = slope * (1.0 - action * action) + raw * (2.0 * self.saturation / len(raw))
-        backward(self.actor, inputs, slope, self.actor_slopes)
-        return -value.mean()
+    def _through_critic(self, space: Workspace, raw: Tensor, action: Tensor) -> Tensor:
+        """Return the derivative of the actor's loss by its output before the tanh."""
+        below = backward(self.critic, space.own, space.slope, None, space.spare)
+        # Of the critic's inputs, only the action depends on the actor.
+        slope = torch.mm(below, self.critic[0][0][:, -action.shape[-1] :])
+        slope.mul_(action.square_().neg_().add_(1.0))
+        return slope.add_(raw, alpha=2.0 * self.saturation / len(raw))

@@ -59,7 +59,7 @@ class GradientTrainer(SimulatedLoop[Analytic]):
         (less, _, _), (more, data, state) = (self._played(source, steps) for steps in (2, 3))
         count = self.env.batch_size.numel()
         vehicles = data.get(OBSERVATION).shape[-2]
-        layers = 4 * sum(own.hidden) * COPIES * vehicles if own.bootstrap else 0
+        layers = 4 * sum(own.hidden) * COPIES * vehicles / own.value_every if own.bootstrap else 0
         return Footprint(
             # Twice the graph: what it holds, and the gradients on the way back.
             step=(2 * (more - less) + COPIES * data.bytes() / 3) / count + layers,

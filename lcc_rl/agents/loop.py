@@ -23,6 +23,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.checks import check_learner
 from lcc_rl.agents.sizes import Footprint, check_length
+from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.errors import Diverged, Interrupted, ResultsError, require_in
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
@@ -187,7 +188,8 @@ class TrainingLoop(ABC, Generic[AgentT]):
         where = f"in iteration {self.iteration + 1} of {self.iterations}"
         try:
             check_learner(self.agent.policy, {}, self.advice)
-            return self._iterate(source)
+            with denormals_flushed():
+                return self._iterate(source)
         except Diverged as error:
             state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
             raise Diverged(f"{error.what} {where}; {state}", error.advice) from error

@@ -13,9 +13,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
+from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
 from lcc_rl.agents.loop import anneal, check_fraction, derived_seed
+from lcc_rl.agents.vectors import join, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole, unknown_name
 from lcc_rl.policies import GaussianExploration
 from lcc_rl.policies.actor import make_actor, seeded_mlp
@@ -174,7 +176,8 @@ class OffPolicy(ABC):
             )
             for number in range(self.critics)
         ]
-        self.optimizers: dict[str, torch.optim.Optimizer] = {}
+        self.optimizers: dict[str, torch.optim.Adam] = {}
+        self.targets: dict[str, tuple[Tensor, Tensor]] = {}  # of each: its vector and the online
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's."""
@@ -192,16 +195,28 @@ class OffPolicy(ABC):
             ``loss_actor`` and ``loss_value``, detached.
         """
 
-    def _complete(self, loss: LossModule, critic: str) -> None:
-        """Set discount and optimizers of a loss with an actor and Q networks."""
+    def _complete(self, loss: LossModule, critic: str, delayed: Sequence[str]) -> None:
+        """Set discount, optimizers and targets of a loss with an actor and Q networks.
+
+        Args:
+            loss: TorchRL's.
+            critic: its name for the Q networks' parameters.
+            delayed: which of ``"actor"`` and ``"value"`` have a target network.
+        """
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.settings.gamma)
-        networks = {"actor": loss.actor_network_params, "value": getattr(loss, critic)}
+        # TorchRL asks for an updater of the targets; _follow does its work.
+        HardUpdate(loss)
         rates = {"actor": self.settings.actor_lr, "value": self.settings.critic_lr}
-        self.optimizers = {
-            name: torch.optim.Adam(leaves(network), lr=rates[name], fused=True)
-            for name, network in networks.items()
-        }
+        for name, key in (("actor", "actor_network_params"), ("value", critic)):
+            network = leaves(getattr(loss, key))
+            vector = join(network)
+            slopes = torch.zeros_like(vector)
+            for parameter, slope in zip(network, views(slopes, network), strict=True):
+                parameter.grad = slope
+            self.optimizers[name] = vector_adam(vector, slopes, [len(vector)], [rates[name]])
+            if name in delayed:
+                self.targets[name] = join(leaves(getattr(loss, f"target_{key}"))), vector
 
     @contextmanager
     def _own_randomness(self) -> Iterator[None]:
@@ -216,11 +231,18 @@ class OffPolicy(ABC):
         return self.settings.saturation * raw.square().mean()
 
     def _step(self, *names: str) -> None:
-        """Take a step of the named optimizers along the gradients at hand."""
+        """Take a step of the named optimizers along the gradients at hand; clear all gradients."""
         for name in names:
-            self.optimizers[name].step()
+            take_step(self.optimizers[name])
         for optimizer in self.optimizers.values():
-            optimizer.zero_grad(set_to_none=True)
+            optimizer.zero_grad(set_to_none=False)
+
+    @torch.no_grad()
+    def _follow(self, *names: str) -> None:
+        """Move the named target networks towards their own, as TorchRL's ``SoftUpdate`` does."""
+        for name in names:
+            target, vector = self.targets[name]
+            target.lerp_(vector, self.settings.tau)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""

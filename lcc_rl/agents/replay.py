@@ -173,8 +173,9 @@ class Trainer(TrainingLoop[OffPolicy]):
         ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
         count = int((before + new) * ratio) - int(before * ratio) if ready else 0
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
+        draw = draws(self.buffer, self.sampler)
         for _ in range(count):
-            losses = self.agent.update(self.buffer.sample())
+            losses = self.agent.update(next(draw))
             sums = {name: total + losses[name] for name, total in sums.items()}
         self.updates += count
         return {name: float(total) / max(count, 1) for name, total in sums.items()}
@@ -186,6 +187,30 @@ class Trainer(TrainingLoop[OffPolicy]):
         self.best = memory["best"]
         self.buffer.load_state_dict(memory["buffer"])
         self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
+
+
+def draws(buffer: ReplayBuffer, generator: torch.Generator) -> Iterator[TensorDictBase]:
+    """Draw batches of a replay buffer as its ``sample()`` does, all into the same tensors.
+
+    A batch holds until the next one is drawn; the buffer is not to grow meanwhile.
+
+    Args:
+        buffer: draws with replacement, each transition as likely as any other.
+        generator: the buffer's own; the numbers are those that ``sample()`` would draw.
+
+    Yields:
+        Transitions, ``[batch_size]``.
+    """
+    rows, size = buffer.storage[:], buffer.batch_size
+    batch = rows[:size].clone()
+    columns = [(rows.get(key), batch.get(key)) for key in rows.keys(True, True)]
+    index = torch.empty(size, dtype=torch.long, device=generator.device)
+    while True:
+        torch.randint(len(rows), (size,), generator=generator, out=index)
+        places = index.to(rows.device or "cpu")
+        for source, target in columns:
+            torch.index_select(source, 0, places, out=target)
+        yield batch
 
 
 def transitions(batch: TensorDictBase) -> TensorDictBase:

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
-from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl.objectives import SACLoss
 
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
 from lcc_rl.errors import require_in, require_positive
@@ -136,9 +136,10 @@ class SAC(OffPolicy):
             loss_function="l2",
             delay_qvalue=True,
         ).to(device)
-        self._complete(loss, "qvalue_network_params")
-        self.targets = SoftUpdate(loss, tau=self.settings.tau)
-        self.optimizers["alpha"] = torch.optim.Adam([self.loss.log_alpha], lr=own.alpha_lr)
+        self._complete(loss, "qvalue_network_params", ("value",))
+        self.loss.log_alpha.grad = torch.zeros_like(self.loss.log_alpha)
+        alpha = [self.loss.log_alpha]
+        self.optimizers["alpha"] = torch.optim.Adam(alpha, lr=own.alpha_lr, fused=True)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         with self._own_randomness():
@@ -146,7 +147,7 @@ class SAC(OffPolicy):
         total = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
         (total + self._penalty(batch)).backward()
         self._step(*self.optimizers)
-        self.targets.step()
+        self._follow("value")
         self.count += 1
         named = {"loss_actor": "loss_actor", "loss_value": "loss_qvalue"}
         return {name: losses[key].detach() for name, key in named.items()}

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import SoftUpdate, TD3Loss
+from torchrl.objectives import TD3Loss
 
 from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
 from lcc_rl.errors import require_in, require_whole
@@ -68,8 +68,7 @@ class TD3(OffPolicy):
             delay_actor=True,
             delay_qvalue=True,
         )
-        self._complete(loss, "qvalue_network_params")
-        self.targets = SoftUpdate(loss, tau=self.settings.tau)
+        self._complete(loss, "qvalue_network_params", ("actor", "value"))
         self.last_actor = torch.zeros(())
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -82,7 +81,7 @@ class TD3(OffPolicy):
             actor, _ = self.loss.actor_loss(batch)
             (actor + self._penalty(batch)).backward()
             self._step("actor")
-            self.targets.step()
+            self._follow("actor", "value")
             self.last_actor = actor.detach()
         return {"loss_actor": self.last_actor, "loss_value": value.detach()}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,31 +12,41 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_sizes, check_variant
-from lcc_rl.config import identity
+from lcc_rl.config import build_as, identity, plain
+from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, Interrupted, unknown_name
 from lcc_rl.evaluation import cases, episodes
-from lcc_rl.evaluation.naming import check_distinct, named_apart
+from lcc_rl.evaluation.blocks import Store
+from lcc_rl.evaluation.naming import POLICY, check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
     Strategy,
-    baselines,
+    applies,
+    baseline,
+    rules,
     studied,
     trained,
 )
-from lcc_rl.io.files import write_parquet
+from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
-from lcc_rl.results.runs import check_folder, save_config
-from lcc_rl.results.savings import by_source
+from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
+from lcc_rl.results.savings import SOURCE, by_source
+from lcc_rl.results.scores import Task, scores
+from lcc_rl.results.scores import as_rich as scores_as_rich
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
+from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import check_present, claim
+from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.runs.states import check_present, claim, forget
+from lcc_rl.targets import TARGET
 
 log = logging.getLogger("lcc_rl")
 
-EPISODES, STEPS = "episodes.parquet", "steps.parquet"
+EPISODES, STEPS, IDENTITY = "episodes.parquet", "steps.parquet", "lcc_rl.config"
 ROWS = ("episodes", "vehicles")
+TASK = "lcc_rl.results.scores.Task"
 
 
 def run(
@@ -44,45 +55,73 @@ def run(
     own: bool = True,
     quiet: bool = False,
     replace: bool = False,
-) -> pd.DataFrame:
+) -> Rows:
     """Evaluate a policy or rule, those it is compared with, and the baselines.
 
     All meet the same profiles, drivers and noise. Writes config.yaml, steps.parquet,
     episodes.parquet and figures.
 
     Args:
-        cfg: configuration of the entry point ``evaluate``.
+        cfg: configuration of the entry point ``evaluate``; with ``resume`` in it the run in that
+            folder is resumed with its own settings instead.
         folder: where the files go.
         own: evaluate the configuration's own variant, not only what it is compared with.
         quiet: write the rows only: print no table, draw no figures.
         replace: write over an evaluation of other settings.
 
     Returns:
-        The rows of episodes.parquet.
+        The rows of episodes.parquet; of many as a dataset, which is not read yet.
 
     Raises:
         LccError: one clear error for whatever is wrong with settings, data or files.
     """
-    with claim(Path(folder)):
+    folder = Path(folder)
+    if cfg.get("resume") is not None:
+        folder, cfg = Path(cfg.resume), _resumed(cfg)
+    with claim(folder):
         if not replace:
-            check_folder(cfg, Path(folder))
-        return _run(cfg, Path(folder), own, quiet, replace)
+            check_folder(cfg, folder)
+        return _run(cfg, folder, own, quiet, replace)
 
 
-def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> pd.DataFrame:
+def _resumed(cfg: DictConfig) -> DictConfig:
+    """Return the configuration of the stopped evaluation that another one names."""
+    check_links(Path(cfg.resume))
+    own = load_config(cfg.resume, tuple(cfg.trust))
+    own.trust = cfg.trust
+    return own
+
+
+def complete(cfg: DictConfig, folder: Path) -> None:
+    """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
+    table = folder / EPISODES
+    if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
+        made, paths = table.stat().st_mtime, map(Path, filter(None, (cfg.policy, *cfg.compare)))
+        files = [path / POLICY if path.is_dir() else path for path in paths]
+        if all(path.stat().st_mtime <= made for path in files if path.exists()):
+            log.info("%s: finished before", folder.name)
+            return
+    run(cfg, folder, quiet=cfg.evaluation.shards > 1)
+    forget(folder)
+
+
+def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
     prepare_torch(cfg)
     check_sizes(cfg)
-    if own:
-        check_variant(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
-    strategies, inputs = _strategies(cfg, own)
+    own = own and not _only_named(cfg)
+    if own:
+        check_variant(cfg)
+    strategies, inputs = strategies_of(cfg, own)
     if replace:  # rows of other settings must never stand beside this configuration
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
-    if not quiet:
+    if not quiet and isinstance(rows, pd.DataFrame):
         _draw(cfg, folder)
+    elif not quiet:
+        log.info("no figures: there are more than %d rows", FEW)
     return rows
 
 
@@ -95,19 +134,41 @@ def _draw(cfg: DictConfig, folder: Path) -> None:
     draw(folder)
 
 
-def _strategies(cfg: DictConfig, own: bool) -> tuple[list[Strategy], Inputs]:
-    """Build all strategies of an evaluation, and read what they are evaluated on."""
+def _only_named(cfg: DictConfig) -> bool:
+    """Whether a task compares those that are named only: nobody's policy is its own variant's."""
+    return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
+
+
+def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
+    """Build all strategies of an evaluation, and read what they are evaluated on.
+
+    Args:
+        cfg: configuration of the entry point ``evaluate``.
+        own: whether the configuration's own variant is among them; None: as the command decides.
+
+    Raises:
+        LccError: one clear error for whatever is wrong with settings, data or files.
+    """
+    own = not _only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust, policy = tuple(cfg.trust), None
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
-    compared = {path: load_policy(path, cfg.variant, trust) for path in cfg.compare}
+    rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
+    task = task_of(cfg)
+    paths = [
+        f"{PRETRAINED}/{task.name}" if task is not None and path == PRETRAINED else path
+        for path in cfg.compare
+        if path not in rivals
+    ]
+    compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
     check_evaluation(cfg, inputs)
-    strategies = baselines(cfg)
-    strategies += [trained(cfg, path, compared[path], inputs.population) for path in cfg.compare]
+    named = [*cfg.evaluation.baselines, *(x for x in rivals if x not in cfg.evaluation.baselines)]
+    strategies = [baseline(cfg, name) for name in named if applies(cfg, name)]
+    strategies += [trained(cfg, path, compared[path], inputs.population) for path in paths]
     if own:
         strategies += studied(cfg, policy, inputs.population)
     for strategy in (s for s in strategies if s.policy is not None):
@@ -123,20 +184,32 @@ def evaluate_and_write(
     inputs: Inputs,
     folder: Path,
     quiet: bool = False,
-) -> pd.DataFrame:
+) -> Rows:
     """Evaluate strategies on the held-out profiles, write the rows and print the summary.
+
+    Of an evaluation of several blocks each block is written when it is played, and those that
+    the folder has are not played again.
+
+    Returns:
+        The rows; of many a dataset, which is read only when asked.
 
     Raises:
         ConfigError: if ``evaluation.rows`` is unknown.
+        Interrupted: if it was stopped between the first and the last block.
     """
-    results = [_evaluate(strategy, cfg, inputs) for strategy in strategies]
-    metadata = {"lcc_rl.config": identity(cfg)}
-    rows = pd.concat([table for table, _ in results], ignore_index=True)
-    steps = pd.concat([trace for _, trace in results], ignore_index=True)
-    check_present(folder)
-    write_parquet(steps, folder / STEPS, metadata)
-    # Last: who finds it finds a finished run.
-    write_parquet(rows, folder / EPISODES, metadata)
+    if cfg.evaluation.rows not in ROWS:
+        raise unknown_name("choice of evaluation.rows", str(cfg.evaluation.rows), ROWS)
+    metadata = {IDENTITY: identity(cfg)}
+    if cfg.evaluation.rows == "vehicles":
+        results = [cases.evaluate(strategy, cfg, inputs) for strategy in strategies]
+        rows: Rows = pd.concat([table for table, _ in results], ignore_index=True)
+        steps = pd.concat([trace for _, trace in results], ignore_index=True)
+        check_present(folder)
+        write_parquet(steps, folder / STEPS, metadata)
+        # Last: who finds it finds a finished run.
+        write_parquet(rows, folder / EPISODES, metadata)
+    else:
+        rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
     for line in leader_too_fast(rows):
         log.warning(line)
     if not quiet:
@@ -144,35 +217,88 @@ def evaluate_and_write(
     return rows
 
 
-def _evaluate(
-    strategy: Strategy, cfg: DictConfig, inputs: Inputs
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    settings = cfg.evaluation
-    if settings.rows not in ROWS:
-        raise unknown_name("choice of evaluation.rows", str(settings.rows), ROWS)
-    if settings.rows == "vehicles":
-        return cases.evaluate(strategy, cfg, inputs)
-    return episodes.evaluate(
-        strategy,
-        inputs,
-        settings.drivers,
-        settings.batch_size,
-        settings.seed,
-        settings.sample_episodes,
-        cfg.device,
-    )
+def _by_blocks(
+    strategies: Sequence[Strategy],
+    cfg: DictConfig,
+    inputs: Inputs,
+    folder: Path,
+    metadata: dict[str, str],
+) -> Rows:
+    """Play all episodes, block by block, and write them as one table."""
+    plan = episodes.plan_of(cfg, inputs)
+    store = Store(folder, strategies, plan.own)
+    try:
+        for place, strategy in enumerate(strategies):
+            _play_missing(place, strategy, store, plan, cfg, inputs, folder)
+    except KeyboardInterrupt as error:
+        if len(plan.own) == 1:
+            raise
+        raise Interrupted(f"stopped; resume={folder} plays the blocks that are missing") from error
+    check_present(folder)
+    write_parquet(store.steps(), folder / STEPS, metadata)
+    write_parquet(store.rows(), folder / EPISODES, metadata)  # last, as above
+    store.clear()
+    return next(store.rows()) if len(plan.own) == 1 else as_rows(folder / EPISODES)
 
 
-def _show(rows: pd.DataFrame, cfg: DictConfig, inputs: Inputs) -> None:
-    """Print the summary of an evaluation."""
-    for source, part in by_source(rows):
-        of = f"{source}: " if source else ""
-        if cfg.evaluation.rows == "vehicles":
+def _play_missing(
+    place: int,
+    strategy: Strategy,
+    store: Store,
+    plan: episodes.Plan,
+    cfg: DictConfig,
+    inputs: Inputs,
+    folder: Path,
+) -> None:
+    """Play the blocks of a strategy that are not stored yet."""
+    missing, settings = store.missing(place), cfg.evaluation
+    if not missing:
+        return
+    how = (settings.seed, settings.sample_episodes, cfg.device, settings.compiled)
+    player = episodes.Episodes(strategy, inputs, plan, *how)
+    counts = {block: plan.count(block) for block in plan.own}
+    done = sum(counts.values()) - sum(counts[block] for block in missing)
+    where = folder if len(plan.own) > 1 else None
+    title = f"evaluate {strategy.name} ({place + 1} of {len(store.marks)})"
+    with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
+        for block in missing:
+            store.put(place, block, player.play(block))
+            done += counts[block]
+            if where is not None:
+                progress.update(done)
+
+
+def task_of(cfg: DictConfig) -> Task | None:
+    """Return the task of a configuration; None without one.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    if cfg.get("task") is None:
+        return None
+    task: Task = build_as("a task", Task, {TARGET: TASK, **plain(cfg.task)}, "task")
+    check_unit(task.unit, build_energy(cfg))
+    return task
+
+
+def _show(rows: Rows, cfg: DictConfig, inputs: Inputs) -> None:
+    """Print the summary of an evaluation, or the scores of its task."""
+    if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
+        for source, part in by_source(rows):
+            of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
                 show(vehicles_as_rich(case_table(part, case), f"{of}{case}"))
-            continue
-        title = (
-            f"{of}{part['profile_id'].nunique()} held-out profiles × "
-            f"{part['driver_id'].nunique()} drivers, {cfg.scenario.horizon} steps"
-        )
-        show(as_rich(summary(part), title))
+        return
+    plan, task = episodes.plan_of(cfg, inputs), task_of(cfg)
+    drivers = f"{len(plan.chosen)} drivers"
+    drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
+    drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
+    for source, count in Counter(inputs.evaluation.sources or [""] * plan.profiles).items():
+        of = f"{source}: " if source else ""
+        title = f"{of}{count} held-out profiles × {drivers}, {cfg.scenario.horizon} steps"
+        if task is not None and isinstance(rows, pd.DataFrame):
+            part = rows[rows[SOURCE] == source] if source else rows
+            table = scores(part, task, build_energy(cfg))
+            show(scores_as_rich(table, task, f"task {task.name}: {title}"))
+        else:
+            show(as_rich(summary(rows, source), title))

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
-from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write
+from lcc_rl.commands.evaluation import EPISODES, IDENTITY, evaluate_and_write
 from lcc_rl.config import identity, require
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
@@ -19,7 +19,7 @@ from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
-from lcc_rl.io.files import parquet_metadata, read_parquet
+from lcc_rl.io.files import Rows, as_rows, parquet_metadata
 from lcc_rl.policies import shared_policy
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
@@ -32,12 +32,10 @@ from lcc_rl.runs.states import working
 log = logging.getLogger("lcc_rl")
 
 POLICIES, POLICY, LAST, CHECKPOINT = "policies", "policy.pt", "policy_last.pt", "checkpoint.pt"
-RECORD, IDENTITY = "training.parquet", "lcc_rl.config"
+RECORD = "training.parquet"
 
 
-def run(
-    cfg: DictConfig, folder: str | Path, quiet: bool = False, resume: bool = False
-) -> pd.DataFrame:
+def run(cfg: DictConfig, folder: str | Path, quiet: bool = False, resume: bool = False) -> Rows:
     """Train the variant of a configuration, then evaluate it.
 
     Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
@@ -53,7 +51,7 @@ def run(
         resume: resume from a checkpoint of the same configuration where the folder has one.
 
     Returns:
-        The rows of episodes.parquet.
+        The rows of episodes.parquet; of many as a dataset, which is not read yet.
 
     Raises:
         LccError: one clear error for whatever is wrong with settings, data or files; it is also
@@ -95,7 +93,7 @@ def _resumed(cfg: DictConfig, folder: Path) -> DictConfig:
     return own
 
 
-def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> pd.DataFrame:
+def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     prepare_torch(cfg)
     check_settings(cfg, folder)
     inputs = load_inputs(cfg)
@@ -155,21 +153,22 @@ def keep_policy(agent: Agent, cfg: DictConfig, folder: Path, iteration: int) -> 
     save_policy(agent.policy.state_dict(), cfg, path)
 
 
-def complete(cfg: DictConfig, folder: Path) -> pd.DataFrame:
+def complete(cfg: DictConfig, folder: Path) -> Rows:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
     if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
         log.info("%s: finished before", folder.name)
-        return read_parquet(table)
+        return as_rows(table)
     if table.exists():
         check_folder(cfg, folder)
     return run(cfg, folder, quiet=True, resume=True)
 
 
-def objective(cfg: DictConfig, rows: pd.DataFrame) -> float | list[float]:
+def objective(cfg: DictConfig, rows: Rows) -> float | list[float]:
     """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
     # By its rows: a resumed run is not of the variant that the command line composed.
-    table = case_table(rows, WINDOWS) if "follower" in rows else summary(rows)
+    vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
+    table = case_table(rows, WINDOWS) if vehicles else summary(rows)
     found = table.iloc[-1].to_dict()
     if pd.isna(found.get("min_ttc_s")):
         found["min_ttc_s"] = NEVER  # no gap ever closed; a sweeper needs a number

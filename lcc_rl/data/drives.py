@@ -41,6 +41,8 @@ class DriveLeaders:
             side. None: every name by itself.
         tuning: for choosing settings: leave the evaluation's part out and divide the rest again.
         least_variation: see :class:`lcc_rl.data.cycles.RecordLeaders`.
+        fastest: held-out windows in which the leader's mean speed is higher are left out [m/s];
+            None for none.
         plausible: thresholds of every sample; None for the defaults.
 
     Raises:
@@ -53,11 +55,14 @@ class DriveLeaders:
     together: str | None = None
     tuning: bool = False
     least_variation: float = 2.0
+    fastest: float | None = None
     plausible: Plausible | None = None
 
     def __post_init__(self) -> None:
         require_in("leader", "(0, 1]", evaluation_share=self.evaluation_share)
         require_in("leader", "[0, inf)", least_variation=self.least_variation)
+        if self.fastest is not None:
+            require_in("leader", "(0, inf)", fastest=self.fastest)
         if self.tuning and self.evaluation_share == 1:
             raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
         try:
@@ -81,6 +86,7 @@ class DriveLeaders:
         if self.tuning:
             training, held_out = divide(training, again=True)
         windows = varying(held_out.at_least(horizon).windows(horizon), self.least_variation)
+        windows = slow(windows, self.fastest)
         if len(training):
             training = training.at_least(horizon)
         by = "at the end" if columns["drive"] is None else "by name"
@@ -133,6 +139,23 @@ class DriveLeaders:
             for part, label in parts
         )
         return first, last
+
+
+def slow(profiles: Profiles, fastest: float | None) -> Profiles:
+    """Return the records whose mean speed is at most ``fastest`` [m/s]; all for None.
+
+    Raises:
+        DataError: if there is none.
+    """
+    if fastest is None:
+        return profiles
+    kept = [i for i in range(len(profiles)) if float(profiles.record(i).mean()) <= fastest]
+    if not kept:
+        raise DataError(
+            f"no held-out window in which the leader's mean speed is at most {fastest:g} m/s; "
+            "raise leader.fastest or give another record"
+        )
+    return profiles.select(kept)
 
 
 def hashed(name: str) -> float:

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
+from lcc_rl.envs.compiled import settings
 from lcc_rl.envs.step import tick
 from lcc_rl.errors import ConfigError, require_whole
 from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
@@ -95,7 +96,8 @@ class Clock(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(0 if seed is None else seed)
 
-    def _draw_seeds(self) -> torch.Tensor:
+    def draw_seeds(self) -> torch.Tensor:
+        """Draw a seed for a new episode in every place of the batch, ``[*batch, 1]``, int64."""
         shape = (*self.batch_size, 1)
         seeds = torch.randint(2**31, shape, generator=self.generator, dtype=torch.int64)
         return seeds.to(self.device)
@@ -103,7 +105,7 @@ class Clock(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         seeds = tensordict.get(SEED, None) if tensordict is not None else None
         if seeds is None:
-            seeds = self._draw_seeds()
+            seeds = self.draw_seeds()
         else:
             require_option(SEED, seeds, 2**32)  # of which all bits count
         return self._moment(seeds, torch.zeros_like(seeds))
@@ -131,6 +133,16 @@ class Traffic(TransformedEnv):
         if tensordict is not None:
             self._check_options(tensordict)
         return super()._reset(tensordict, **settings)
+
+    def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
+        """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
+
+        Settings of pieces are not compared at every step, unless a ``mode``, a ``backend`` or
+        ``options`` are given.
+        """
+        own = {} if {"mode", "backend", "options"} & set(given) else settings()
+        super().compile(warmup=warmup, **{**own, **given})
+        return self
 
     def _moment_keys(self) -> set[Key]:
         """Return the keys of everything that a reset writes."""

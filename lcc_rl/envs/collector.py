@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -15,10 +15,11 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 
+from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.single import SingleAgent, group_key
-from lcc_rl.envs.step import DONE, Compiled, Step, closure, entries, leaves, pieces_of
+from lcc_rl.envs.step import DONE, Step, closure, entries, leaves, pieces_of
 from lcc_rl.errors import ConfigError
-from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
+from lcc_rl.pieces.base import NEXT, SEED, STEP, Key, State, StepTransform, as_key, root_key
 
 
 class StringCollector(BaseCollector):
@@ -73,10 +74,10 @@ class StringCollector(BaseCollector):
         self.reads = [
             as_key(key) for key in getattr(policy, "in_keys", []) if as_key(key) != self.action
         ]
-        self.reset()
+        state = self._entries(env.reset())
         rewards = env.full_reward_spec.keys(True, True)
-        moment = [*self.state, *(as_key(key) for key in rewards)]
-        known = [self._shown(key) for key in [*self.state, self._inner(self.action)]]
+        moment = [*state, *(as_key(key) for key in rewards)]
+        known = [self._shown(key) for key in [*state, self._inner(self.action)]]
         asked = keys if keys is not None else [*known, *((NEXT, *self._shown(k)) for k in moment)]
         every = [*known, *map(as_key, rewards)]
         self.keys = list(dict.fromkeys(leaf for key in asked for leaf in leaves(key, every)))
@@ -84,7 +85,14 @@ class StringCollector(BaseCollector):
         wanted |= {self._inner(key) for key in self.reads}
         # Pieces that none of this depends on, which only an evaluation measures, are left out.
         self.step = Step(closure(pieces_of(env), wanted), env.base_env.horizon)
+        # A reset may read more than a step does.
+        self.first = Step(pieces_of(env), env.base_env.horizon)
+        self.carried = self._needed()
+        self.state = {key: value for key, value in state.items() if key in self.carried}
         self.advance = Compiled(self._advance, "the environment", compiled)
+        self.renew = Compiled(self._renewed, "its resets", compiled)
+        # A compiled reset takes so many episodes at once, about twice as many as end in a step.
+        self.rows = min(episodes, max(32, episodes // 64)) if compiled else 0
 
     def _inner(self, key: Key) -> Key:
         """Return the key under which the pieces know an entry."""
@@ -95,9 +103,19 @@ class StringCollector(BaseCollector):
         inner = self.single and key[:1] == ("automated",) and group_key(key[1:]) == key
         return key[1:] if inner else key
 
+    def _needed(self) -> set[Key]:
+        """Return the entries of a moment that the next step reads, or that a batch shows."""
+        read = {SEED, STEP, DONE, *map(self._inner, self.reads)}
+        read |= {self._inner(key) for key in self.keys if key[0] != NEXT}
+        for piece, _ in self.step.pieces:
+            read |= {key for late, key in piece.sources if not late}
+            read |= set(piece.constants) if isinstance(piece, StepTransform) else set()
+        return read
+
     def reset(self) -> None:
         """Begin new episodes everywhere."""
-        self.state = self._entries(self.env.reset())
+        begun = self._entries(self.env.reset())
+        self.state = {key: value for key, value in begun.items() if key in self.carried}
 
     def _entries(self, td: TensorDictBase) -> State:
         shown = entries(td)
@@ -120,7 +138,7 @@ class StringCollector(BaseCollector):
             self.state, kept, over = self.advance(self.state)
             record.append(kept)
             if over:
-                self.state = self._renew(self.state)
+                self.state = self._renew(self.state, self.renew, self.rows)
         self._frames += self.requested_frames_per_batch
         self._iter += 1
         batch = self.env.batch_size
@@ -143,7 +161,7 @@ class StringCollector(BaseCollector):
             reached = self.step.checked(self._act(state), running)
             state = {key: reached.get(key, value) for key, value in state.items()}
             if reached[DONE].any():
-                state = self._renew(state)
+                state = self._renew(state, self._renewed)
 
     def _act(self, state: State) -> State:
         """Return a moment with the policy's action."""
@@ -170,12 +188,32 @@ class StringCollector(BaseCollector):
         inner = self._inner(key)
         return state[key] if inner == key else state[inner].squeeze(-2)
 
-    def _renew(self, state: State) -> State:
-        """Begin a new episode where one is over."""
-        moment = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
-        for key in state:
-            moment.set(self._shown(key), self._look(state, self._shown(key)))
-        return self._entries(self.env.maybe_reset(moment))
+    def _renew(self, state: State, renewed: Callable[..., State], size: int = 0) -> State:
+        """Begin a new episode where one is over.
+
+        Args:
+            state: the moment reached.
+            renewed: :meth:`_renewed`, or the same compiled.
+            size: for how many episodes it is compiled; 0 for any number.
+        """
+        rows = state[DONE].flatten().nonzero().flatten()
+        seeds = self.env.base_env.draw_seeds().view(-1, 1)[rows]
+        for first in range(0, len(rows), size or len(rows)):
+            # The last one repeated fills up what is lacking: it is written twice.
+            last = first + (size or len(rows))
+            places = torch.arange(first, last, device=rows.device).clamp(max=len(rows) - 1)
+            state = renewed(state, rows[places], seeds[places])
+        return state
+
+    def _renewed(self, state: State, rows: Tensor, seeds: Tensor) -> State:
+        """Return the moment with the first one of new episodes, by their seeds, in some rows."""
+        begun = self.first.begin(seeds)
+
+        def put(value: Tensor, new: Tensor) -> Tensor:
+            flat = value.reshape(-1, *new.shape[1:])
+            return flat.index_put((rows,), new).view(value.shape)
+
+        return {key: put(value, begun[key]) for key, value in state.items()}
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
         """Do nothing: the policy is the caller's own object, in this process."""

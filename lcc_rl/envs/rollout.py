@@ -10,8 +10,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.finite import ACTION
-from lcc_rl.envs.step import DONE, TERMINATED, Compiled, Step, closure, pieces_of, written
+from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, written
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import NEXT, SEED, STEP, Piece, State, StepTransform, as_key
 
@@ -62,15 +63,10 @@ class DifferentiableRollout:
         td = self.env.reset(given)
         return {key: td.get(key) for key in sorted(self.carried)}
 
-    def _advance(
-        self, network: Network, state: State, shift: Tensor | None = None
-    ) -> tuple[State, Tensor]:
-        """Return the moment reached and the action taken."""
-        action = network(state[OBSERVATION])
-        if shift is not None:
-            action = (action + shift).clamp(-1.0, 1.0)
+    def _advance(self, state: State, action: Tensor) -> State:
+        """Return the moment reached."""
         reached = self.step({**state, ACTION: action})
-        return {key: reached[key] for key in state}, action
+        return {key: reached[key] for key in state}
 
     def play(
         self, state: State, network: Network, steps: int, shifts: Tensor | None = None
@@ -89,10 +85,13 @@ class DifferentiableRollout:
         """
         record = []
         for step in range(steps):
-            shift = None if shifts is None else shifts[step]
-            reached, action = self.advance(network, state, shift)
+            # Not compiled: in a compiled graph with its gradient, ReLU is many times slower.
+            action = network(state[OBSERVATION])
+            if shifts is not None:
+                action = (action + shifts[step]).clamp(-1.0, 1.0)
             record.append(self._entries(state, action))
-            state = reached
+            # The first moment carries no gradient; compiled, it would need a graph of its own.
+            state = (self.advance if step else self._advance)(state, action)
         record.append(self._entries(state, torch.zeros_like(action)))
         return state, record
 

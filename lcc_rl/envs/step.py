@@ -6,16 +6,13 @@ by :func:`tick` and the pieces' :meth:`~lcc_rl.pieces.base.Piece.apply`: a :clas
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Size as BatchSize
-from torch import Tensor, compile, compiler, device, ones_like, zeros_like
-from torch._dynamo.exc import TorchDynamoException
-from torch._inductor.exc import InductorError
+from torch import Tensor, compiler, device, ones_like, zeros_like
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
@@ -25,9 +22,6 @@ from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
 
-log = logging.getLogger("lcc_rl")
-
-COMPILER_ERRORS = (TorchDynamoException, InductorError)
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
 # Where none of these is lost after a step, nothing that matters is.
 TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
@@ -70,6 +64,21 @@ class Step:
                 watched += [Written(key, reached[key], piece) for key in piece.targets]
         return reached
 
+    def begin(self, seeds: Tensor) -> State:
+        """Return the first moment of episodes, as ``env.reset`` draws it.
+
+        Args:
+            seeds: the seed of each episode, ``[n, 1]``, int64.
+        """
+        clock = tick(seeds, zeros_like(seeds), self.horizon)
+        start = TensorDict(batch_size=seeds.shape[:-1], device=seeds.device)
+        for key, value in clock.items():
+            start.set(key, value)
+        given = TensorDict(batch_size=start.batch_size)
+        for piece, _ in self.pieces:
+            start = piece._reset(given, start)
+        return _read(start)
+
     def checked(self, before: State, running: Tensor, who: str = "") -> State:
         """Return the entries of the moment reached, all of them numbers.
 
@@ -88,32 +97,6 @@ class Step:
         if check_moment(watched, {**before, STEP: reached[STEP]}, running, pieces, who):
             reached = {key: value.nan_to_num(0.0, 0.0, 0.0) for key, value in reached.items()}
         return reached
-
-
-class Compiled:
-    """A function compiled at its first call; where there is no compiler, the plain function.
-
-    Args:
-        function: what to compile, for one size of its arguments.
-        what: its name in the line of the log that says that it is not compiled.
-        compiled: False for the plain function.
-    """
-
-    def __init__(self, function: Callable[..., Any], what: str, compiled: bool) -> None:
-        self.plain, self.what = function, what
-        # One graph for each size: a graph for any size would be slower.
-        self.function = compile(function, dynamic=False) if compiled else function
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Call the function."""
-        if self.function is self.plain:
-            return self.plain(*arguments)
-        try:
-            return self.function(*arguments)
-        except COMPILER_ERRORS as error:
-            log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
-            self.function = self.plain
-            return self.plain(*arguments)
 
 
 def written(pieces: Iterable[Piece]) -> set[Key]:

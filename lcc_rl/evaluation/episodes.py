@@ -1,12 +1,10 @@
-"""Evaluation with one row per episode: every driver behind every profile, the same noise for all.
-
-Columns named ``cav_…`` belong to the automated vehicles of the string, ``hdv_…`` to all others;
-energies and distances add up over them.
-"""
+"""Evaluation with one row per episode: every driver behind every profile, in the same noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -16,43 +14,120 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import require
-from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import Fleet, as_fleet, build_energy
+from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs, string_of
-from lcc_rl.evaluation.metrics import KILO, energy_measures, measured_ttc, safety_measures
-from lcc_rl.evaluation.rollout import Record, play, reset_options
+from lcc_rl.evaluation.rollout import Player, reset_options
+from lcc_rl.evaluation.rows import (
+    INDEX,
+    KEYS,
+    PROMISED,
+    as_frame,
+    describe,
+    desired_speeds,
+    grouped,
+    leader_faster,
+    leader_measures,
+    measures,
+    sample,
+    traffic,
+)
 from lcc_rl.evaluation.strategies import Strategy
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import as_key
-from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.results.savings import LEADER, SOURCE
 from lcc_rl.results.tables import FASTER
 
-RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
-SUMMED = (
-    "energy_kj",
-    "net_energy_kj",
-    "steady_energy_kj",
-    "acceleration_loss_kj",
-    "path_energy_kj",
-)
-# What a step of a sample episode says of its episode.
-SAMPLED = (
-    "strategy",
-    "training_seed",
-    "profile",
-    "driver_id",
-    "desired_speed_mps",
-    "time_gap_s",
-)
-KEYS = [("leader", name) for name in ("speed", "acceleration")]
-KEYS += [("vehicles", name) for name in RECORDED]
-INDEX, PROMISED = (AUTOMATED, "index"), (AUTOMATED, "promised")
-# The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
-Groups = dict[str, dict[str, Tensor]]
+# Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
+WORTH_COMPILING = 20_000_000
+MOST = 10**9  # episodes of a run: each is a row of its table
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The episodes of an evaluation, in blocks of one size that are played and written one by one.
+
+    Every profile is paired with every driver, profiles slower than drivers, repeats slowest. A
+    block is the same, bit for bit, whichever shard plays it.
+
+    Args:
+        profiles: how many there are.
+        population: how many drivers there are.
+        drivers: how many of them are met, spread evenly; None for all.
+        batch_size: the most episodes of a block.
+        repeats: draws of the noise of every pair.
+        shards: parts of equal size that the blocks are divided into.
+        shard: which part is played, from 0.
+
+    Raises:
+        ConfigError: if there is no such shard, more shards than blocks, or too many episodes.
+    """
+
+    profiles: int
+    population: int
+    drivers: int | None
+    batch_size: int
+    repeats: int = 1
+    shards: int = 1
+    shard: int = 0
+
+    def __post_init__(self) -> None:
+        require(
+            self.batch_size >= 1, f"evaluation.batch_size must be at least 1, got {self.batch_size}"
+        )
+        require(
+            0 <= self.shard < self.shards,
+            f"evaluation.shard must lie from 0 to evaluation.shards - 1 = {self.shards - 1}, got "
+            f"{self.shard}",
+        )
+        require(
+            self.shards <= self.blocks,
+            f"evaluation.shards={self.shards}: the {len(self)} episodes are {self.blocks} blocks "
+            f"of up to evaluation.batch_size={self.batch_size}; say fewer shards or smaller blocks",
+        )
+        require(
+            len(self.own) * self.size <= MOST + self.size,
+            f"evaluation.repeats={self.repeats}: {len(self)} episodes; a run has at most {MOST}: "
+            "divide them, evaluation.shards=…",
+        )
+
+    @cached_property
+    def chosen(self) -> Tensor:
+        """The ids of the drivers that are met."""
+        count = min(self.drivers or self.population, self.population)
+        return torch.from_numpy(np.linspace(0, self.population - 1, count).round().astype(np.int64))
+
+    def __len__(self) -> int:
+        """Return the number of episodes, those of all shards."""
+        return self.profiles * len(self.chosen) * self.repeats
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks, those of all shards."""
+        return math.ceil(len(self) / self.batch_size)
+
+    @property
+    def size(self) -> int:
+        """Episodes of a block; the last one may have less."""
+        return math.ceil(len(self) / self.blocks)
+
+    @property
+    def own(self) -> range:
+        """The blocks of this shard."""
+        first, end = (self.blocks * part // self.shards for part in (self.shard, self.shard + 1))
+        return range(first, end)
+
+    def count(self, block: int) -> int:
+        """Return the number of episodes of a block."""
+        return min(self.size, len(self) - block * self.size)
+
+    def episodes(self, block: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return profile, driver and repeat of each episode of a block, each ``[size]``.
+
+        The last block is filled up with its last episode: one size is compiled once.
+        """
+        number = torch.arange(self.size).clamp(max=self.count(block) - 1) + block * self.size
+        pair, driver = number // len(self.chosen), number % len(self.chosen)
+        return pair % self.profiles, self.chosen[driver], pair // self.profiles
 
 
 def pairs(profiles: int, drivers: int, chosen: int | None) -> tuple[Tensor, Tensor]:
@@ -61,10 +136,92 @@ def pairs(profiles: int, drivers: int, chosen: int | None) -> tuple[Tensor, Tens
     Returns:
         Profile and driver ids, each ``[episodes]``, profiles slowest.
     """
-    limit = drivers if chosen is None else min(chosen, drivers)
-    ids = torch.from_numpy(np.linspace(0, drivers - 1, limit).round().astype(np.int64))
-    profile, driver = torch.meshgrid(torch.arange(profiles), ids, indexing="ij")
-    return profile.flatten(), driver.flatten()
+    return Plan(profiles, drivers, chosen, profiles * drivers).episodes(0)[:2]
+
+
+def plan_of(cfg: DictConfig, inputs: Inputs) -> Plan:
+    """Return the episodes of a configuration's evaluation.
+
+    Raises:
+        ConfigError: see :class:`Plan`.
+    """
+    settings, people = cfg.evaluation, len(inputs.population.time_gap)
+    sizes = (settings.batch_size, settings.repeats, settings.shards, settings.shard)
+    return Plan(len(inputs.evaluation), people, settings.drivers, *sizes)
+
+
+class Episodes:
+    """Plays the episodes of one strategy, block by block.
+
+    An episode's noise depends on ``seed`` and its profile, driver and repeat only: it is the same
+    for every strategy, and the batch size changes a row by no more than rounding.
+
+    Args:
+        strategy: who drives, and its environment's configuration.
+        inputs: held-out windows and drivers.
+        plan: which episodes.
+        seed: seed of the noise.
+        sample_episodes: how many episodes to keep as time series.
+        device: where to compute.
+        compiled: compile the step; None: where the plan, whatever its shard, is long enough.
+    """
+
+    def __init__(
+        self,
+        strategy: Strategy,
+        inputs: Inputs,
+        plan: Plan,
+        seed: int,
+        sample_episodes: int = 0,
+        device: str = "cpu",
+        compiled: bool | None = None,
+    ) -> None:
+        self.strategy, self.inputs, self.plan, self.seed = strategy, inputs, plan, seed
+        self.cfg = any_leader(strategy.cfg)
+        if compiled is None:
+            compiled = len(plan) * self.cfg.scenario.horizon >= WORTH_COMPILING
+        env = build_env(
+            self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
+        )
+        self.energy = build_energy(self.cfg)
+        keys = [*KEYS, INDEX, PROMISED, CLASS]
+        self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
+        count = min(sample_episodes, len(plan))
+        self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
+
+    def play(self, block: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Play a block.
+
+        Returns:
+            One row per episode, and one row per step of its sample episodes.
+        """
+        plan, inputs, count = self.plan, self.inputs, self.plan.count(block)
+        profile, driver, repeat = plan.episodes(block)
+        options = reset_options(
+            self.player.env, profile, driver, self.seed, plan.population, repeat
+        )
+        record, alive = self.player.play(options)
+        groups = grouped(record, string_of(self.cfg))
+        described = describe(
+            self.strategy,
+            inputs.evaluation,
+            inputs.population,
+            profile,
+            driver,
+            repeat if plan.repeats > 1 else None,
+        )
+        desired = desired_speeds(self.strategy, described)
+        described[FASTER] = leader_faster(inputs.evaluation, profile, desired)
+        time_step = self.cfg.scenario.time_step
+        leader = leader_measures(inputs.evaluation, profile, self.energy)
+        measured = measures(groups, alive, time_step, self.energy)
+        measured |= traffic(record, alive, self.cfg.scenario.vehicle_length)
+        rows = pd.concat([described, leader, as_frame(measured)], axis=1)
+        rows = rows.iloc[:count]
+        inside = [index - block * plan.size for index in sorted(self.samples)]
+        inside = [index for index in inside if 0 <= index < count]
+        steps = list(sample(groups, alive, rows, inside, time_step))
+        return rows, pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
 
 
 def evaluate(
@@ -75,20 +232,15 @@ def evaluate(
     seed: int,
     sample_episodes: int = 0,
     device: str = "cpu",
+    repeats: int = 1,
+    compiled: bool | None = None,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Run every episode of one strategy.
-
-    An episode's noise depends on ``seed`` and its profile and driver only: it is the same for
-    every strategy, and the batch size changes a row by no more than rounding.
+    """Run every episode of one strategy, all rows in memory; arguments as in :class:`Episodes`.
 
     Args:
-        strategy: who drives, and its environment's configuration.
-        inputs: held-out windows and drivers.
         drivers: how many of the population, spread evenly; None for all.
         batch_size: episodes side by side.
-        seed: seed of the noise.
-        sample_episodes: how many episodes to keep as time series.
-        device: where to compute.
+        repeats: draws of the noise of every profile and driver.
 
     Returns:
         One row per episode, and one row per step of the sample episodes.
@@ -96,32 +248,11 @@ def evaluate(
     Raises:
         ConfigError: if the batch size is not positive.
     """
-    require(batch_size >= 1, f"evaluation.batch_size must be at least 1, got {batch_size}")
-    profiles, count = inputs.evaluation, len(inputs.population.time_gap)
-    profile, driver = pairs(len(profiles), count, drivers)
-    samples = min(max(sample_episodes, 1), len(profile))
-    kept = set(np.linspace(0, len(profile) - 1, samples).round().astype(int))
-    cfg, time_step = any_leader(strategy.cfg), strategy.cfg.scenario.time_step
-    energy = build_energy(cfg)
-    episodes, steps = [], []
-    for start in range(0, len(profile), batch_size):
-        who = profile[start : start + batch_size], driver[start : start + batch_size]
-        env = build_env(cfg, profiles, inputs.population, len(who[0]), 0, device, True)
-        given = reset_options(env, *who, seed, count)
-        keys = [*KEYS, INDEX, PROMISED, CLASS]
-        record, alive = play(env, strategy.policy, given, keys, strategy.title)
-        groups = grouped(record, string_of(cfg))
-        described = describe(strategy, profiles, inputs.population, *who)
-        described[FASTER] = leader_faster(profiles, who[0], desired_speeds(strategy, described))
-        parts = [described, leader_measures(profiles, who[0], energy)]
-        parts.append(measure(groups, alive, time_step, energy))
-        table = pd.concat(parts, axis=1)
-        episodes.append(table)
-        if sample_episodes:
-            inside = [index - start for index in sorted(kept) if 0 <= index - start < len(table)]
-            steps += list(sample(groups, alive, table, inside, time_step))
-    trace = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
-    return pd.concat(episodes, ignore_index=True), trace
+    people = len(inputs.population.time_gap)
+    plan = Plan(len(inputs.evaluation), people, drivers, batch_size, repeats)
+    episodes = Episodes(strategy, inputs, plan, seed, sample_episodes, device, compiled)
+    rows, steps = zip(*map(episodes.play, plan.own), strict=True)
+    return pd.concat(rows, ignore_index=True), pd.concat(steps, ignore_index=True)
 
 
 def needed(
@@ -138,10 +269,10 @@ def needed(
     moment = env.reset()
     known = set(map(as_key, moment.keys(True, True)))
     size = sum(moment.get(key).nbytes for key in KEYS if key in known)
-    settings, people = cfg.evaluation, len(inputs.population.time_gap)
+    settings = cfg.evaluation
     count = len(inputs.evaluation)
     if settings.rows == "episodes":
-        count = min(count * min(settings.drivers or people, people), settings.batch_size)
+        count = plan_of(cfg, inputs).size
     steps = cfg.scenario.horizon
     if settings.full_length and inputs.full_length and inputs.full_length.horizon > count * steps:
         count, steps = 1, inputs.full_length.horizon
@@ -159,147 +290,3 @@ def any_leader(cfg: DictConfig) -> DictConfig:
     if leader is not None and "profile" in leader:
         leader.profile = None
     return cfg
-
-
-def grouped(record: Record, string: VehicleString) -> Groups:
-    """Divide the record of a string into that of its automated vehicles and of all others."""
-    groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
-    own = list(string.places(AUTOMATED))
-    others = [place for place in range(len(string)) if place not in own]
-    for (space, name), entry in record.items():
-        if (space, name) == PROMISED:
-            groups["cav"][name] = entry
-        elif space == "leader":
-            groups["leader"][name] = entry.unsqueeze(-2)
-        elif space == "vehicles" and not string.drawn:
-            for group, places in (("cav", own), ("hdv", others)):
-                if places:
-                    groups[group][name] = entry[..., places, :]
-        elif space == "vehicles":
-            index = record[INDEX][0]
-            place = torch.arange(len(string), device=index.device)
-            taken = (place == index.unsqueeze(-1)).any(-2)
-            order = taken.int().argsort(stable=True, dim=-1)
-            rest = order[..., : len(others)].sort(-1).values
-            for group, chosen in (("cav", index), ("hdv", rest)):
-                at = chosen.expand(entry.shape[0], *chosen.shape)
-                groups[group][name] = gather(entry, at)
-    return groups
-
-
-def measure(
-    groups: Groups, alive: Tensor, time_step: float, energy: Fleet | None = None
-) -> pd.DataFrame:
-    """Turn the record of a batch into one row per episode; energies add up over vehicles (A20)."""
-    columns: dict[str, Tensor] = {}
-    for group in ("cav", "hdv"):
-        series = groups[group]
-        if "power" not in series:
-            continue
-        kinds = series.get(CLASS[1])
-        measures = energy_measures(
-            series["power"],
-            series["speed"],
-            alive.unsqueeze(-2),
-            time_step,
-            energy,
-            None if kinds is None else kinds[0],
-        )
-        for name, value in measures.items():
-            added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
-            columns[f"{group}_{name}"] = added
-    own = groups["cav"]
-    if "gap" in own:
-        columns |= safety_measures(own, alive.unsqueeze(-2), time_step)
-        for name in SUMMED:
-            keys = [f"{group}_{name}" for group in ("cav", "hdv")]
-            parts = [columns[key] for key in keys if key in columns]
-            if parts:
-                columns[f"total_{name}"] = torch.stack(parts).sum(0)
-    if "gap" in groups["hdv"]:
-        gap = groups["hdv"]["gap"].amin(-2)
-        columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)
-    frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
-    lowest = [frame[key] for key in ("min_gap_m", "hdv_min_gap_m") if key in frame]
-    frame["collided"] = np.minimum.reduce(lowest) <= 0.0
-    frame["steps"] = alive.sum(0).squeeze(-1).cpu().numpy()
-    return frame
-
-
-def describe(
-    strategy: Strategy,
-    profiles: Profiles,
-    population: Population,
-    profile: Tensor,
-    driver: Tensor,
-) -> pd.DataFrame:
-    """Say which episodes a batch holds: strategy, profile, its source, and driver."""
-    columns = {
-        "strategy": strategy.name,
-        "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
-        "profile": [profiles.names[i] for i in profile.tolist()],
-        "profile_id": profile.numpy(),
-        "driver_id": driver.numpy(),
-        "desired_speed_mps": population.desired_speed[driver].numpy(),
-        "time_gap_s": population.time_gap[driver].numpy(),
-    }
-    if profiles.sources:
-        columns[SOURCE] = [profiles.sources[i] for i in profile.tolist()]
-    return pd.DataFrame(columns)
-
-
-def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
-    """Return v0 [m/s] by episode: that of the one driver of a strategy, or of the episode's."""
-    controllers = strategy.cfg.scenario.controllers
-    own = controllers.get(AUTOMATED) if string_of(strategy.cfg).count(AUTOMATED) else None
-    given = None if own is None else own.get("desired_speed")
-    drivers = episodes["desired_speed_mps"].to_numpy()
-    return drivers if given is None else np.full_like(drivers, given)
-
-
-def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> np.ndarray:
-    """Return the share of time in which the leader of each episode drives faster than v0."""
-    ids, place = np.unique(profile.numpy(), return_inverse=True)
-    shares = np.zeros(len(desired))
-    for number, index in enumerate(ids):
-        speeds = np.sort(profiles.record(int(index)).numpy())
-        rows = place == number
-        slower = np.searchsorted(speeds, desired[rows], side="right")
-        shares[rows] = 1.0 - slower / len(speeds)
-    return shares
-
-
-def leader_measures(
-    profiles: Profiles, profile: Tensor, energy: Fleet | None = None
-) -> pd.DataFrame:
-    """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
-
-    The leader has the first energy model.
-    """
-    energy = as_fleet(energy)
-    ids, place = np.unique(profile.numpy(), return_inverse=True)
-    rows = []
-    for index in ids:
-        speed = profiles.record(int(index))
-        power = energy.path_power(speed[:-1], speed.diff() / profiles.time_step)
-        drawn = power.sum() * profiles.time_step * KILO
-        rows.append((float(drawn), float(speed.mean())))
-    return pd.DataFrame(np.array(rows)[place], columns=list(LEADER))
-
-
-def sample(
-    groups: Groups, alive: Tensor, episodes: pd.DataFrame, inside: list[int], time_step: float
-) -> Iterator[pd.DataFrame]:
-    """Yield the time series of chosen episodes of a batch, one row per step."""
-    for index in inside:
-        steps = int(alive[:, index].sum())
-        columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
-        for group, series in groups.items():
-            for name, values in series.items():
-                values = measured_ttc(values) if name == "ttc" else values
-                rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
-                for place in range(rows.shape[1]):
-                    label = group if rows.shape[1] == 1 else f"{group}{place + 1}"
-                    columns[f"{label}_{name}"] = rows[:, place].cpu().numpy()
-        described = episodes[list(SAMPLED)].iloc[[index] * steps].reset_index(drop=True)
-        yield pd.concat([described, pd.DataFrame(columns)], axis=1)

@@ -108,6 +108,9 @@ def safety_measures(
     unsafe, long = series["ttc"] < UNSAFE_TTC, series["time_gap"] > LONG_TIME_GAP
     found = {
         "min_gap_m": lowest(series["gap"]),
+        "mean_gap_m": average(series["gap"]),
+        "max_gap_m": highest(series["gap"]),
+        "min_time_gap_s": lowest(series["time_gap"]),
         "min_ttc_s": measured_ttc(lowest(series["ttc"])),
         "max_time_gap_s": highest(series["time_gap"]),
         "share_ttc_unsafe": average(unsafe),
@@ -118,4 +121,50 @@ def safety_measures(
     }
     if "promised" in series:
         found["share_ttc_unpromised"] = average(unsafe & (series["promised"] == 0.0))
+    return found
+
+
+def string_measures(
+    speed: Tensor, gap: Tensor, alive: Tensor, length: float, leader: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Traffic of a string, front to back.
+
+    Args:
+        speed: of every vehicle after each step, ``[time, *batch, N, 1]`` [m/s].
+        gap: to the vehicle ahead, likewise [m].
+        alive: whether the episode was still running, ``[time, *batch, 1]``.
+        length: of a vehicle [m].
+        leader: speed of the vehicle ahead of the string, ``[time, *batch, 1]`` [m/s].
+
+    Returns:
+        Each ``[*batch, 1]``: mean speed; standard deviation of a vehicle's speed in time, averaged
+        over vehicles (``speed_std_mps``), and over the vehicles at a time, averaged over the
+        episode and over its last tenth (``speed_spread_mps``, ``final_speed_spread_mps``);
+        vehicles per hour by the mean speed and spacing (``flow_vph``); and, behind a leader, that
+        deviation in time of the last vehicle over the leader's (``string_ratio``).
+    """
+    here, steps = alive.unsqueeze(-2), alive.sum(0).clamp(min=1)
+
+    def average(entry: Tensor) -> Tensor:
+        """Mean over time of ``[time, *batch, …, 1]``."""
+        running = here if entry.ndim == here.ndim else alive
+        count = running.sum(0).clamp(min=1)
+        return torch.where(running, entry, 0.0).sum(0) / count
+
+    def deviation(entry: Tensor) -> Tensor:
+        return average((entry - average(entry)).square()).sqrt()
+
+    spread = speed.std(-2, correction=0)
+    late = torch.arange(len(alive), device=alive.device).view(-1, *[1] * (alive.ndim - 1))
+    last = alive & (late >= (0.9 * steps).floor())
+    found = {
+        "mean_speed_mps": average(speed).mean(-2),
+        "speed_std_mps": deviation(speed).mean(-2),
+        "speed_spread_mps": average(spread),
+        "final_speed_spread_mps": torch.where(last, spread, 0.0).sum(0) / last.sum(0).clamp(min=1),
+    }
+    found["flow_vph"] = 3600.0 * found["mean_speed_mps"] / (average(gap).mean(-2) + length)
+    if leader is not None:
+        own = deviation(speed[..., -1, :])
+        found["string_ratio"] = own / deviation(leader).clamp(min=1e-3)
     return found

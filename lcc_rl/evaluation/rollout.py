@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.envs.finite import ACTION, check_moment
+from lcc_rl.envs.compiled import Compiled
+from lcc_rl.envs.finite import ACTION, Written, check_moment
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written, written_by
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.random import MASK, hash_bits
-from lcc_rl.pieces.base import SEED, Key, Piece, State, as_key
+from lcc_rl.functional.random import MASK, STREAM, hash_bits
+from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
 
 # Reads and writes a TensorDict; None where a rule drives.
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Record = dict[Key, Tensor]
+# The moment reached, the entries to keep, who still runs, and a sum of all that was written.
+Advanced = tuple[State, list[Tensor], Tensor, Tensor]
 PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
 
 
@@ -28,52 +32,119 @@ def play(
     keys: Sequence[Key],
     who: str = "",
 ) -> tuple[Record, Tensor]:
-    """Play all episodes of a batch to the horizon, without resets.
+    """Play one batch of episodes to the horizon, see :class:`Player`."""
+    return Player(env, policy, keys, who).play(given)
+
+
+class Player:
+    """Plays batches of episodes to the horizon, without resets.
 
     Args:
         env: the environment, without the single-agent view.
         policy: writes the action; None where none is needed.
-        given: reset options.
         keys: entries to keep; those that the environment lacks are left out.
         who: who drives, for messages.
-
-    Returns:
-        The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
-        ``[time + 1, …]``, and whether each step belongs to a running episode, ``[time, batch, 1]``.
+        compiled: compile the step, policy included; where there is no compiler, one line of the
+            log says so and the plain step is used.
 
     Raises:
         ConfigError: if a controller takes an action and there is no policy.
-        Diverged: if the action, or an entry that is written, is not a number; what the policy and
-            every controller wish counts, not what a filter makes of it.
     """
-    pieces = pieces_of(env)
-    _check_driven(policy, pieces)
-    known = written(pieces)
-    kept = [key for key in keys if key in known]
-    reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
-    step = Step(closure(pieces, {*kept, *reads, TERMINATED}), env.base_env.horizon)
-    with torch.no_grad():
-        state = _begin(env, given, pieces, who)
-        record = {key: [state[key]] if key[-1] == "speed" else [] for key in kept}
-        running, alive = torch.ones_like(state[TERMINATED]), []
-        for _ in range(env.base_env.horizon):
-            reached = step.checked({**state, **_action(policy, reads, state, env)}, running, who)
-            for key in kept:
-                record[key].append(reached[key])
+
+    def __init__(
+        self,
+        env: TransformedEnv,
+        policy: Policy | None,
+        keys: Sequence[Key],
+        who: str = "",
+        compiled: bool = False,
+    ) -> None:
+        self.env, self.policy, self.who, self.horizon = env, policy, who, env.base_env.horizon
+        self.pieces = pieces_of(env)
+        _check_driven(policy, self.pieces)
+        known = written(self.pieces)
+        self.kept = [key for key in keys if key in known]
+        self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
+        needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
+        self.step = Step(needed, self.horizon)
+        self.compiled = compiled
+        self.record: Record = {}
+        self.advance = Compiled(self._advance, "the evaluation", compiled)
+
+    @torch.no_grad()
+    def play(self, given: TensorDictBase) -> tuple[Record, Tensor]:
+        """Play one batch.
+
+        Args:
+            given: reset options.
+
+        Returns:
+            The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
+            ``[time + 1, …]``, and whether each step belongs to a running episode,
+            ``[time, batch, 1]``. The next call writes into the same tensors.
+
+        Raises:
+            Diverged: if the action, or an entry that is written, is not a number; what the policy
+                and every controller wish counts, not what a filter makes of it.
+        """
+        start = self._begin(given)
+        record, alive, lost = self._played(start, self.advance if self.compiled else self._checked)
+        # A compiled step cannot name what is not a number, nor keep it out of what follows.
+        return self._played(start, self._checked)[:2] if lost else (record, alive)
+
+    def _played(self, state: State, advance: Callable[..., Any]) -> tuple[Record, Tensor, bool]:
+        """Return the record, who runs at each step, and whether anything is not a number."""
+        record = self.record
+        running, alive, sums = torch.ones_like(state[TERMINATED]), [], []
+        for step in range(self.horizon):
             alive.append(running)
-            running = running & ~reached[TERMINATED]
-            state = {key: reached.get(key, value) for key, value in state.items()}
-    return {key: torch.stack(values) for key, values in record.items()}, torch.stack(alive)
+            before, (state, kept, running, total) = state, advance(state, running)
+            for key, value in zip(self.kept, kept, strict=True):
+                first = int(key[-1] == "speed")
+                if key not in record:  # written in place: a stack would hold everything twice
+                    record[key] = value.new_empty((self.horizon + first, *value.shape))
+                if first and step == 0:
+                    record[key][0] = before[key]
+                record[key][step + first] = value
+            sums.append(total)
+        return record, torch.stack(alive), not bool(torch.stack(sums).isfinite().all())
 
+    def _begin(self, given: TensorDictBase) -> State:
+        """Return the first moment of the episodes, whose entries are checked."""
+        state = entries(self.env.reset(given))
+        start = [entry for piece in self.pieces for entry in written_by(piece, state)]
+        check_moment(start, state, torch.ones_like(state[TERMINATED]), self.pieces, self.who)
+        if self.policy is not None and not self.reads:
+            return state  # it may read anything
+        carried = {SEED, STEP, TERMINATED, *written(piece for piece, _ in self.step.pieces)}
+        return {key: value for key, value in state.items() if key in carried}
 
-def _begin(
-    env: TransformedEnv, given: TensorDictBase, pieces: Sequence[Piece], who: str
-) -> dict[Key, Tensor]:
-    """Return the first moment of the episodes, whose entries are checked."""
-    state = entries(env.reset(given))
-    start = [entry for piece in pieces for entry in written_by(piece, state)]
-    check_moment(start, state, torch.ones_like(state[TERMINATED]), pieces, who)
-    return state
+    def _checked(self, state: State, running: Tensor) -> Advanced:
+        """Take a step whose entries are checked, and made numbers where an episode is over."""
+        reached = self.step.checked({**state, **self._action(state)}, running, self.who)
+        return self._after(state, reached, running, running.new_zeros((), dtype=torch.float32))
+
+    def _advance(self, state: State, running: Tensor) -> Advanced:
+        """Take a step and add up everything that it writes: a sum that no NaN or inf leaves."""
+        before = {**state, **self._action(state)}
+        watched = [Written(ACTION, before[ACTION])] if ACTION in before else []
+        reached = self.step(before, watched)
+        sums = [entry.value.sum() for entry in watched if entry.value.is_floating_point()]
+        return self._after(state, reached, running, torch.stack(sums).sum())
+
+    def _after(self, state: State, reached: State, running: Tensor, total: Tensor) -> Advanced:
+        after = {key: reached.get(key, value) for key, value in state.items()}
+        return after, [reached[key] for key in self.kept], running & ~reached[TERMINATED], total
+
+    def _action(self, state: State) -> State:
+        """Return the action of the policy; none where there is no policy."""
+        if self.policy is None:
+            return {}
+        seen = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
+        for key in self.reads or state:
+            if key in state:
+                seen.set(key, state[key])
+        return {ACTION: self.policy(seen).get(ACTION)}
 
 
 def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
@@ -84,21 +155,13 @@ def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
         )
 
 
-def _action(
-    policy: Policy | None, reads: Sequence[Key], state: State, env: TransformedEnv
-) -> State:
-    """Return the action of a policy; none where there is no policy."""
-    if policy is None:
-        return {}
-    seen = TensorDict(batch_size=env.batch_size, device=env.device)
-    for key in reads or state:
-        if key in state:
-            seen.set(key, state[key])
-    return {ACTION: policy(seen).get(ACTION)}
-
-
 def reset_options(
-    env: TransformedEnv, profile: Tensor, driver: Tensor, seed: int, drivers: int
+    env: TransformedEnv,
+    profile: Tensor,
+    driver: Tensor,
+    seed: int,
+    drivers: int,
+    repeat: Tensor | int = 0,
 ) -> TensorDict:
     """Build what ``env.reset`` needs to play given profiles to given drivers.
 
@@ -108,11 +171,12 @@ def reset_options(
         driver: driver that each episode is named after, ``[batch]``.
         seed: seed of the noise.
         drivers: how many drivers there are.
+        repeat: which draw of the noise of this profile and driver, ``[batch]``.
     """
     batch = env.batch_size
     # Every episode gets its own stream. A string begins with the driver it is named after, those
     # of the next ids follow: every driver is met equally often in every place.
-    number = profile * drivers + driver
+    number = profile * drivers + driver + repeat * STREAM
     given = TensorDict(batch_size=batch, device=env.device)
     given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & MASK)) >> 1).unsqueeze(-1))
     spec = env.full_state_spec

@@ -10,6 +10,8 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -45,6 +47,8 @@ BASELINES = {
     "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
 }
 DIRECT = "direct"
+# Controllers that need a policy's action, or the communication of a platoon.
+NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
 
 
@@ -126,6 +130,13 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
+def rules() -> list[str]:
+    """Return the names of all baselines and of the files of conf/controller, no name twice."""
+    shipped = Path(str(files("lcc_rl.conf"))) / "controller"
+    found = sorted(path.stem for path in shipped.glob("*.yaml") if path.stem not in NEEDY)
+    return list(dict.fromkeys([DIRECT, *BASELINES, *found]))
+
+
 @cache  # composed once: an evaluation asks for each several times
 def baseline_controller(name: str, suffix: str = "") -> Any:
     """Return the node of a baseline's controller, of a tuned one also behind the filter.
@@ -133,9 +144,9 @@ def baseline_controller(name: str, suffix: str = "") -> Any:
     Raises:
         ConfigError: if there is none of that name.
     """
-    if name not in BASELINES:
-        raise unknown_name("baseline", name, (DIRECT, *BASELINES))
-    *first, last = BASELINES[name]
+    if name not in rules():
+        raise unknown_name("baseline", name, rules())
+    *first, last = BASELINES.get(name, ("variant=idm", f"{PLACE}={name}"))
     return plain(load("evaluate", [*first, last + suffix]).scenario.controllers.automated)
 
 

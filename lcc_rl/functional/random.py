@@ -48,7 +48,9 @@ def uniform(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tenso
 
 def normal(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tensor:
     """Draw from N(0, 1) by counter; arguments as in :func:`uniform`."""
-    return torch.special.ndtri(uniform(seed, step, stream) + 2.0**-25)
+    # Amid the cells of the uniform draw; the last one would be rounded to 1, which is infinity.
+    middle = (uniform(seed, step, stream) + 2.0**-25).clamp(max=1.0 - 2.0**-24)
+    return torch.special.ndtri(middle)
 
 
 def choose(seed: Tensor, count: Tensor | int, stream: Tensor | int = 0) -> Tensor:

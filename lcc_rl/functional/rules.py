@@ -50,6 +50,47 @@ def follower_stopper_speed(
     return torch.where(gap < near, torch.zeros_like(commanded), commanded)
 
 
+def pi_saturation_speed(
+    speed: Tensor,
+    gap: Tensor,
+    ahead: Tensor,
+    desired_speed: Tensor,
+    commanded: Tensor,
+    gaps: Sequence[float] = (7.0, 30.0),
+    catch_up: float = 1.0,
+    least_gap: float = 4.0,
+    closing_time: float = 2.0,
+    transition: float = 2.0,
+) -> Tensor:
+    """Return the speed that PI with saturation commands (Stern et al. 2018, arXiv 1705.01693).
+
+    v_target = v_d + c·min(max((Δx − g_l)/(g_u − g_l), 0), 1); Δx_s = max(2 s·(v − v_ahead), 4 m);
+    α = min(max((Δx − Δx_s)/γ, 0), 1), β = 1 − α/2; the command becomes
+    β(α v_target + (1 − α) v_ahead) + (1 − β) times the command before.
+
+    Args:
+        speed: own speed v [m/s].
+        gap: bumper-to-bumper gap Δx [m].
+        ahead: speed of the vehicle ahead [m/s].
+        desired_speed: v_d, the mean of the own speed [m/s].
+        commanded: the command before [m/s].
+        gaps: g_l and g_u, between which catching up sets in [m].
+        catch_up: c, by how much the target may exceed the mean [m/s].
+        least_gap: least Δx_s [m].
+        closing_time: how long closing in may take [s].
+        transition: γ [m].
+
+    Returns:
+        The speed [m/s], of the arguments' shape.
+    """
+    lower, upper = gaps
+    target = desired_speed + catch_up * ((gap - lower) / (upper - lower)).clamp(0.0, 1.0)
+    safe = (closing_time * (speed - ahead)).clamp(min=least_gap)
+    share = ((gap - safe) / transition).clamp(0.0, 1.0)
+    weight = 1.0 - 0.5 * share
+    return weight * (share * target + (1.0 - share) * ahead) + (1.0 - weight) * commanded
+
+
 def idm_acc(
     speed: Tensor,
     gap: Tensor,

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from lcc_rl.errors import ResultsError
 
-SUBFOLDERS = ("figures", "policies")  # of a run; other folders in it are runs of their own
+# Of a run; other folders in it are runs of their own.
+SUBFOLDERS = ("figures", "policies", "blocks")
 
 
 @contextmanager

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from importlib.metadata import version as installed
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
+from pyarrow import fs
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.atomic import atomic_path
@@ -23,17 +25,24 @@ SCHEMA_VERSION = "1"
 # Changes of a table from one schema version to the next, by the older version.
 MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
 PROCESSOR = "lcc_rl.processor"  # in a table's metadata
+# The rows of a table, read; or, of many rows, files that are read when asked.
+Rows: TypeAlias = pd.DataFrame | ds.Dataset
+FEW = 200_000  # rows that are read at once without a thought
+TEXT = pa.dictionary(pa.int32(), pa.string())
 
 
 def write_parquet(
-    frame: pd.DataFrame, path: str | Path, metadata: Mapping[str, str] | None = None
+    frame: pd.DataFrame | Iterable[pd.DataFrame],
+    path: str | Path,
+    metadata: Mapping[str, str] | None = None,
 ) -> None:
     """Write a table atomically, with schema, package, torch and processor in its metadata.
 
     The processor is recorded because trainings differ between processors as between seeds.
 
     Args:
-        frame: the table; its index is not kept.
+        frame: the table; its index is not kept. Or its parts, at least one, all of the same
+            columns: each becomes a row group, and one at a time is held in memory.
         path: destination.
         metadata: further entries, such as a config hash.
 
@@ -47,16 +56,28 @@ def write_parquet(
         "lcc_rl.torch": installed("torch"),
         PROCESSOR: processor(),
     }
+    parts = iter([frame] if isinstance(frame, pd.DataFrame) else frame)
+    table = _finite(next(parts), path)
+    schema = table.schema.with_metadata(
+        {**(table.schema.metadata or {}), **own, **(metadata or {})}
+    )
+    with (
+        atomic_path(path) as temporary,
+        pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as file,
+    ):
+        file.write_table(table.cast(schema))
+        for part in parts:
+            file.write_table(_finite(part, path).cast(schema))
+
+
+def _finite(frame: pd.DataFrame, path: str | Path) -> pa.Table:
+    """Return a data frame as a table whose numbers are finite."""
     table = pa.Table.from_pandas(frame, preserve_index=False)
     for name, column in zip(table.column_names, table.columns, strict=True):
         if pa.types.is_floating(column.type) and pc.any(pc.is_inf(column)).as_py():
             row = pc.index(pc.is_inf(column), True).as_py()
             raise ResultsError(f"{path}: row {row}, column {name!r} is infinite; expected a number")
-    table = table.replace_schema_metadata(
-        {**(table.schema.metadata or {}), **own, **(metadata or {})}
-    )
-    with atomic_path(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+    return table
 
 
 @cache
@@ -85,6 +106,77 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
         found = f"schema version {version[:20]!r}"
         raise ResultsError(f"{path}: {found}; this package reads 1 to {SCHEMA_VERSION}")
     return migrated(table.to_pandas(), int(version))
+
+
+def as_rows(path: Path) -> Rows:
+    """Return a table: read where it has :data:`FEW` rows at most, else as a dataset.
+
+    Raises:
+        ResultsError: if it is missing, damaged or of a newer schema.
+    """
+    many = _read(path, pq.read_metadata).num_rows > FEW
+    return as_dataset([path]) if many else read_parquet(path)
+
+
+def as_dataset(
+    paths: Sequence[Path], columns: Sequence[Mapping[str, Any]] | None = None
+) -> ds.Dataset:
+    """Return tables as one dataset of pyarrow, whose rows are read when asked.
+
+    Text is dictionary-encoded. A column that a table lacks is null there.
+
+    Args:
+        paths: the tables.
+        columns: further columns, constant within each table.
+
+    Raises:
+        ResultsError: if a table is missing, damaged, of a newer schema, or has another type of
+            column than the rest.
+    """
+    schemas = [_schema(path) for path in paths]
+    try:
+        schema = pa.unify_schemas(schemas, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise ResultsError(f"{paths[0].parent}: tables differ: {error}") from error
+    texts = [field.name for field in schema if _is_text(field.type)]
+    for name in texts:
+        schema = schema.set(schema.get_field_index(name), pa.field(name, TEXT))
+    extra = [dict(each) for each in columns or [{}] * len(paths)]
+    own = pa.Table.from_pylist(extra).schema
+    own = pa.schema([(x.name, TEXT if _is_text(x.type) else x.type) for x in own])
+    fields = [*schema, *(field for field in own if field.name not in schema.names)]
+    return ds.FileSystemDataset.from_paths(
+        [str(path) for path in paths],
+        schema=pa.schema(fields),
+        format=ds.ParquetFileFormat(
+            ds.ParquetReadOptions(dictionary_columns=texts),
+            ds.ParquetFragmentScanOptions(page_checksum_verification=True),
+        ),
+        filesystem=fs.LocalFileSystem(),
+        partitions=[_constants(each) for each in extra],
+    )
+
+
+def _schema(path: Path) -> pa.Schema:
+    """Return the columns of a table of the present schema version."""
+    found: pa.Schema = _read(path, pq.read_schema)
+    version = (found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
+    if version != SCHEMA_VERSION:
+        raise ResultsError(f"{path}: schema version {version[:20]!r}; expected {SCHEMA_VERSION}")
+    return found.remove_metadata()
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+
+
+def _constants(columns: Mapping[str, Any]) -> ds.Expression:
+    """Return constant columns as the expression that a dataset's file has them by."""
+    found = ds.scalar(True)
+    for name, value in columns.items():
+        same = ds.field(name).is_null() if value is None else ds.field(name) == value
+        found = found & same
+    return found
 
 
 def _unpacked_size(path: Path) -> int:

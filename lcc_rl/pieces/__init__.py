@@ -15,6 +15,7 @@ from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.platoon_rewards import JerkReward, SpacingReward, VelocityReward
+from lcc_rl.pieces.ranges import RangeReward, SmoothRange
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
@@ -23,7 +24,7 @@ from lcc_rl.pieces.rewards import (
     SafetyReward,
     TotalReward,
 )
-from lcc_rl.pieces.rules import FollowerStopper, Handover
+from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
 from lcc_rl.pieces.surrogates import (
@@ -71,13 +72,16 @@ __all__ = [
     "NGSIMLeader",
     "Observation",
     "ObservationMemory",
+    "PISaturation",
     "PathEnergy",
     "Piece",
     "Places",
+    "RangeReward",
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
     "SmoothEfficiency",
+    "SmoothRange",
     "SmoothSafety",
     "Smoothness",
     "SpacingReward",

@@ -200,6 +200,8 @@ class PathEnergy(RewardTerm):
         name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
         scale: power that costs 1 per second [W].
         of: ``"self"``, or ``"behind"``: all vehicles behind, back to the next automated one.
+        distance_price: energy that a metre driven is worth [J/m]: at what a metre takes, the
+            objective is energy per distance, and falling behind gains nothing.
         energy: the energy models; None for that of the ALCC paper.
 
     Raises:
@@ -213,17 +215,19 @@ class PathEnergy(RewardTerm):
         weight: float = 1.0,
         scale: float = 20000.0,
         of: str = "self",
+        distance_price: float = 0.0,
         string: VehicleString | None = None,
         energy: Fleet | EnergyModel | None = None,
     ) -> None:
         require_positive(f"agent.surrogates.{name}", scale=scale)
+        require_in(f"agent.surrogates.{name}", "[0, inf)", distance_price=distance_price)
         if of not in ("self", "behind"):
             raise ConfigError(f"agent.surrogates.{name}.of must be self or behind, got {of!r}")
         string = VehicleString() if string is None else string
         self.sections, self.behind = Sections(string, VEHICLES), of == "behind"
         space = VEHICLES if self.behind else "self"
         reads = [f"{space}.speed", f"{space}.acceleration"]
-        self.energy = as_fleet(energy)
+        self.energy, self.distance_price = as_fleet(energy), distance_price
         self.mixed = len(self.energy.models) > 1
         if self.mixed:
             reads.append(f"{space}.{CLASS[-1]}")
@@ -235,7 +239,7 @@ class PathEnergy(RewardTerm):
         """Return the unweighted term."""
         before = speed - acceleration * self.time_step
         kind, indices = (more[0], more[1:]) if self.mixed else (None, more)
-        power = self.energy.path_power(before, acceleration, kind)
+        power = self.energy.path_power(before, acceleration, kind) - self.distance_price * before
         if self.behind:
             power = self.sections.sum(power, *indices)
         return power * -self.factor

@@ -28,7 +28,9 @@ POLICY_KEYS = (
 
 def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None:
     """Write a policy's weights and, as text, the configuration of its training."""
-    write_torch({"weights": dict(weights), "config": OmegaConf.to_yaml(plain(cfg))}, path)
+    # Copies: weights that are parts of one vector would be stored with all of it.
+    own = {name: weight.clone() for name, weight in weights.items()}
+    write_torch({"weights": own, "config": OmegaConf.to_yaml(plain(cfg))}, path)
 
 
 def pretrained_path(variant: str) -> Path:

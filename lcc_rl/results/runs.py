@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
+from pyarrow.dataset import Dataset
 
 from lcc_rl.config import plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.io.files import read_parquet
+from lcc_rl.io.files import Rows, as_dataset, parquet_metadata, read_parquet
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
 
@@ -22,7 +24,8 @@ log = logging.getLogger("lcc_rl")
 CONFIG = "config.yaml"
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # What no command of other settings may replace: results, and what a stopped run resumes from.
-KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "overrides.json")
+KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "overrides.json", "blocks")
+SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
@@ -94,17 +97,32 @@ def read_settings(path: Path) -> dict[str, Any]:
     return parse_yaml(read_text(path), str(path))
 
 
+@overload
 def load(
-    root: str | Path = "outputs", table: str = "episodes", strict: bool = False
-) -> pd.DataFrame:
+    root: str | Path = ..., table: str = ..., strict: bool = ..., lazy: Literal[False] = ...
+) -> pd.DataFrame: ...
+
+
+@overload
+def load(
+    root: str | Path = ..., table: str = ..., strict: bool = ..., *, lazy: Literal[True]
+) -> Dataset: ...
+
+
+def load(
+    root: str | Path = "outputs", table: str = "episodes", strict: bool = False, lazy: bool = False
+) -> Rows:
     """Read one table of every run below a folder.
 
     A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run.
+    So is said what shards of an evaluation are missing (``frame.attrs["missing"]``).
 
     Args:
         root: a run folder, or any folder above runs.
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
-        strict: raise for a damaged run instead.
+        strict: raise for a damaged run, or a missing shard, instead.
+        lazy: return a dataset of pyarrow, whose rows are read when asked: for tables that do not
+            fit into memory. Its columns of settings are those in which the runs differ.
 
     Returns:
         The rows of all runs, in the order of their folders, with the column ``run`` and one
@@ -118,31 +136,83 @@ def load(
     if table not in TABLES:
         raise unknown_name("table", table, TABLES)
     root = Path(root)
+    found: dict[Path, dict[str, Any]] = {}
     frames, damaged = [], {}
     for path in sorted(root.rglob(f"{table}.parquet")):
         run = str(path.parent.relative_to(root))
         try:
-            frames.append(_with_settings(read_parquet(path), path.parent, run))
+            settings = {"run": run, **_settings(path.parent)}
+            if lazy:
+                parquet_metadata(path)
+            else:
+                frames.append(_with_settings(read_parquet(path), settings))
+            found[path] = settings
         except ResultsError as error:
             if strict:
                 raise
             log.warning("left out: %s", error)
             damaged[run] = str(error)
-    if not frames:
+    if not found:
         why = f"; none is readable: {next(iter(damaged.values()))}" if damaged else ""
         raise ResultsError(f"{root}: no {table}.parquet in it or below it{why}")
+    missing = missing_shards(list(found.values())) if table == "episodes" else []
+    for line in missing:
+        if strict:
+            raise ResultsError(f"{root}: {line}")
+        log.warning("%s: %s", root, line)
+    if lazy:
+        return as_dataset(list(found), _different(list(found.values())))
     rows = pd.concat(frames, ignore_index=True)
     rows.attrs |= {"damaged": damaged} if damaged else {}
+    rows.attrs |= {"missing": missing} if missing else {}
     return rows
 
 
-def _with_settings(frame: pd.DataFrame, folder: Path, run: str) -> pd.DataFrame:
-    """Add the run's name and its settings as columns."""
+def _settings(folder: Path) -> dict[str, Any]:
+    """Return the settings of a run by their dotted keys; none where it has no configuration."""
     config = folder / CONFIG
-    settings = dict(flatten(read_settings(config))) if config.is_file() else {}
-    extra = {"run": run, **settings}
-    new = {k: [v] * len(frame) for k, v in extra.items() if k not in frame.columns}
+    return dict(flatten(read_settings(config))) if config.is_file() else {}
+
+
+def _with_settings(frame: pd.DataFrame, settings: Mapping[str, Any]) -> pd.DataFrame:
+    """Add settings as columns."""
+    new = {k: [v] * len(frame) for k, v in settings.items() if k not in frame.columns}
     return pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1)
+
+
+def _different(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return of every run its name and the settings in which not all runs agree."""
+    keys = dict.fromkeys(key for settings in runs for key in settings)
+    kept = [k for k in keys if k == "run" or any(x.get(k) != runs[0].get(k) for x in runs)]
+    found = [{key: settings.get(key) for key in kept} for settings in runs]
+    for key in kept:  # a column of a dataset has one type
+        kinds = {type(settings[key]) for settings in found} - {type(None)}
+        if not kinds or len(kinds - {int, float}) > (0 if len(kinds) > 1 else 1):
+            for settings in found:
+                settings[key] = None if settings[key] is None else str(settings[key])
+    return found
+
+
+def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say which shards of evaluations in several parts are missing.
+
+    Args:
+        runs: settings of every run by their dotted keys.
+    """
+    parts: dict[str, set[int]] = {}
+    for settings in (x for x in runs if (x.get(SHARDS) or 1) > 1):
+        others = {key: value for key, value in settings.items() if key not in (SHARD, "run")}
+        key = json.dumps(others, sort_keys=True, default=str)
+        parts.setdefault(key, set()).add(settings[SHARD])
+    lines = []
+    for key, present in parts.items():
+        settings = json.loads(key)
+        gaps = [str(x) for x in range(settings[SHARDS]) if x not in present]
+        if gaps:
+            which = ", ".join(gaps[:10]) + (", …" if len(gaps) > 10 else "")
+            of = f"{len(gaps)} of {settings[SHARDS]} shards of variant {settings['variant']}"
+            lines.append(f"{of} are missing: {SHARD}={which}")
+    return lines
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -10,6 +10,7 @@ import pandas as pd
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
+REPEAT = "repeat"  # of a row: which draw of the noise of its profile and driver, where several
 BASELINES = ("idm", "human", "idm tuned", "reference")
 UNTRAINED = ("direct", "idm", "human", "idm tuned", "acc tuned")
 NOTHING = Estimate(np.nan, np.nan, np.nan)
@@ -22,8 +23,12 @@ TERCILES = ("lower", "middle", "upper")
 
 
 def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return a column per strategy and a row per (profile, driver), the mean over seeds."""
-    return episodes.pivot_table(index=KEYS, columns="strategy", values=column, aggfunc="mean")
+    """Return a column per strategy and a row per pair, the mean over seeds.
+
+    A pair is a profile and a driver, and where there are several draws of its noise, the draw.
+    """
+    keys = [*KEYS, REPEAT] if REPEAT in episodes else KEYS
+    return episodes.pivot_table(index=keys, columns="strategy", values=column, aggfunc="mean")
 
 
 def by_driver(episodes: pd.DataFrame, column: str) -> pd.DataFrame:

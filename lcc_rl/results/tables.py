@@ -10,15 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from lcc_rl.results.savings import (
-    BASELINES,
-    KINDS,
-    NOTHING,
-    paired,
-    per_window,
-    savings,
-    worse_off,
-)
+from lcc_rl.io.files import Rows
+from lcc_rl.results.savings import BASELINES, KINDS, NOTHING, savings
+from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 FASTER = "share_leader_faster"
@@ -42,11 +36,13 @@ SHOWN = CAR_COLUMNS[CAR_COLUMNS.index("share_ttc_unsafe") :]  # as means
 HUMAN_COLUMNS = ("hdv_energy_kj", "hdv_net_energy_kj", "hdv_distance_m")
 
 
-def summary(episodes: pd.DataFrame) -> pd.DataFrame:
+def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     """Summarise every strategy.
 
     Args:
-        episodes: rows of one or more evaluations on the same profiles and drivers.
+        episodes: rows of one or more evaluations on the same profiles and drivers; of a dataset
+            one block is in memory at a time, and strategies are paired within blocks.
+        source: of the leaders whose rows count; empty for all.
 
     Returns:
         One row per strategy: mean energies [kJ] and energy per kilometre, savings against each of
@@ -55,40 +51,40 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
         the safety measures; missing where a strategy has none.
     """
     # A string without automated vehicles, or without others, has no energies of them.
-    lacking = [column for column in (*CAR_COLUMNS, *HUMAN_COLUMNS) if column not in episodes]
-    episodes = episodes.assign(**dict.fromkeys(lacking, float("nan")))
-    windows = per_window(episodes, [f"total_{column}" for column in KINDS.values()])
-    path = paired(episodes, PATH)
+    columns = [*CAR_COLUMNS, *HUMAN_COLUMNS, "collided"]
+    means = list(dict.fromkeys([*columns, *(f"total_{column}" for column in KINDS.values())]))
+    found = Totals(episodes, means, ["min_ttc_s"], PATH, BASELINES, source)
+    windows, every, sums = found.per_window(), found.mean(), found.sums()
     rows = []
-    for strategy, group in episodes.groupby("strategy", sort=False):
-        row: dict[str, object] = {"strategy": strategy, "episodes": len(group)}
+    for strategy in found.strategies:
+        mean, total = every.loc[strategy].to_dict(), sums.loc[strategy].to_dict()
+        row: dict[str, object] = {"strategy": strategy, "episodes": int(total["rows"])}
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
-                row[f"{vehicle}_{kind}"] = group[f"{vehicle}_{kind}"].mean()
-        row |= {name: group[name].mean() for name in (PATH, LOST)}
-        kilometres = group[["cav_distance_m", "hdv_distance_m"]].sum().sum() / 1e3
-        energy = group["total_energy_kj"].fillna(group["hdv_energy_kj"])
-        row["kj_per_km"] = energy.sum() / kilometres
+                row[f"{vehicle}_{kind}"] = mean[f"{vehicle}_{kind}"]
+        row |= {name: mean[name] for name in (PATH, LOST)}
+        kilometres = (total["cav_distance_m"] + total["hdv_distance_m"]) / 1e3
+        whose = "hdv" if np.isnan(mean["total_energy_kj"]) else "total"
+        row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
         for baseline in BASELINES:
-            row |= _against(windows, path, str(strategy), baseline)
-        row["collisions"] = int(group["collided"].sum())
-        row["min_ttc_s"] = group["min_ttc_s"].min()
-        for column in SHOWN:
-            row[column] = group[column].mean()
+            row |= _against(windows, found, strategy, baseline)
+        row["collisions"] = int(total["collided"])
+        row["min_ttc_s"] = found.low("min_ttc_s", strategy)
+        row |= {column: mean[column] for column in SHOWN}
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def _against(
-    windows: pd.DataFrame, path: pd.DataFrame, strategy: str, baseline: str
+    windows: pd.DataFrame, found: Totals, strategy: str, baseline: str
 ) -> dict[str, float]:
     """Savings of a strategy over a baseline, paired by window and driver."""
     row: dict[str, float] = {}
     for kind, column in KINDS.items():
         known = strategy != baseline
-        found = savings(windows, f"total_{column}", strategy, baseline) if known else NOTHING
-        row |= found.columns(f"{kind}saving_vs_{baseline}")
-    worse = worse_off(path, strategy, baseline)
+        share = savings(windows, f"total_{column}", strategy, baseline) if known else NOTHING
+        row |= share.columns(f"{kind}saving_vs_{baseline}")
+    worse = found.worse_off(strategy, baseline)
     return row | {f"{name}_worse_than_{baseline}": share for name, share in worse.items()}
 
 
@@ -124,7 +120,7 @@ ROWS = (
 )
 
 
-def leader_too_fast(episodes: pd.DataFrame) -> list[str]:
+def leader_too_fast(episodes: Rows) -> list[str]:
     """Return a warning for every human baseline whose desired speed the leaders mostly exceed.
 
     A driver who would not keep up with the leader by choice drops back, whoever drives ahead:
@@ -133,13 +129,19 @@ def leader_too_fast(episodes: pd.DataFrame) -> list[str]:
     Args:
         episodes: rows of an evaluation.
     """
-    if FASTER not in episodes:
-        return []
     remedies = {
         "direct": "drivers=highway, or drivers calibrated on such traffic",
         "idm": "variant=idm scenario.controllers.automated.desired_speed=45 'compare=[<run>]'",
     }
-    shares = episodes.groupby("strategy")[FASTER].mean()
+    parts = [
+        frame.groupby("strategy")[FASTER].agg(["sum", "count"])
+        for frame in frames(episodes, ["strategy", FASTER])
+        if FASTER in frame
+    ]
+    if not parts:
+        return []
+    total = pd.concat(parts).groupby(level=0).sum()
+    shares = total["sum"] / total["count"]
     return [
         f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
         f"time (more than {MOSTLY:.0%}): savings against it mean little. Raise v0: {remedy}"

@@ -12,7 +12,7 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.targets import TARGET, find_target, forget_places, settings_at
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
-ROOMS = "agents data drivers evaluation functional pieces policies runs.loggers synthetic"
+ROOMS = "agents data drivers energy evaluation functional pieces policies runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
 

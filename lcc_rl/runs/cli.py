@@ -259,3 +259,23 @@ def root_key(override: str) -> str:
 def run_folder() -> Path:
     """Return the folder that Hydra made for the present run or job."""
     return Path(HydraConfig.get().runtime.output_dir)
+
+
+def resumed_folder(cfg: DictConfig, own: Sequence[str]) -> Path:
+    """Return the folder of the run that ``resume`` names; without it that of the present run.
+
+    Args:
+        cfg: the configuration, with the key ``resume``.
+        own: settings that may be given beside the folder.
+
+    Raises:
+        ConfigError: naming other settings.
+    """
+    if cfg.resume is None:
+        return run_folder()
+    others = [item for item in HydraConfig.get().overrides.task if root_key(item) not in own]
+    if others:
+        raise ConfigError(
+            f"a resumed run keeps the settings it was started with; remove {' '.join(others)}"
+        )
+    return Path(cfg.resume)

@@ -90,6 +90,39 @@ def test_the_record_is_that_of_the_literal_reward(tmp_path) -> None:
     assert row["episode_reward"] == pytest.approx(float(played["next", *REWARD].sum(1).mean()))
 
 
+@pytest.mark.parametrize("every", [1, 3, 10])
+def test_the_value_is_fitted_to_returns_of_all_lengths(every) -> None:
+    """Against the definition, episode by episode: the last stretch is short, one collides."""
+    agent = make_agent(compose("alcc", *SMALL, f"agent.value_every={every}"))
+    generator = torch.Generator().manual_seed(0)
+    steps, own = 7, agent.settings
+    moments = torch.randn(3, steps + 1, 1, 7, generator=generator)
+    rewards = torch.randn(3, steps, 1, generator=generator)
+    running = torch.ones(3, steps, 1)
+    running[1, 4:], rewards[1, 5:] = 0.0, 0.0
+    begins, errors = list(range(0, steps, every)), []
+    with torch.no_grad():
+        seen, ahead = agent.value(moments).flatten(1), agent.target(moments).flatten(1)
+        for episode in range(3):
+            for place in begins:
+                alive = running[episode, place - 1] if place else torch.ones(1)
+                wanted, factor, last = torch.zeros(1), 1.0, 0.0
+                # The mixture of the returns up to each later moment, each of weight (1 − λ) λ^n.
+                for begin in [b for b in begins if b >= place]:
+                    end = min(begin + every, steps)
+                    stretch = sum(
+                        own.gamma ** (t - begin) * rewards[episode, t] for t in range(begin, end)
+                    )
+                    wanted = wanted + factor * stretch
+                    last = factor * own.gamma ** (end - begin) * running[episode, end - 1]
+                    weight = own.td_lambda ** (end - begin) if end < steps else 0.0
+                    wanted = wanted + last * (1.0 - weight) * ahead[episode, end]
+                    factor = last * weight
+                errors.append((seen[episode, place] - wanted) * alive)
+    loss = agent._fit(rewards, running, moments)
+    assert float(loss) == pytest.approx(float(torch.stack(errors).square().mean()), rel=1e-5)
+
+
 def test_a_removed_term_is_not_optimised(tmp_path) -> None:
     names = {term.name for term, _ in make(tmp_path).objective.terms}
     assert names == {

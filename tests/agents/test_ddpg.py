@@ -6,11 +6,14 @@ from copy import deepcopy
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
 from lcc_rl.errors import ConfigError
+from lcc_rl.io.tensors import read_torch
+from lcc_rl.results.policies import save_policy
 
 
 def transitions(count: int, seed: int) -> TensorDict:
@@ -45,6 +48,34 @@ def test_the_fused_update_equals_torchrls_loss(hidden: list[int]) -> None:
     fused, plain = (one.loss.state_dict() for one in agents)
     for name in plain:
         torch.testing.assert_close(fused[name], plain[name], rtol=1e-3, atol=2e-5)
+
+
+def test_batches_of_all_sizes_are_learned_from() -> None:
+    agents = [agent(fused=fused) for fused in (True, False)]
+    for step, size in enumerate((8, 64, 8)):
+        fused, plain = (one.update(transitions(size, step)) for one in agents)
+        for name in plain:
+            torch.testing.assert_close(fused[name], plain[name], rtol=1e-4, atol=1e-6)
+
+
+def test_networks_that_learn_at_two_rates_do_so_where_one_rate_is_nearly_zero() -> None:
+    for slow in ("actor", "value"):
+        rates = {"actor_lr": 1e-3, "critic_lr": 1e-3}
+        learner = agent(**{**rates, "actor_lr" if slow == "actor" else "critic_lr": 1e-30})
+        before = deepcopy(learner.loss.state_dict())
+        learner.update(transitions(64, 0))
+        for name, value in learner.loss.state_dict().items():
+            if name.startswith(("actor_network", "value_network")):
+                assert torch.equal(value, before[name]) == name.startswith(slow), name
+
+
+def test_a_policys_file_holds_its_weights_only(tmp_path) -> None:
+    learner = agent()
+    save_policy(learner.policy.state_dict(), OmegaConf.create({}), tmp_path / "policy.pt")
+    found = read_torch(tmp_path / "policy.pt")["weights"]
+    for name, weight in learner.policy.state_dict().items():
+        assert torch.equal(found[name], weight)
+        assert found[name].untyped_storage().nbytes() == 4 * weight.numel()
 
 
 def test_the_policy_acts_with_the_weights_that_the_fused_update_moves() -> None:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pandas as pd
 import pytest
 import torch
 from helpers import ACTION, POPULATION, compose, make_agent, wavy_profiles
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.objectives import SoftUpdate
 
-from lcc_rl.agents.replay import Trainer
+from lcc_rl.agents.off_policy import leaves
+from lcc_rl.agents.replay import Trainer, draws
+from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
@@ -67,8 +73,8 @@ def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
     assert torch.equal(weights(second), weights(whole))
 
 
-def batch(size: int = 64) -> TensorDict:
-    draw = torch.Generator().manual_seed(0)
+def batch(size: int = 64, seed: int = 0) -> TensorDict:
+    draw = torch.Generator().manual_seed(seed)
     flag = torch.zeros(size, 1, dtype=torch.bool)
     return TensorDict(
         {
@@ -83,6 +89,56 @@ def batch(size: int = 64) -> TensorDict:
         },
         [size],
     )
+
+
+@EACH
+def test_vectors_learn_as_torchs_adam_and_torchrls_soft_update_do(agent) -> None:
+    settings = ("agent.tau=0.05", "agent.critic_lr=0.002")
+    joined, plain = (make_agent(compose("alcc", f"agent={agent}", *SMALL, *settings)) for _ in "ab")
+    loss = plain.loss
+    critic = loss.qvalue_network_params
+    own = {
+        "actor": torch.optim.Adam(leaves(loss.actor_network_params), lr=1e-3),
+        "value": torch.optim.Adam(leaves(critic), lr=2e-3),
+        "alpha": torch.optim.Adam([getattr(loss, "log_alpha", torch.nn.Parameter())], lr=1e-3),
+    }
+    updater = SoftUpdate(loss, tau=0.05)
+
+    def step(*names: str) -> None:
+        for name in names:
+            own[name].step()
+        loss.zero_grad(set_to_none=True)
+
+    plain._step, plain._follow = step, lambda *_: updater.step()
+    for number in range(6):
+        data = batch(seed=number)
+        found, expected = joined.update(data.clone()), plain.update(data.clone())
+        for name in expected:
+            torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-6)
+    state = plain.loss.state_dict()
+    for name, value in joined.loss.state_dict().items():
+        torch.testing.assert_close(value, state[name], rtol=1e-3, atol=2e-5)
+
+
+@pytest.mark.parametrize("filled", [40, 100, 130])
+def test_batches_are_drawn_as_torchrls_buffer_draws_them(filled) -> None:
+    generator = torch.Generator()
+    buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=32, generator=generator)
+    buffer.extend(batch(filled))
+    generator.manual_seed(3)
+    expected = [buffer.sample() for _ in range(3)]
+    generator.manual_seed(3)
+    for one, found in zip(expected, draws(buffer, generator), strict=False):
+        for key in found.keys(True, True):
+            assert torch.equal(found.get(key), one.get(key)), key
+
+
+def test_small_numbers_count_as_zero_within_and_as_themselves_after() -> None:
+    small = torch.tensor([1e-39])
+    for inside in (True, False):
+        with denormals_flushed() if inside else nullcontext():
+            flushed = float(small * 1.0) == 0.0
+        assert flushed == (inside and torch.set_flush_denormal(False))
 
 
 @EACH

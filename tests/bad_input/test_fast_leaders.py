@@ -14,7 +14,7 @@ from study_frames import episodes
 
 from lcc_rl.commands import evaluation
 from lcc_rl.data.profiles import from_records
-from lcc_rl.evaluation.episodes import leader_faster
+from lcc_rl.evaluation.rows import leader_faster
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.tables import FASTER, leader_too_fast, summary
 from lcc_rl.studies.alcc.report_main import add_main

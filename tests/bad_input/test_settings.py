@@ -154,6 +154,7 @@ NODES = (
             **dict.fromkeys(("learning_rate", "clip_norm", "value_lr"), POSITIVE),
             "gamma": (0, *SHARE),
             "td_lambda": SHARE,
+            "value_every": WHOLE_ONE,
             "tau": (0, *SHARE),
             "surrogates.safety.width": POSITIVE,
             "surrogates.efficiency.speed_floor": POSITIVE,

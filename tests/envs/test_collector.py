@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
-from helpers import TERMS, compose, make_agent, single_env, small_env, string
-from tensordict.nn import TensorDictSequential
+from helpers import TERMS, VARIANTS, compose, make_agent, single_env, small_env, string
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs.transforms import RewardSum
 
 from lcc_rl.agents.replay import LEARNED_FROM
 from lcc_rl.envs import StringCollector
+from lcc_rl.envs.step import Step, pieces_of
 from lcc_rl.errors import ConfigError
+from lcc_rl.pieces.base import SEED, as_key
 from lcc_rl.policies import GaussianExploration, shared_policy
 
 KEYS = (*LEARNED_FROM, ("next", *TERMS), ("vehicles", "gap"))
@@ -64,6 +68,53 @@ def test_transitions_are_those_of_torchrls_collector(view) -> None:
     ours.shutdown()
 
 
+@pytest.mark.parametrize("size", [1, 3, 8])
+def test_resets_of_so_many_episodes_at_once_are_the_same(size) -> None:
+    # As when compiled, where the number of episodes that end is filled up or divided.
+    wanted = StringCollector(environment("two"), policy(), frames_per_batch=8 * 120, keys=KEYS)
+    ours = StringCollector(environment("two"), policy(), frames_per_batch=8 * 120, keys=KEYS)
+    ours.rows = size
+    one, two = wanted.collect(), ours.collect()
+    assert one["next", "terminated"].any()
+    assert one["next", "done"].sum(0).max() > 1  # more than one at the same step
+    for key in one.keys(True, True):
+        assert torch.equal(one[key], two[key]), key
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_any_batch_of_episodes(batch) -> None:
+    def played(make):
+        env = small_env("alcc", batch, ["scenario.horizon=10"])
+        return next(iter(make(env, policy(), frames_per_batch=env.batch_size.numel() * 25)))
+
+    theirs = played(partial(Collector, total_frames=-1, auto_register_policy_transforms=False))
+    ours = played(StringCollector)
+    assert ours.shape == (*batch, 25)
+    assert ours["next", "done"].sum() == 2 * ours[..., 0].numel()
+    for key in ours.keys(True, True):
+        assert torch.equal(ours[key], theirs[key]), key
+
+
+@pytest.mark.parametrize(
+    ("variant", "overrides"),
+    [
+        *((variant, []) for variant in VARIANTS),
+        ("alcc", ["+knowledge=[memory,preview]", "+filter=cbf"]),
+        ("alcc", ["scenario.string={size: 9, penetration: 0.4}"]),
+        ("alcc", ["scenario.pieces.leader.perturbation=1.0"]),
+        ("idm", ["scenario=ring"]),
+    ],
+)
+def test_an_episode_begins_as_the_environment_would_begin_it(variant, overrides) -> None:
+    env = small_env(variant, 7, overrides)
+    begun = env.reset()
+    rows = torch.tensor([5, 2])
+    ours = Step(pieces_of(env), env.base_env.horizon).begin(begun[SEED][rows])
+    assert set(ours) == {as_key(key) for key in begun.keys(True, True)}
+    for key, value in ours.items():
+        assert torch.equal(value, begun[key][rows]), key
+
+
 def test_an_environment_may_be_made_by_a_function_and_its_state_restored() -> None:
     def segments(collector):
         return next(iter(collector))["vehicles", "speed"]
@@ -111,7 +162,7 @@ def test_without_a_compiler_one_line_and_the_plain_step(monkeypatch, caplog) -> 
         return fail
 
     expected = first(small_env("alcc", 2), frames_per_batch=10)
-    monkeypatch.setattr("lcc_rl.envs.step.compile", broken)
+    monkeypatch.setattr("lcc_rl.envs.compiled.compile", broken)
     caplog.set_level("INFO", "lcc_rl")
     segment = first(small_env("alcc", 2), frames_per_batch=10, compiled=True)
     assert torch.equal(
@@ -131,3 +182,73 @@ def test_compiled_agrees_and_repeats_itself() -> None:
     for key in plain.keys(True, True):
         torch.testing.assert_close(one[key], plain[key], rtol=1e-4, atol=1e-4)
         assert torch.equal(one[key], two[key]), key
+
+
+def crashing(compiled: bool, batch: int = 40, seed: int = 0):
+    env = small_env("alcc", batch, CRASHING, seed)
+    return StringCollector(
+        env, policy(), frames_per_batch=batch * 150, keys=[*KEYS, SEED], compiled=compiled
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_compiled_replaces_the_episodes_that_end() -> None:
+    ours = crashing(True)
+    assert ours.rows < 40  # so that those that all reach the horizon are more than fit
+    compiled, plain = ours.collect(), crashing(False).collect()
+    assert isinstance(ours.renew.function, type(ours.advance.function))
+    assert ours.renew.function is not ours.renew.plain
+    assert plain["next", "terminated"].any()
+    assert (plain["next", "done"].sum(1) > 1).any()
+    # A gap of nearly zero may end an episode a step earlier; from there on the seeds differ.
+    same = (compiled["next", "done"] == plain["next", "done"]).all(0).cumprod(0).flatten().bool()
+    assert same[:100].all()
+    for key in plain.keys(True, True):
+        torch.testing.assert_close(
+            compiled[key][:, same], plain[key][:, same], rtol=1e-3, atol=1e-3, msg=str(key)
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_compiled_collectors_of_one_process_do_not_share_their_graphs() -> None:
+    def gaps(margin: float, compiled: bool):
+        env = small_env("alcc", 4, [f"scenario.controllers.automated.max_acceleration={margin}"])
+        collector = StringCollector(
+            env, policy(), frames_per_batch=40, keys=[("vehicles", "gap")], compiled=compiled
+        )
+        return collector.collect()["vehicles", "gap"]
+
+    # What differs is a setting of a piece, which is not compared before a graph is used.
+    for margin in (3.0, 1.0):
+        torch.testing.assert_close(gaps(margin, True), gaps(margin, False), rtol=1e-4, atol=1e-4)
+
+
+class Shifted(TensorDictModuleBase):
+    """A policy with a setting that is no tensor."""
+
+    def __init__(self) -> None:
+        self.in_keys, self.out_keys = [("automated", "observation")], [("automated", "action")]
+        super().__init__()
+        self.shift = 0.5
+
+    def forward(self, tensordict):
+        action = torch.zeros_like(tensordict[self.in_keys[0]][..., :1]) + self.shift
+        return tensordict.set(self.out_keys[0], action)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_compiled_sees_a_change_of_the_policy() -> None:
+    acting = Shifted()
+    collector = StringCollector(
+        small_env("alcc", 4),
+        acting,
+        frames_per_batch=8,
+        keys=[("automated", "action")],
+        compiled=True,
+    )
+    assert (collector.collect()["automated", "action"] == 0.5).all()
+    acting.shift = -0.25
+    assert (collector.collect()["automated", "action"] == -0.25).all()

@@ -121,12 +121,12 @@ def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
     _, expected = unrolled.play(unrolled.start(), network, 3)
 
     def no_compiler(function, **settings):
-        def fail(network, state, shift):
+        def fail(state, action):
             raise torch._dynamo.exc.TorchDynamoException("no C++ compiler found\nmore")
 
         return fail
 
-    monkeypatch.setattr("lcc_rl.envs.step.compile", no_compiler)
+    monkeypatch.setattr("lcc_rl.envs.compiled.compile", no_compiler)
     fallback = DifferentiableRollout(small_env("alcc", 4), WANTED, compiled=True)
     with caplog.at_level(logging.INFO):
         _, record = fallback.play(fallback.start(), network, 3)

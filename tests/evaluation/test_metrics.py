@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lcc_rl.evaluation.metrics import energy_measures, safety_measures
+from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
 from lcc_rl.functional.safety import NEVER
 
 ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
@@ -39,6 +39,9 @@ def test_safety() -> None:
     measures = safety_measures(series, ALIVE.view(2, 2, 1, 1), 0.1)
     expected = {
         "min_gap_m": [7.0, 3.0],
+        "mean_gap_m": [7.5, 3.0],
+        "max_gap_m": [8.0, 3.0],
+        "min_time_gap_s": [1.0, 1.0],
         "min_ttc_s": [3.0, 5.0],
         "max_time_gap_s": [2.6, 1.0],
         "share_ttc_unsafe": [0.5, 0.0],
@@ -79,3 +82,26 @@ def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> 
     assert found["share_ttc_unsafe"] == pytest.approx(0.5)
     assert found["share_time_gap_long"] == pytest.approx(0.25)
     assert found["share_time_gap_long_moving"] == pytest.approx(0.25)
+
+
+def test_traffic_of_a_string() -> None:
+    # [time, episodes, vehicles, 1]; the second episode ends after two steps.
+    one = torch.tensor([[10.0, 12.0], [12.0, 12.0], [10.0, 12.0], [12.0, 12.0]])
+    other = torch.tensor([[5.0, 7.0], [5.0, 9.0], [50.0, 90.0], [50.0, 90.0]])
+    speed = torch.stack([one, other], 1).unsqueeze(-1)
+    alive = torch.tensor([[1, 1], [1, 1], [1, 0], [1, 0]], dtype=torch.bool).unsqueeze(-1)
+    leader = torch.tensor([[8.0, 1.0], [12.0, 3.0], [8.0, 0.0], [12.0, 0.0]]).unsqueeze(-1)
+    gap = torch.full_like(speed, 15.0)
+    found = string_measures(speed, gap, alive, 5.0, leader)
+    expected = {
+        "mean_speed_mps": [11.5, 6.5],
+        "speed_std_mps": [0.5, 0.5],
+        "speed_spread_mps": [0.5, 1.5],
+        "final_speed_spread_mps": [0.0, 2.0],
+        "flow_vph": [3600.0 * 11.5 / 20.0, 3600.0 * 6.5 / 20.0],
+        "string_ratio": [0.0, 1.0],
+    }
+    assert set(found) == set(expected)
+    for name, values in expected.items():
+        torch.testing.assert_close(found[name].flatten(), torch.tensor(values))
+    assert "string_ratio" not in string_measures(speed, gap, alive, 5.0)

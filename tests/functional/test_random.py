@@ -39,3 +39,11 @@ def test_draw_is_a_function_of_its_counter() -> None:
 def test_streams_differ() -> None:
     a, b = (uniform(SEEDS, 0, stream_id(name)) for name in ("hdv.noise", "exploration"))
     assert abs(torch.corrcoef(torch.stack([a, b]))[0, 1]) < 0.01
+
+
+def test_normal_draws_are_finite_at_both_ends(monkeypatch) -> None:
+    ends = torch.tensor([0.0, 1.0 - 2.0**-24])  # all 24 bits clear, all set
+    monkeypatch.setattr("lcc_rl.functional.random.uniform", lambda *_: ends)
+    drawn = normal(torch.zeros(2, dtype=torch.int64), 0)
+    assert drawn.isfinite().all()
+    assert drawn.abs().min() > 5.0

@@ -6,30 +6,41 @@ from argparse import Namespace
 
 import numpy as np
 import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
 
-from benchmarks.harness import Row, alternate, endings, rows_of
+from benchmarks.harness import Row, Run, alternate, endings, first_calls, rows_of
 from benchmarks.plain import PlainLoop, alcc, check_physics
-from lcc_rl.envs.rollout import ACTION
+from lcc_rl.envs import StringCollector
+from lcc_rl.envs.rollout import ACTION, OBSERVATION
+from lcc_rl.pieces.rewards import REWARD
+
+Rates = dict[str, np.ndarray]
 
 
 def env(options: Namespace) -> list[Row]:
     """Steps per second of the ALCC environment with zero actions, beside the plain loop.
 
-    "step" is what a collector calls (``step_and_maybe_reset``) and keeps nothing, like the plain
-    loop; "rollout" stacks every entry of every moment. The vehicles start 30 s apart, so that no
+    "step" is what TorchRL's collector calls (``step_and_maybe_reset``) and keeps nothing, like the
+    plain loop; "StringCollector" is the training's own, which keeps the rewards; "rollout" stacks
+    every entry of every moment. The vehicles start 30 s apart, so that no
     episode ends within a run and nobody resets. Both are first checked to be the same physics.
     """
     check_physics(options, 20 if options.quick else 250)
     rows: list[Row] = []
     for batch in (1, 16) if options.quick else (1, 64, 1024, 8192):
         for ending in endings(options):
-            rates = env_rates(options, batch, ending)
+            rates, first = env_rates(options, batch, ending)
             rows += rows_of("env", rates, "steps/s", f"plain loop{ending}", batch)
+            rows += rows_of("env", first, "s, first call", None, batch)
     return rows
 
 
-def env_rates(options: Namespace, batch: int, ending: str) -> dict[str, np.ndarray]:
-    """Steps per second of every way to step, all eager or, with an ending, all compiled."""
+def env_rates(options: Namespace, batch: int, ending: str) -> tuple[Rates, Rates]:
+    """Steps per second of every way to step, all eager or, with an ending, all compiled.
+
+    And the seconds of the first call of those compiled.
+    """
     steps, env = 10 if options.quick else 100, alcc(options, batch, 30)
     zero = torch.zeros(batch, 1, 1, device=options.device)
     plain, start = PlainLoop(env), env.reset()
@@ -55,7 +66,27 @@ def env_rates(options: Namespace, batch: int, ending: str) -> dict[str, np.ndarr
         for _ in range(steps):
             state, _ = advance(state, action)
 
-    runs = {f"rollout{ending}": rollout, f"step{ending}": step, f"plain loop{ending}": loop}
+    collect = collecting(alcc(options, batch, 30), zero, steps, bool(ending))
+    ways = {"rollout": rollout, "StringCollector": collect, "step": step, "plain loop": loop}
+    runs = {f"{name}{ending}": way for name, way in ways.items()}
     with torch.no_grad():
+        first = first_calls(runs) if ending else {}
         spent = alternate(runs, options.repeats)
-    return {name: batch * steps / seconds for name, seconds in spent.items()}
+    return {name: batch * steps / seconds for name, seconds in spent.items()}, first
+
+
+def collecting(env: TransformedEnv, action: torch.Tensor, steps: int, compiled: bool) -> Run:
+    """So many steps of the training's own collector with one action, of which rewards are kept."""
+    collector = StringCollector(
+        env,
+        TensorDictModule(lambda _: action, [OBSERVATION], [ACTION]),
+        frames_per_batch=env.batch_size.numel() * steps,
+        keys=[("next", *REWARD)],
+        compiled=compiled,
+    )
+
+    def run() -> None:
+        collector.reset()
+        collector.collect()
+
+    return run

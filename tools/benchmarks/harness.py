@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from argparse import Namespace
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
@@ -31,6 +32,19 @@ def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
             run()
             spent[name].append(clock() - begun)
     return {name: np.array(seconds[1:]) for name, seconds in spent.items()}
+
+
+def first_calls(runs: Mapping[str, Run]) -> dict[str, np.ndarray]:
+    """Seconds of the first call of every run, with nothing kept of an earlier compilation."""
+    spent = {}
+    config: Any = torch.compiler.config  # torch adds its method patch on import
+    with config.patch(force_disable_caches=True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that caches are disabled
+        for name, run in runs.items():
+            begun = clock()
+            run()
+            spent[name] = np.array([clock() - begun])
+    return spent
 
 
 def clock() -> float:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -17,12 +19,13 @@ from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.estimation import Belief, predict_and_update
-from lcc_rl.functional.idm import idm_acceleration
+from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
-from lcc_rl.functional.random import uniform
+from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.rewards import TOUCH
 
 
 @cache
@@ -30,6 +33,12 @@ def study(quick: bool) -> tuple[DictConfig, Inputs]:
     """Configuration and inputs of the ALCC study on the synthetic stream."""
     cfg = load("train", ["variant=alcc"])
     return cfg, load_inputs(cfg, stream(quick).load().episodes)
+
+
+def training(options: Namespace, batch: int) -> TransformedEnv:
+    """Build the ALCC environment of a training: gaps spread at the start, episodes that end."""
+    cfg, inputs = study(options.quick)
+    return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 
 
 def alcc(
@@ -48,7 +57,8 @@ class PlainLoop:
     """The physics of the environment as one function of tensors, without TorchRL.
 
     Args:
-        env: an ALCC environment with one human follower, whose settings and data it shares.
+        env: an ALCC environment, one automated vehicle ahead of human drivers, whose settings and
+            data it shares.
     """
 
     def __init__(self, env: TransformedEnv) -> None:
@@ -59,23 +69,27 @@ class PlainLoop:
         self.human, self.estimator = pieces["IDM"], pieces["DriverEstimator"]
         self.scales, self.penalty = pieces["Observation"].constants, terms["collision"].weight
         self.safety, self.efficiency = terms["safety"], terms["efficiency"]
+        self.horizon, self.rows = env.base_env.horizon, env.batch_size.numel()
         energies = (terms["cav_energy"], terms["hdv_energy"])
         self.cav_price, self.hdv_price = (term.weight * term.factor for term in energies)
 
     def start(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Begin where a reset of the environment begins; all entries are ``[batch, width]``."""
-        (cav, speed), (cav_gap, gap) = (td["vehicles", key].unbind(-2) for key in ("speed", "gap"))
+        """Begin where a reset of the environment begins.
+
+        Entries are ``[batch, 1]``, of the human drivers ``[batch, n, width]``.
+        """
+        speed, gap = td["vehicles", "speed"], td["vehicles", "gap"]
         keys = ("estimate", "covariance", "desired_speed", "desired_time_gap")
         return {
             "seed": td[SEED],
             "step": td[STEP],
             "place": self.leader.offsets[td["leader", "profile"]] + td["leader", "start"],
             "leader": td["leader", "speed"],
-            "cav": cav,
-            "cav_gap": cav_gap,
-            "speed": speed,
-            "gap": gap,
-            **{key: td["human", key].squeeze(-2) for key in keys},
+            "cav": speed[:, 0],
+            "cav_gap": gap[:, 0],
+            "speed": speed[:, 1:],
+            "gap": gap[:, 1:],
+            **{key: td["human", key] for key in keys},
         }
 
     def step(self, now: dict[str, Tensor], action: Tensor) -> tuple[dict[str, Tensor], ...]:
@@ -84,40 +98,133 @@ class PlainLoop:
         leader = self.leader.speeds[now["place"] + now["step"] + 1]
         cav, cav_acceleration = advance_speed(now["cav"], action * self.max_acceleration, dt)
         cav_gap = advance_gap(now["cav_gap"], now["leader"], now["cav"], leader, cav, dt)
-        motion = (now["speed"], now["gap"], now["speed"] - now["cav"])
+        ahead = following(now["cav"], now["speed"])
+        motion = (now["speed"], now["gap"], now["speed"] - ahead)
         wish = idm_acceleration(*motion, now["desired_speed"], now["desired_time_gap"], drivers)
-        noise = self.human.noise * uniform(now["seed"], now["step"], self.human.noise_stream)
+        draws = uniform(
+            now["seed"][:, None], now["step"][:, None], self.human.noise_stream + self.human.index
+        )
+        noise = self.human.noise * draws
         speed, acceleration = advance_speed(now["speed"], wish * (1.0 + noise), dt)
-        gap = advance_gap(now["gap"], now["cav"], now["speed"], cav, speed, dt)
+        gap = advance_gap(now["gap"], ahead, now["speed"], following(cav, speed), speed, dt)
         belief = Belief(now["estimate"], now["covariance"])
         error = self.estimator.measurement_error
         predicted, belief = predict_and_update(*motion, speed, belief, drivers, dt, error)
-        early = now["step"] < self.estimator.learning_steps
+        early = now["step"][:, None] < self.estimator.learning_steps
         predicted = torch.where(early, self.estimator.mean(*motion), predicted)
         threshold = self.safety.threshold
-        ttc = time_to_collision(cav_gap - self.safety.margin, cav - leader)
+        room = (cav_gap - self.safety.margin).clamp(min=TOUCH)
+        ttc = time_to_collision(torch.where(cav_gap > 0.0, room, cav_gap), cav - leader)
         late = time_gap(cav_gap, cav) >= self.efficiency.threshold
         reward = (
             self.safety.weight * (ttc.clamp(self.safety.floor, threshold) / threshold).log()
             - self.efficiency.weight * late.float()
             - self.cav_price * motor_power(now["cav"], cav_acceleration)
-            - self.hdv_price * motor_power(now["speed"], predicted)
-            - self.penalty * ((cav_gap <= 0.0) | (gap <= 0.0)).float()
+            - self.hdv_price * motor_power(now["speed"], predicted).sum(-2)
+            - self.penalty * ((cav_gap <= 0.0) | (gap <= 0.0).any(-2)).float()
         )
-        seen = [leader, cav, leader - cav, cav_gap, speed, cav - speed, gap]
-        written = {
-            "observation": torch.cat(seen, dim=-1) * self.scales,
-            "reward": reward,
-            "hdv_power": motor_power(now["speed"], acceleration),
-        }
+        written = {"reward": reward, "hdv_power": motor_power(now["speed"], acceleration)}
         reached = {"leader": leader, "cav": cav, "cav_gap": cav_gap, "speed": speed, "gap": gap}
         learned = {"estimate": belief.estimate, "covariance": belief.covariance}
-        return {**now, "step": now["step"] + 1, **reached, **learned}, written
+        after = {**now, "step": now["step"] + 1, **reached, **learned}
+        return after, {**written, "observation": self.observe(after)}
+
+    def observe(self, now: dict[str, Tensor]) -> Tensor:
+        """Return what the automated vehicle sees."""
+        leader, cav, speed, gap = now["leader"], now["cav"], now["speed"][:, 0], now["gap"][:, 0]
+        seen = [leader, cav, leader - cav, now["cav_gap"], speed, cav - speed, gap]
+        return torch.cat(seen, dim=-1) * self.scales
+
+    def over(self, now: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return where an episode ends by a collision, and where it ends at all."""
+        crashed = (now["cav_gap"] <= 0.0) | (now["gap"] <= 0.0).any(-2)
+        return crashed, crashed | (now["step"] >= self.horizon)
+
+    def begin(self, seed: Tensor) -> dict[str, Tensor]:
+        """Return the first moment of the episodes of some seeds, ``[n, 1]``."""
+        leader, human, believed = self.leader, self.human, self.estimator
+        starts = self.motion.start
+        profile = choose(seed, len(leader.offsets), leader.profile_stream)
+        first = choose(seed, leader.starts[profile], leader.start_stream)
+        place = leader.offsets[profile] + first
+        speed = leader.speeds[place]
+        stream = human.driver_stream + human.index
+        driver = choose(seed[:, None], len(human.desired_speeds), stream)
+        v0, headway = human.desired_speeds[driver], human.time_gaps[driver]
+        cap, humans = starts["human"].cap_time_gap, speed[:, None].expand_as(v0)
+        own = starts["automated"]
+        factor = own.lowest + (own.highest - own.lowest) * uniform(seed, 0, own.stream)
+        return {
+            "seed": seed,
+            "step": torch.zeros_like(seed),
+            "place": place,
+            "leader": speed,
+            "cav": speed,
+            "cav_gap": factor * (own.standstill_gap + own.time_gap * speed),
+            "speed": humans,
+            "gap": equilibrium_gap(humans, v0, headway, human.drivers, cap),
+            "estimate": believed.prior_estimate.expand(*v0.shape[:2], 2),
+            "covariance": believed.prior_covariance.expand(*v0.shape[:2], 3),
+            "desired_speed": v0,
+            "desired_time_gap": headway,
+        }
+
+    def play(
+        self, now: dict[str, Tensor], action: Tensor, seeds: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+        """Take a step, replace episodes that end; return state, what was written, observation.
+
+        Made for the compiler: every episode is begun anew, and that taken where one is over.
+        """
+        after, written = self.step(now, action)
+        crashed, over = self.over(after)
+        new = self.begin(seeds)
+        after = {name: chosen(over, new[name], value) for name, value in after.items()}
+        written |= {"terminated": crashed, "done": over}
+        return after, written, chosen(over, self.observe(new), written["observation"])
+
+    def play_eagerly(
+        self, now: dict[str, Tensor], action: Tensor, seeds: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+        """The same without a compiler: only episodes that are over are begun anew."""
+        after, written = self.step(now, action)
+        crashed, over = self.over(after)
+        written |= {"terminated": crashed, "done": over}
+        seen, rows = written["observation"], over.flatten().nonzero().flatten()
+        if len(rows):
+            new = self.begin(seeds[rows])
+            seen = seen.index_put((rows,), self.observe(new))
+            after = {name: value.index_put((rows,), new[name]) for name, value in after.items()}
+        return after, written, seen
+
+    def player(self, compiled: bool) -> Callable[..., Any]:
+        """Return the faster of the two ways to play, compiled or not."""
+        return torch.compile(self.play, dynamic=False) if compiled else self.play_eagerly
+
+    def seeds(self) -> Tensor:
+        """Draw the seeds of new episodes."""
+        return torch.randint(2**31, (self.rows, 1)).to(self.leader.speeds.device)
+
+
+def following(first: Tensor, others: Tensor) -> Tensor:
+    """Return what is ahead of each of some vehicles, ``[batch, n, 1]``."""
+    alone = others.shape[1] == 1
+    return first[:, None] if alone else torch.cat([first[:, None], others[:, :-1]], -2)
+
+
+def chosen(over: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Return new values where an episode is over, ``[batch, 1]``."""
+    return torch.where(over.view(-1, *(1 for _ in new.shape[1:])), new, old)
 
 
 def check_physics(options: Namespace, steps: int) -> None:
     """Hold the plain loop against the environment, whose episodes go on after a collision."""
-    env = alcc(options, 64)
+    _check_steps(alcc(options, 64), steps)
+    _check_steps(alcc(options, 64, 30, followers=3), steps)
+    check_resets(options)
+
+
+def _check_steps(env: TransformedEnv, steps: int) -> None:
     plain, generator, td = PlainLoop(env), torch.Generator().manual_seed(0), env.reset()
     state = plain.start(td)
     for step in range(steps):
@@ -129,3 +236,14 @@ def check_physics(options: Namespace, steps: int) -> None:
             if not off <= TOLERANCE:
                 raise RuntimeError(f"step {step}: {name} of the plain loop is off by {off:g}")
         td = step_mdp(td)
+
+
+def check_resets(options: Namespace) -> None:
+    """Hold the first moments of the plain loop against those of the environment."""
+    env = training(options, 64)
+    plain, td = PlainLoop(env), env.reset()
+    begun, wanted = plain.begin(td[SEED]), plain.start(td)
+    for name, value in wanted.items():
+        off = float((begun[name] - value).abs().max())
+        if not off <= TOLERANCE:
+            raise RuntimeError(f"first moment: {name} of the plain loop is off by {off:g}")

@@ -21,6 +21,7 @@ from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.functional.random import STEP as COUNT
 from lcc_rl.functional.random import STREAM, hash_bits
 from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.rewards import TOUCH
 
 Draw = Callable[[int], float]
 
@@ -108,11 +109,11 @@ class ScalarLoop:
         crashed: bool,
     ) -> float:
         """Return the reward of the step (A17); the car's and the human's speeds are its start's."""
-        safety, contact, ttc = self.safety, gap - self.safety.margin, math.inf
-        if contact <= 0.0:
+        safety, ttc = self.safety, math.inf
+        if gap <= 0.0:
             ttc = safety.floor
         elif approach > 0.0:
-            ttc = max(contact / approach, safety.floor)
+            ttc = max(max(gap - safety.margin, TOUCH) / approach, safety.floor)
         total = safety.weight * math.log(min(ttc, safety.threshold) / safety.threshold)
         if gap / max(speed, 1.0) >= self.late.threshold:
             total -= self.late.weight

@@ -9,8 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
+from benchmarks.env import collecting
 from benchmarks.harness import Row, Run, alternate, endings, rows_of
-from benchmarks.plain import alcc
+from benchmarks.plain import PlainLoop, alcc
 from lcc_rl.envs.rollout import ACTION
 
 
@@ -19,7 +20,7 @@ def scale(options: Namespace) -> list[Row]:
 
     A ratio of 1 to the smallest batch says that cost grows exactly in proportion; below 1, that
     it grows less. Followers: batch 1,024, cost beside that of the shortest string. Vehicles: the
-    same cost, uncompiled, per vehicle.
+    same cost, uncompiled, per vehicle; and a long string beside the plain loop of the same.
     """
     rows: list[Row] = []
     batches = (16, 32) if options.quick else (1024, 4096, 8192, 32768)
@@ -32,7 +33,7 @@ def scale(options: Namespace) -> list[Row]:
         sizes = zip(spent, batches, strict=True)
         costs = {name: 1e9 * spent[name] / (batch * steps) for name, batch in sizes}
         rows += rows_of("scale", costs, "ns/transition", f"batch {batches[0]}{ending}")
-        rows += followers(options, ending)
+        rows += followers(options, ending) + beside_plain(options, ending)
     return rows + vehicles(options)
 
 
@@ -59,6 +60,31 @@ def vehicles(options: Namespace) -> list[Row]:
         spent = alternate(runs, options.repeats)
     costs = {name: 1e6 * spent[name] / (steps * (n + 1)) for name, n in names.items()}
     return rows_of("scale", costs, "µs/(step·vehicle)", "automated human", batch)
+
+
+def beside_plain(options: Namespace, ending: str) -> list[Row]:
+    """Microseconds per step and vehicle of a long string, and of the plain loop of the same."""
+    batch, behind, steps = (16, 9, 5) if options.quick else (1024, 99, 20)
+    env, name = alcc(options, batch, 30, behind), f"automated human*{behind}"
+    zero = torch.zeros(batch, 1, 1, device=options.device)
+    plain, start = PlainLoop(env), env.reset()
+    advance_plain = torch.compile(plain.step, dynamic=False) if ending else plain.step
+
+    def loop() -> None:
+        state = plain.start(start)
+        for _ in range(steps):
+            state, _ = advance_plain(state, zero[:, 0])
+
+    runs: dict[str, Run] = {
+        f"{name}, StringCollector{ending}": collecting(env, zero, steps, bool(ending)),
+        f"{name}, step{ending}": stepping(options, batch, behind, steps, bool(ending)),
+        f"{name}, plain loop{ending}": loop,
+    }
+    with torch.no_grad():
+        spent = alternate(runs, options.repeats)
+    # As rates: a ratio is that of the speeds.
+    rates = {name: steps * batch * (behind + 1) / each for name, each in spent.items()}
+    return rows_of("scale", rates, "vehicle steps/s", f"{name}, plain loop{ending}", batch)
 
 
 def stepping(options: Namespace, batch: int, behind: int, steps: int, compiled: bool) -> Run:

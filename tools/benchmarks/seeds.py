@@ -91,14 +91,13 @@ class Stacked:
         gradients = [torch.zeros_like(vector) for vector in self.online]
         for vector, gradient in zip(self.online, gradients, strict=True):
             vector.grad = gradient
-        shapes = [[(w.shape, b.shape) for w, b in net] for net in (first.actor, first.critic)]
+        nets = (first.actor, first.critic)
+        shapes = [[(weight.shape, bias.shape) for weight, _, bias in net] for net in nets]
         self.actor, self.critic = map(views, self.online, shapes)
         self.target_actor, self.target_critic = map(views, self.following, shapes)
         self.slopes = list(map(views, gradients, shapes))
-        groups = zip(self.online, first.optimizer.param_groups, strict=True)
-        self.optimizer = torch.optim.Adam(
-            [{"params": [vector], "lr": group["lr"]} for vector, group in groups], fused=True
-        )
+        rate = first.optimizer.param_groups[0]["lr"]  # by default, one for both networks
+        self.optimizer = torch.optim.Adam(self.online, lr=rate, fused=True)
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> None:

@@ -62,7 +62,7 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path) -> Run:
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
     training.buffer.extend(transitions(played))
     collector = training._source()
-    return lambda: training._iterate(collector)
+    return lambda: training._numbers(collector)
 
 
 def short(options: Namespace, batch: int, horizon: int) -> TransformedEnv:

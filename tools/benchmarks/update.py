@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from benchmarks.collect import OTHER, stable_baselines_model
 from benchmarks.harness import Row, Run, alternate, installed, rows_of, times
 from benchmarks.plain import alcc
+from benchmarks.plain_update import PlainUpdate, check
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
-from lcc_rl.agents.replay import LEARNED_FROM, transitions
+from lcc_rl.agents.replay import LEARNED_FROM, draws, transitions
 
-PRODUCTS = "matrix products"
+PLAIN = "plain update"
 
 
 def update(options: Namespace) -> list[Row]:
-    """DDPG updates per second, beside their matrix products alone and stable-baselines3.
+    """DDPG updates per second, beside one written by hand and stable-baselines3's.
 
-    Both updates include drawing the batch from the buffer, both losses and backward passes, Adam
+    All updates include drawing the batch from the buffer, both losses and backward passes, Adam
     and the soft target updates, all in single precision. stable-baselines3's is its ``train()``,
     which also writes its two losses to its logger, once per call of many updates.
     """
@@ -38,23 +39,35 @@ def update(options: Namespace) -> list[Row]:
         storage = LazyTensorStorage(agent.settings.buffer_size, device=options.device)
         buffer = ReplayBuffer(storage=storage, batch_size=batch)
         buffer.extend(played)
+        draw = draws(buffer, torch.Generator().manual_seed(0))
         runs: dict[str, Run] = {
-            "DDPG.update": partial(times, count, partial(learn, agent, buffer)),
-            PRODUCTS: partial(times, count, matrix_products(batch, options.device)),
+            "DDPG.update": partial(times, count, partial(learn, agent, draw)),
+            PLAIN: partial(times, count, plain_update(agent, played)),
         }
         if installed("stable_baselines3", "gymnasium"):
             runs[OTHER] = partial(stable_baselines(options, batch, played).train, count, batch)
         rates = {name: count / spent for name, spent in alternate(runs, options.repeats).items()}
-        rows += rows_of("update", rates, "updates/s", PRODUCTS, batch)
+        rows += rows_of("update", rates, "updates/s", PLAIN, batch)
         if OTHER in rates:
             pair = {name: rates[name] for name in ("DDPG.update", OTHER)}
             rows += rows_of("update", pair, "updates/s", OTHER, batch)[:1]
     return rows
 
 
-def learn(agent: DDPG, buffer: ReplayBuffer) -> None:
+def learn(agent: DDPG, draw: Iterator[TensorDictBase]) -> None:
     """Take one update."""
-    agent.update(buffer.sample())
+    agent.update(next(draw))
+
+
+def plain_update(agent: DDPG, played: TensorDictBase) -> PlainUpdate:
+    """Return the update by hand, checked, with the transitions of the agent's buffer."""
+    reached = {"reached": "observation", "reward": "reward", "terminated": "terminated"}
+    columns = {name: played["next", key] for name, key in reached.items()}
+    columns |= {name: played[name] for name in ("observation", "action")}
+    settings = replace(agent.settings, fused=False)
+    loss = DDPG(7, 1, 1, settings, agent.device)
+    check(loss, PlainUpdate(loss, columns))
+    return PlainUpdate(agent, columns)
 
 
 def stable_baselines(options: Namespace, batch: int, played: TensorDictBase) -> Any:
@@ -67,26 +80,3 @@ def stable_baselines(options: Namespace, batch: int, played: TensorDictBase) -> 
     for seen, action, after, reward, done in zip(*columns, strict=True):
         model.replay_buffer.add(seen, after, action, reward, done, [{}])
     return model
-
-
-def matrix_products(batch: int, device: str = "cpu", hidden: Sequence[int] = (200, 100, 50)) -> Run:
-    """The matrix products of one update: no activation, loss, optimizer or target step."""
-
-    def layers(inputs: int) -> list[tuple[Tensor, Tensor, Tensor]]:
-        sizes = list(zip((inputs, *hidden), (*hidden, 1), strict=True))
-        rand = partial(torch.rand, device=device)
-        return [(rand(batch, i), rand(o, i), rand(batch, o)) for i, o in sizes]
-
-    actor, critic = layers(7), layers(8)
-
-    def run() -> None:
-        # Forward: both targets, the critic on the data, the actor, the critic on its action.
-        for x, weight, _ in (*actor, *critic, *critic, *actor, *critic):
-            torch.mm(x, weight.t())
-        for x, _, gradient in (*actor, *critic):
-            torch.mm(gradient.t(), x)
-        # To the inputs: no first layer needs it but where the critic judges the actor's action.
-        for _, weight, gradient in (*critic[1:], *critic, *actor[1:]):
-            torch.mm(gradient, weight)
-
-    return run

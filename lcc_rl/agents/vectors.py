@@ -1,0 +1,87 @@
+"""Networks that lie in one vector: Adam and target steps are one operation each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+from torch.optim.adam import adam
+
+
+def views(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Return a vector's parts in the shapes of tensors, one after the other."""
+    parts = vector.split([tensor.numel() for tensor in tensors])
+    return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
+
+
+def join(tensors: Sequence[Tensor]) -> Tensor:
+    """Move tensors into one vector, of which they become views, and return it."""
+    vector = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
+    for tensor, view in zip(tensors, views(vector, tensors), strict=True):
+        tensor.data = view
+    return vector
+
+
+def vector_adam(
+    vector: Tensor, slopes: Tensor, sizes: Sequence[int], rates: Sequence[float]
+) -> torch.optim.Adam:
+    """Return Adam of a vector of weights whose parts learn at rates of their own.
+
+    Args:
+        vector: the weights.
+        slopes: where their derivatives are written.
+        sizes: of the parts.
+        rates: the learning rate of each part; one step serves all where they are equal.
+    """
+    if len(set(rates)) == 1:
+        sizes, rates = [len(vector)], rates[:1]
+    groups = []
+    for part, slope, rate in zip(vector.split(sizes), slopes.split(sizes), rates, strict=True):
+        parameter = nn.Parameter(part)
+        parameter.grad = slope
+        groups.append({"params": [parameter], "lr": rate})
+    return torch.optim.Adam(groups, fused=True)
+
+
+def take_step(optimizer: torch.optim.Adam) -> None:
+    """Take the step of ``optimizer.step()`` without what torch does around each call."""
+    if not optimizer.state:  # made by the first step
+        optimizer.step()
+        return
+    for group in optimizer.param_groups:
+        first, second = group["betas"]
+        parameters = group["params"]
+        states = [optimizer.state[parameter] for parameter in parameters]
+        adam(
+            parameters,
+            [parameter.grad for parameter in parameters],
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [],
+            [state["step"] for state in states],
+            fused=True,
+            amsgrad=False,
+            beta1=first,
+            beta2=second,
+            lr=group["lr"],
+            weight_decay=0.0,
+            eps=group["eps"],
+            maximize=False,
+        )
+
+
+@contextmanager
+def denormals_flushed() -> Iterator[None]:
+    """Count numbers below the normal range of floats as zero, on processors that can.
+
+    The momentum of a weight without a gradient, such as one behind a ReLU that is always zero,
+    falls to such numbers and stays there; with them, arithmetic is many times slower.
+    """
+    before = not bool(torch.tensor(1e-39) * 1.0)
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)

@@ -1,0 +1,68 @@
+"""A function of the environment, compiled where there is a compiler."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from torch import compile
+from torch._dynamo.exc import TorchDynamoException
+from torch._inductor.exc import InductorError
+
+log = logging.getLogger("lcc_rl")
+
+COMPILER_ERRORS = (TorchDynamoException, InductorError)
+# Where an object whose method is compiled keeps the environment and its pieces, and an environment
+# its pieces.
+CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
+
+
+class Compiled:
+    """A function compiled at its first call; where there is no compiler, the plain function.
+
+    What the object of a method keeps under the names of :data:`CONSTANT` must not change between
+    calls, but for the values of its tensors.
+
+    Args:
+        function: what to compile, for one size of its arguments.
+        what: its name in the line of the log that says that it is not compiled.
+        compiled: False for the plain function.
+    """
+
+    def __init__(self, function: Callable[..., Any], what: str, compiled: bool) -> None:
+        self.plain, self.what = function, what
+        # One graph for each size: a graph for any size would be slower.
+        self.function = compile(function, dynamic=False, **settings()) if compiled else function
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        if self.function is self.plain:
+            return self.plain(*arguments)
+        try:
+            return self.function(*arguments)
+        except COMPILER_ERRORS as error:
+            log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
+            self.function = self.plain
+            return self.plain(*arguments)
+
+
+def _checked(guards: Sequence[Any]) -> list[bool]:
+    """Return which of a graph's guards to check before each use.
+
+    Pieces do not change (:mod:`lcc_rl.envs.checks` refuses those that do); to check a thousand
+    settings of them takes as long as a step of a small batch. Arguments, the policy, and whether
+    gradients are kept are checked.
+    """
+    return [
+        not guard.is_global and not any(name in guard.name for name in CONSTANT) for guard in guards
+    ]
+
+
+def settings() -> dict[str, Any]:
+    """Return settings of ``torch.compile`` for functions of an environment.
+
+    Apart from other objects' compilations of the same code, whose guards would be tried first and
+    count towards the compiler's limit of graphs. New at each call: torch takes entries out.
+    """
+    return {"isolate_recompiles": True, "options": {"guard_filter_fn": _checked}}

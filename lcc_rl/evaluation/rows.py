@@ -1,0 +1,232 @@
+"""Rows of episodes.parquet: what the record of a batch of episodes is turned into.
+
+Columns named ``cav_…`` belong to the automated vehicles of the string, ``hdv_…`` to all others;
+energies and distances add up over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.envs.inputs import string_of
+from lcc_rl.evaluation.metrics import (
+    KILO,
+    energy_measures,
+    measured_ttc,
+    safety_measures,
+    string_measures,
+)
+from lcc_rl.evaluation.rollout import Record
+from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.string import gather
+from lcc_rl.pieces.controllers import Population
+from lcc_rl.pieces.features import CLASS
+from lcc_rl.results.savings import LEADER, REPEAT, SOURCE
+
+RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
+SUMMED = (
+    "energy_kj",
+    "net_energy_kj",
+    "steady_energy_kj",
+    "acceleration_loss_kj",
+    "path_energy_kj",
+)
+# What a step of a sample episode says of its episode.
+SAMPLED = (
+    "strategy",
+    "training_seed",
+    "profile",
+    "driver_id",
+    REPEAT,
+    "desired_speed_mps",
+    "time_gap_s",
+)
+KEYS = [("leader", name) for name in ("speed", "acceleration")]
+KEYS += [("vehicles", name) for name in RECORDED]
+INDEX, PROMISED = (AUTOMATED, "index"), (AUTOMATED, "promised")
+# The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
+Groups = dict[str, dict[str, Tensor]]
+
+
+def grouped(record: Record, string: VehicleString) -> Groups:
+    """Divide the record of a string into that of its automated vehicles and of all others."""
+    groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
+    own = list(string.places(AUTOMATED))
+    others = [place for place in range(len(string)) if place not in own]
+    for (space, name), entry in record.items():
+        if (space, name) == PROMISED:
+            groups["cav"][name] = entry
+        elif space == "leader":
+            groups["leader"][name] = entry.unsqueeze(-2)
+        elif space == "vehicles" and not string.drawn:
+            for group, places in (("cav", own), ("hdv", others)):
+                if places:
+                    groups[group][name] = entry[..., _slice(places), :]
+        elif space == "vehicles":
+            index = record[INDEX][0]
+            place = torch.arange(len(string), device=index.device)
+            taken = (place == index.unsqueeze(-1)).any(-2)
+            order = taken.int().argsort(stable=True, dim=-1)
+            rest = order[..., : len(others)].sort(-1).values
+            for group, chosen in (("cav", index), ("hdv", rest)):
+                at = chosen.expand(entry.shape[0], *chosen.shape)
+                groups[group][name] = gather(entry, at)
+    return groups
+
+
+def _slice(places: list[int]) -> slice | list[int]:
+    """Return neighbouring places as a slice, which copies nothing."""
+    first, end = places[0], places[-1] + 1
+    return slice(first, end) if len(places) == end - first else places
+
+
+def measures(
+    groups: Groups, alive: Tensor, time_step: float, energy: Fleet | None = None
+) -> dict[str, Tensor]:
+    """Return the measures of a batch, each ``[batch, 1]``; energies add up over vehicles (A20).
+
+    Args:
+        groups: the record of each group of vehicles.
+        alive: whether each step belongs to a running episode, ``[time, batch, 1]``.
+        time_step: duration of a step [s].
+        energy: the energy models; None for that of the ALCC paper.
+    """
+    columns: dict[str, Tensor] = {}
+    for group in ("cav", "hdv"):
+        series = groups[group]
+        if "power" not in series:
+            continue
+        kinds = series.get(CLASS[1])
+        found = energy_measures(
+            series["power"],
+            series["speed"],
+            alive.unsqueeze(-2),
+            time_step,
+            energy,
+            None if kinds is None else kinds[0],
+        )
+        for name, value in found.items():
+            added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
+            columns[f"{group}_{name}"] = added
+    own = groups["cav"]
+    if "gap" in own:
+        columns |= safety_measures(own, alive.unsqueeze(-2), time_step)
+        for name in SUMMED:
+            keys = [f"{group}_{name}" for group in ("cav", "hdv")]
+            parts = [columns[key] for key in keys if key in columns]
+            if parts:
+                columns[f"total_{name}"] = torch.stack(parts).sum(0)
+    if "gap" in groups["hdv"]:
+        gap = groups["hdv"]["gap"].amin(-2)
+        columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)
+    return {**columns, "steps": alive.sum(0)}
+
+
+def as_frame(columns: dict[str, Tensor]) -> pd.DataFrame:
+    """Return the measures of a batch as one row per episode."""
+    frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
+    lowest = [frame[key] for key in ("min_gap_m", "hdv_min_gap_m") if key in frame]
+    frame.insert(len(frame.columns) - 1, "collided", np.minimum.reduce(lowest) <= 0.0)
+    return frame
+
+
+def traffic(record: Record, alive: Tensor, length: float) -> dict[str, Tensor]:
+    """Return what the whole string did, each ``[batch, 1]``; see :func:`string_measures`."""
+    steps, leader = len(alive), record.get(("leader", "speed"))
+    return string_measures(
+        record["vehicles", "speed"][-steps:],
+        record["vehicles", "gap"],
+        alive,
+        length,
+        None if leader is None else leader[-steps:],
+    )
+
+
+def describe(
+    strategy: Strategy,
+    profiles: Profiles,
+    population: Population,
+    profile: Tensor,
+    driver: Tensor,
+    repeat: Tensor | None = None,
+) -> pd.DataFrame:
+    """Say which episodes a batch holds: strategy, profile, its source, driver and repeat."""
+    columns = {
+        "strategy": strategy.name,
+        "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
+        "profile": [profiles.names[i] for i in profile.tolist()],
+        "profile_id": profile.numpy(),
+        "driver_id": driver.numpy(),
+        **({} if repeat is None else {REPEAT: repeat.numpy()}),
+        "desired_speed_mps": population.desired_speed[driver].numpy(),
+        "time_gap_s": population.time_gap[driver].numpy(),
+    }
+    if profiles.sources:
+        columns[SOURCE] = [profiles.sources[i] for i in profile.tolist()]
+    return pd.DataFrame(columns)
+
+
+def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
+    """Return v0 [m/s] by episode: that of the one driver of a strategy, or of the episode's."""
+    controllers = strategy.cfg.scenario.controllers
+    own = controllers.get(AUTOMATED) if string_of(strategy.cfg).count(AUTOMATED) else None
+    given = None if own is None else own.get("desired_speed")
+    drivers = episodes["desired_speed_mps"].to_numpy()
+    return drivers if given is None else np.full_like(drivers, given)
+
+
+def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> np.ndarray:
+    """Return the share of time in which the leader of each episode drives faster than v0."""
+    ids, place = np.unique(profile.numpy(), return_inverse=True)
+    shares = np.zeros(len(desired))
+    for number, index in enumerate(ids):
+        speeds = np.sort(profiles.record(int(index)).numpy())
+        rows = place == number
+        slower = np.searchsorted(speeds, desired[rows], side="right")
+        shares[rows] = 1.0 - slower / len(speeds)
+    return shares
+
+
+def leader_measures(
+    profiles: Profiles, profile: Tensor, energy: Fleet | None = None
+) -> pd.DataFrame:
+    """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
+
+    The leader has the first energy model.
+    """
+    energy = as_fleet(energy)
+    ids, place = np.unique(profile.numpy(), return_inverse=True)
+    rows = []
+    for index in ids:
+        speed = profiles.record(int(index))
+        power = energy.path_power(speed[:-1], speed.diff() / profiles.time_step)
+        drawn = power.sum() * profiles.time_step * KILO
+        rows.append((float(drawn), float(speed.mean())))
+    return pd.DataFrame(np.array(rows)[place], columns=list(LEADER))
+
+
+def sample(
+    groups: Groups, alive: Tensor, episodes: pd.DataFrame, inside: list[int], time_step: float
+) -> Iterator[pd.DataFrame]:
+    """Yield the time series of chosen episodes of a batch, one row per step."""
+    for index in inside:
+        steps = int(alive[:, index].sum())
+        columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
+        for group, series in groups.items():
+            for name, values in series.items():
+                rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
+                rows = measured_ttc(rows) if name == "ttc" else rows
+                for place in range(rows.shape[1]):
+                    label = group if rows.shape[1] == 1 else f"{group}{place + 1}"
+                    columns[f"{label}_{name}"] = rows[:, place].cpu().numpy()
+        names = [name for name in SAMPLED if name in episodes]
+        described = episodes[names].iloc[[index] * steps].reset_index(drop=True)
+        yield pd.concat([described, pd.DataFrame(columns)], axis=1)

@@ -1,0 +1,166 @@
+"""The table of a task: who keeps its limits, and what that saves against whom it names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import pandas as pd
+from rich.table import Table
+
+from lcc_rl.energy import Fleet
+from lcc_rl.errors import ConfigError, require_in, unknown_name
+from lcc_rl.results.savings import NOTHING, savings
+from lcc_rl.results.tables import strategies_side_by_side
+from lcc_rl.results.units import check_unit, per_distance
+
+# Scores by name: the column that is divided by the distance of all vehicles; None: as it is.
+PER_DISTANCE = {
+    "energy": "total_energy_kj",
+    "net_energy": "total_net_energy_kj",
+    "path_energy": "total_path_energy_kj",
+}
+PLAIN = ("final_speed_spread_mps", "speed_std_mps", "string_ratio")
+SCORE, DISTANCE = "score", "distance_m"
+MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", "flow_vph", "string_ratio")
+LARGEST, LEAST, SHARE = "max_", "min_", "share_"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a task asks for, so that two groups mean the same.
+
+    Args:
+        name: of the task.
+        score: what counts, the less the better: ``energy``, ``net_energy`` or ``path_energy`` of
+            all vehicles over their distance, or a column of episodes.parquet.
+        unit: of an energy over a distance, see :mod:`lcc_rl.results.units`.
+        against: the strategy that the others are compared with.
+        limits: bounds of columns by name: at most for ``max_…`` in every episode, at least for
+            ``min_…``, and for ``share_…`` at most so much of the time of all episodes.
+
+    Raises:
+        ConfigError: if the score is unknown, or a limit has another name or is no number.
+    """
+
+    name: str
+    score: str = "net_energy"
+    unit: str = "kJ/km"
+    against: str = "human"
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.score not in (*PER_DISTANCE, *PLAIN):
+            raise unknown_name("score (task.score)", self.score, (*PER_DISTANCE, *PLAIN))
+        for column, bound in self.limits.items():
+            if not column.startswith((LARGEST, LEAST, SHARE)):
+                raise ConfigError(
+                    f"task.limits.{column}: a limit is of a column that begins with {LARGEST}, "
+                    f"{LEAST} or {SHARE}"
+                )
+            require_in("task.limits", "[0, inf)", **{column: bound})
+
+    @property
+    def label(self) -> str:
+        """The score with its unit, for tables."""
+        named = self.score.replace("_", " ")
+        return f"{named} [{self.unit}]" if self.score in PER_DISTANCE else named
+
+
+def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
+    """Score every strategy of an evaluation.
+
+    Args:
+        episodes: rows of an evaluation, every strategy on the same windows and drivers.
+        task: what counts.
+        energy: the energy models, for units.
+
+    Returns:
+        One row per strategy: seeds, score, the share saved against ``task.against`` with its
+        interval over windows and seeds, the share of the distance that is lost against it, means
+        of gap, speed and traffic, the value of every limit, collisions, and whether all limits
+        are kept without one.
+
+    Raises:
+        ConfigError: if a column of a limit is missing, or whom to compare with.
+    """
+    check_unit(task.unit, energy)
+    missing = [column for column in task.limits if column not in episodes]
+    if missing:
+        raise ConfigError(f"task.limits.{missing[0]}: episodes.parquet has no such column")
+    if task.against not in set(episodes["strategy"]):
+        raise ConfigError(f"task.against={task.against}: it is not among the strategies evaluated")
+    rows, whole = _scored(episodes, task)
+    found = []
+    for name, part in rows.groupby("strategy", sort=False):
+        value = float(part[SCORE].mean())
+        if task.score in PER_DISTANCE:
+            value = per_distance(value / whole * 1e3, task.unit, energy)
+        share = NOTHING if name == task.against else savings(rows, SCORE, str(name), task.against)
+        limits = {column: _worst(part, column) for column in task.limits}
+        row: dict[str, object] = {"strategy": name, "seeds": part["training_seed"].nunique()}
+        row |= {"score": value, **share.columns("saving")}
+        row |= {"distance_lost": 1.0 - part[DISTANCE].mean() / whole}
+        row |= {column: part[column].mean() for column in MEANS if column in part}
+        row |= limits | {"collisions": int(part["collided"].sum())}
+        kept = all(_keeps(column, limits[column], task.limits[column]) for column in limits)
+        found.append(row | {"kept": kept and not row["collisions"]})
+    return pd.DataFrame(found)
+
+
+def _scored(episodes: pd.DataFrame, task: Task) -> tuple[pd.DataFrame, float]:
+    """Return the rows with score and distance of all vehicles, and whom they are compared with's.
+
+    An energy is brought to that mean distance [m] by the strategy's own: what is saved is then a
+    ratio of totals, in which short episodes count little.
+    """
+    parts = [name for name in ("cav_distance_m", "hdv_distance_m") if name in episodes]
+    rows = episodes.assign(**{DISTANCE: episodes[parts].sum(axis=1)})
+    driven = rows.groupby("strategy")[DISTANCE].mean()
+    whole = float(driven[task.against])
+    if task.score in PLAIN:
+        return rows.assign(**{SCORE: rows[task.score]}), whole
+    column = PER_DISTANCE[task.score]
+    energy = rows[column] if column in rows else pd.Series(float("nan"), rows.index)
+    alone = column.replace("total", "hdv")  # where nobody is automated
+    if alone in rows:
+        energy = energy.fillna(rows[alone])
+    return rows.assign(**{SCORE: energy * whole / rows["strategy"].map(driven)}), whole
+
+
+def _worst(part: pd.DataFrame, column: str) -> float:
+    """Return the value of a column that its limit is about."""
+    if column.startswith(SHARE):
+        return float(part[column].mean())
+    return float(part[column].max() if column.startswith(LARGEST) else part[column].min())
+
+
+def _keeps(column: str, value: float, bound: float) -> bool:
+    """Whether a limit is kept; one of somebody who is not there is."""
+    return not (value < bound if column.startswith(LEAST) else value > bound)
+
+
+def as_rich(table: pd.DataFrame, task: Task, title: str) -> Table:
+    """Return scores as a table for the terminal, a column per strategy."""
+    shares = [column for column in task.limits if column.startswith(SHARE)]
+    others = [column for column in task.limits if column not in shares]
+    rows = (
+        (task.label, "score", "{:.2f}"),
+        (f"saved against {task.against}", "saving", "{:+.2%}"),
+        ("  95 % interval, low", "saving_low", "{:+.2%}"),
+        ("    high", "saving_high", "{:+.2%}"),
+        ("distance lost", "distance_lost", "{:+.2%}"),
+        ("mean gap [m]", "mean_gap_m", "{:.1f}"),
+        ("mean speed [m/s]", "mean_speed_mps", "{:.2f}"),
+        ("spread of speeds at the end [m/s]", "final_speed_spread_mps", "{:.2f}"),
+        ("flow [vehicles/h]", "flow_vph", "{:.0f}"),
+        ("string ratio", "string_ratio", "{:.2f}"),
+        *((f"{column} (limit {task.limits[column]:g})", column, "{:.2f}") for column in others),
+        *((f"{column} (limit {task.limits[column]:g})", column, "{:.4f}") for column in shares),
+        ("collisions", "collisions", "{:d}"),
+        ("keeps the limits (1: yes)", "kept", "{:d}"),
+        ("training seeds", "seeds", "{:d}"),
+    )
+    known = [row for row in rows if row[1] in table]
+    caption = "intervals: over held-out windows and training seeds"
+    return strategies_side_by_side(table, known, title, caption)

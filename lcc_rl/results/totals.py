@@ -1,0 +1,150 @@
+"""What a summary needs of the rows of an evaluation, added up block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from lcc_rl.io.files import Rows
+from lcc_rl.results.savings import KEYS, REPEAT, SOURCE, paired
+
+WINDOW = ["strategy", "training_seed", "profile_id"]
+FOLDED = 100_000  # rows of partial sums that are kept before they are added up
+
+
+def frames(rows: Rows, columns: Sequence[str], source: str = "") -> Iterator[pd.DataFrame]:
+    """Yield rows block by block; a data frame is one block.
+
+    Args:
+        rows: of one or more evaluations.
+        columns: the columns that are wanted; those that do not exist are left out.
+        source: of the leaders; empty for all.
+    """
+    wanted = [*dict.fromkeys([*columns, SOURCE])] if source else list(columns)
+    for frame in [rows] if isinstance(rows, pd.DataFrame) else _row_groups(rows, wanted):
+        kept = frame[[name for name in wanted if name in frame]]
+        yield kept[kept[SOURCE] == source] if source else kept
+
+
+def _row_groups(rows: pa.dataset.Dataset, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
+    known = [name for name in columns if name in rows.schema.names]
+    for file in rows.get_fragments():
+        for group in file.split_by_row_group():
+            table = group.to_table(schema=rows.schema, columns=known)
+            for place, field in enumerate(table.schema):
+                if pa.types.is_dictionary(field.type):
+                    text = table.column(place).cast(pa.string())
+                    table = table.set_column(place, field.name, text)
+            yield table.to_pandas()
+
+
+class Totals:
+    """Sums over the rows of one or more evaluations on the same profiles and drivers.
+
+    Memory grows with the windows and the drivers, not with the rows. Strategies are paired within
+    a block, which holds the same episodes of all strategies.
+
+    Args:
+        rows: the rows.
+        means: columns whose means are asked for.
+        lows: columns whose minima are asked for.
+        paired_by: the energy by which pairs are compared.
+        baselines: with whom.
+        source: of the leaders; empty for all.
+    """
+
+    def __init__(
+        self,
+        rows: Rows,
+        means: Sequence[str],
+        lows: Sequence[str],
+        paired_by: str,
+        baselines: Sequence[str],
+        source: str = "",
+    ) -> None:
+        self.means, self.lows, self.paired_by = list(means), list(lows), paired_by
+        self.baselines, self.minima = baselines, pd.DataFrame()
+        # Of a strategy and a baseline: pairs, those worse off, and by driver the sums of both.
+        self.pairs: dict[tuple[str, str], tuple[int, int]] = {}
+        self.drivers: dict[tuple[str, str], pd.DataFrame] = {}
+        parts: list[pd.DataFrame] = []
+        columns = [*WINDOW, *KEYS, REPEAT, *self.means, *self.lows, paired_by]
+        for frame in frames(rows, list(dict.fromkeys(columns)), source):
+            parts.append(self._window_sums(frame))
+            if sum(map(len, parts)) > FOLDED + 2 * len(parts[0]):
+                parts = [_folded(parts)]
+            lows_here = frame.groupby("strategy", sort=False)[self._known(frame, self.lows)].min()
+            self.minima = pd.concat([self.minima, lows_here]).groupby(level=0, sort=False).min()
+            self._compare(frame)
+        self.windows = _folded(parts)
+        self.strategies = [str(name) for name in self.windows.index.unique(0)]
+
+    def _known(self, frame: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+        return [name for name in columns if name in frame]
+
+    def _window_sums(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Return sums and counts by window."""
+        values = frame.reindex(columns=self.means).astype(np.float64).assign(rows=1.0)
+        seeds = frame.get("training_seed", pd.Series(np.nan, frame.index, name=WINDOW[1]))
+        by = [frame["strategy"], pd.to_numeric(seeds).astype("Int64"), frame["profile_id"]]
+        groups = values.groupby(by, sort=False, dropna=False)
+        return pd.concat({"sum": groups.sum(), "count": groups.count()}, axis=1)
+
+    def _compare(self, frame: pd.DataFrame) -> None:
+        """Count who is worse off with a strategy than with a baseline, pair by pair."""
+        if self.paired_by not in frame:
+            return
+        energy = paired(frame, self.paired_by)
+        for baseline in (name for name in self.baselines if name in energy):
+            for strategy in (str(name) for name in energy if name != baseline):
+                both = energy[[strategy, baseline]].dropna().astype(np.float64)
+                place = (strategy, baseline)
+                count, worse = self.pairs.get(place, (0, 0))
+                more = int((both[strategy] > both[baseline]).sum())
+                self.pairs[place] = (count + len(both), worse + more)
+                sums = both.groupby("driver_id").sum()
+                known = self.drivers.get(place)
+                self.drivers[place] = sums if known is None else known.add(sums, fill_value=0.0)
+
+    def sums(self) -> pd.DataFrame:
+        """Return the sum of each column of means by strategy, and the number of ``rows``."""
+        return pd.DataFrame(self._by_strategy()["sum"])
+
+    def mean(self) -> pd.DataFrame:
+        """Return the mean of each column of means by strategy."""
+        found = self._by_strategy()
+        return pd.DataFrame(found["sum"] / found["count"].replace(0, np.nan))
+
+    def low(self, column: str, strategy: str) -> float:
+        """Return the minimum of a column of lows; NaN where the strategy has none."""
+        return float(self.minima[column][strategy]) if column in self.minima else np.nan
+
+    def _by_strategy(self) -> pd.DataFrame:
+        return self.windows.groupby(level=0, sort=False).sum()
+
+    def per_window(self) -> pd.DataFrame:
+        """Return the means by strategy, training seed and window, as rows."""
+        means = self.windows["sum"] / self.windows["count"].replace(0, np.nan)
+        return means.reset_index()
+
+    def worse_off(self, strategy: str, baseline: str) -> dict[str, float]:
+        """Return the shares of pairs and of drivers who draw more than with a baseline.
+
+        See :func:`lcc_rl.results.savings.worse_off`; NaN where one of them is missing.
+        """
+        count, worse = self.pairs.get((strategy, baseline), (0, 0))
+        if not count:
+            return {"pairs": float("nan"), "drivers": float("nan")}
+        drivers = self.drivers[strategy, baseline]
+        return {
+            "pairs": worse / count,
+            "drivers": float((drivers[strategy] > drivers[baseline]).mean()),
+        }
+
+
+def _folded(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Add up partial sums of the same windows."""
+    return pd.concat(parts).groupby(level=[0, 1, 2], sort=False, dropna=False).sum()

@@ -1,0 +1,58 @@
+"""Every task at the size of a test, and rivals by name."""
+
+from pathlib import Path
+
+import pytest
+from commands import DATA, tiny
+
+from lcc_rl.commands import evaluation
+from lcc_rl.commands.evaluation import task_of
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.strategies import BASELINES, DIRECT, rules
+
+TASKS = sorted(path.stem for path in Path("conf/task").glob("*.yaml"))
+FEW = ("experiment=smoke", "evaluation.profiles=2", "scenario.horizon=12")
+MORE = {
+    "i80-follow": [*DATA, "evaluation.drivers=2"],
+    "i24-follow5": DATA,
+    "i24-mixed": [*DATA, "scenario.string={size: 8, penetration: 0.25}"],
+    "platoon-highway": [*DATA, "leader.least_variation=0"],
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, capsys) -> None:
+    words = [f"task={name}", "compare=[pi_saturation]", *FEW, *MORE.get(name, ())]
+    cfg = load("evaluate", words)
+    rows = evaluation.run(cfg, tmp_path)
+    task = task_of(cfg)
+    assert set(rows["strategy"]) == {*cfg.evaluation.baselines, "pi_saturation"}
+    printed = capsys.readouterr().out
+    assert f"task {name}" in printed
+    assert f"saved against {task.against}" in printed
+    assert "keeps the limits" in printed
+
+
+def test_rules_have_names_and_others_are_refused(tmp_path) -> None:
+    assert {DIRECT, *BASELINES, "follower_stopper", "pi_saturation", "acc"} <= set(rules())
+    assert not {"action", "hcfs"} & set(rules())
+    cfg = tiny("evaluate", "variant=idm", "compare=[follower_stoper]", agent=False)
+    with pytest.raises(Exception, match="follower_stoper"):
+        evaluation.run(cfg, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("task.unit=mpg", "unit=mpg"),
+        ("task.score=fuel", "task.score"),
+        ("+task.limit=3", "limit"),
+        ("+task.limits.gap=3", "task.limits.gap"),
+    ],
+)
+def test_mistakes_of_a_task_are_named_before_it_begins(override, words, tmp_path) -> None:
+    cfg = load("evaluate", ["task=i80-follow", "compare=[idm]", override])
+    with pytest.raises(ConfigError, match=words):
+        evaluation.run(cfg, tmp_path / "run")
+    assert not (tmp_path / "run" / "episodes.parquet").exists()
