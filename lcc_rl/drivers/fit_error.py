@@ -19,8 +19,7 @@ State = tuple[Tensor, Tensor, Tensor, Tensor]
 SPEED, GAP, GAP_SHARE = "speed_rmspe", "gap_rmse", "gap_nrmse"
 # What a calibration may minimise; ``both`` is the sum of the two relative errors.
 OBJECTIVES = (SPEED, GAP, GAP_SHARE, "both")
-# The number by which the kernel knows a model.
-NUMBERS = {IDM: 0, "ovm": 1, "fvdm": 1, "gipps": 2}
+OVMS = ("ovm", "fvdm")  # simulated alike; λ of the first is zero
 
 
 class FitError:
@@ -110,7 +109,7 @@ class FitError:
             for name in COLUMNS
         }
         shape = candidates.shape[:-1]
-        ready = READY[NUMBERS[self.model]](values)
+        ready = READY[self.model](values)
         return tuple(value.expand(shape).contiguous() for value in ready)
 
     def _by_tensors(self, parameters: tuple[Tensor, ...], apart: bool) -> tuple[Tensor, Tensor]:
@@ -148,7 +147,7 @@ class FitError:
         """
         speed, gap, total, distance = state
         leader, observed, gaps = (tensor.unbind(0) for tensor in series)
-        command_of, constants = COMMANDS[NUMBERS[self.model]], self.constants
+        command_of, constants = COMMANDS[self.model], self.constants
         time_step = self.observed.time_step
         half = 0.5 * time_step
         for step in range(len(leader) - 1):
@@ -173,15 +172,19 @@ class FitError:
         totals = torch.empty((2, *parameters[0].shape), dtype=parameters[0].dtype)
         settings = (
             *(getattr(constants, name, 1.0) for name in ("gap_floor", "braking_limit")),
-            *(constants.acceleration_limit, getattr(constants, "exponent", 4.0)),
-            *(time_step, 0.5 * time_step, 0.0, 1.0, 2.0, 4.0, 0.025, 1e-12),
+            *(constants.acceleration_limit, time_step, 0.5 * time_step),
+            *(0.0, 1.0, 2.0, 0.025, 1e-12),
         )
+        single = np.dtype(_name(totals.dtype)).type
+        exponent = getattr(constants, "exponent", 4.0)
         self._kernel(
-            NUMBERS[self.model],
-            apart,
+            True if self.model == IDM else None,
+            True if self.model in OVMS else None,
+            None if exponent == 4.0 else single(exponent),
+            apart or None,
             *self._episodes,
             tuple(parameter.numpy() for parameter in parameters),
-            tuple(np.dtype(_name(totals.dtype)).type(value) for value in settings),
+            tuple(single(value) for value in settings),
             totals.numpy(),
         )
         return totals[0], totals[1]
@@ -249,8 +252,14 @@ def _gipps(
     return torch.minimum(free, root.sub_(slowing).sub_(speed).div_(tau))
 
 
-# By the kernel's number: what is computed once per candidate, and the command at a step.
-READY: tuple[Callable[[dict[str, Tensor]], list[Tensor]], ...] = (
-    *(_ready_idm, _ready_ovm, _ready_gipps),
-)
-COMMANDS: tuple[Callable[..., Tensor], ...] = (_idm, _ovm, _gipps)
+# By model: what is computed once per candidate, and the command at a step.
+READY: dict[str, Callable[[dict[str, Tensor]], list[Tensor]]] = {
+    IDM: _ready_idm,
+    **dict.fromkeys(OVMS, _ready_ovm),
+    "gipps": _ready_gipps,
+}
+COMMANDS: dict[str, Callable[..., Tensor]] = {
+    IDM: _idm,
+    **dict.fromkeys(OVMS, _ovm),
+    "gipps": _gipps,
+}

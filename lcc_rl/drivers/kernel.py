@@ -19,7 +19,9 @@ FOLDER = "lcc_rl"  # in the user's cache folder
 
 
 def squared_errors(
-    law: Any,
+    idm: Any,
+    ovm: Any,
+    exponent: Any,
     apart: Any,
     leader: Any,
     follower: Any,
@@ -31,30 +33,28 @@ def squared_errors(
 ) -> None:
     """Sum up the squared errors of speed and gap of followers, for many candidates of each driver.
 
-    The formulas are those of :func:`lcc_rl.functional.idm.simulate_follower`. The inner loops run
-    over the candidates of one driver, in which they become vector instructions. Comparisons are
-    such that what is not a number stays so.
+    The formulas are those of :func:`lcc_rl.functional.idm.simulate_follower`. The inner loop runs
+    over the candidates of one driver, in which it becomes vector instructions: numba drops the
+    branches for arguments that are None. Comparisons are such that what is not a number stays so.
 
     Args:
-        law: 0 for the IDM, 1 for optimal velocities, 2 for Gipps' model.
-        apart: whether the errors of the gap are summed up; else they are zero.
+        idm: None unless the drivers are of the IDM.
+        ovm: None unless they are of optimal velocities; with both None, of Gipps' model.
+        exponent: of the IDM; None for 4.
+        apart: None unless the errors of the gap are summed up; else they are zero.
         leader: observed speeds, ``[drivers, time]`` [m/s].
         follower: the same of the followers [m/s].
         gaps: observed gaps, ``[drivers, time]`` [m].
         samples: number of samples, ``[drivers]``.
         parameters: six, each ``[drivers, candidates]``; see
             :data:`lcc_rl.drivers.fit_error.READY`.
-        settings: gap floor, braking limit, acceleration limit, exponent, time step, half of it
-            and the numbers 0, 1, 2, 4, 0.025 and 1e-12: literals would be of double precision.
+        settings: gap floor, braking limit, acceleration limit, time step, half of it and the
+            numbers 0, 1, 2, 0.025 and 1e-12: literals would be of double precision.
         total: is overwritten with the sums of speed and gap, ``[2, drivers, candidates]``.
     """
-    floor, braking, limit, exponent, time_step, half = settings[:6]
-    zero, one, two, four, slow, tiny = settings[6:]
-    squared = exponent == four
+    floor, braking, limit, time_step, half, zero, one, two, slow, tiny = settings
     speed, gap = np.empty_like(total[0, 0]), np.empty_like(total[0, 0])
-    command = np.empty_like(speed)
     for driver in range(total.shape[1]):
-        # What the six are depends on the law; the names say it for the first use.
         p0, p1, p2 = parameters[0][driver], parameters[1][driver], parameters[2][driver]
         p3, p4, p5 = parameters[3][driver], parameters[4][driver], parameters[5][driver]
         error, distance = total[0, driver], total[1, driver]
@@ -63,42 +63,33 @@ def squared_errors(
         for step in range(samples[driver] - 1):
             ahead, truth = leader[driver, step], follower[driver, step + 1]
             seen, advance = gaps[driver, step + 1], half * (ahead + leader[driver, step + 1])
-            if law == 0:
-                if squared:  # outside of the loops: within one, it would be no vector instruction
-                    for i in range(len(speed)):
-                        free = speed[i] * p0[i]
-                        command[i] = free * free * (free * free)
-                else:
-                    for i in range(len(speed)):
-                        command[i] = (speed[i] * p0[i]) ** exponent
-                for i in range(len(speed)):
+            for i in range(len(speed)):
+                if idm is not None:
                     wish = speed[i] * (p1[i] + (speed[i] - ahead) * p3[i])
                     wish = (zero if wish < zero else wish) + p4[i]
                     ratio = wish / (floor if gap[i] < floor else gap[i])
-                    command[i] = p2[i] * (one - command[i] - ratio * ratio)
-            elif law == 1:
-                for i in range(len(speed)):
+                    free = speed[i] * p0[i]
+                    free = free * free * (free * free) if exponent is None else free**exponent
+                    command = p2[i] * (one - free - ratio * ratio)
+                elif ovm is not None:
                     optimal = p0[i] * np.tanh(gap[i] * p1[i] - p2[i]) + p3[i]
-                    command[i] = p4[i] * (optimal - speed[i]) + p5[i] * (ahead - speed[i])
-            else:
-                for i in range(len(speed)):
+                    command = p4[i] * (optimal - speed[i]) + p5[i] * (ahead - speed[i])
+                else:
                     share, brake = speed[i] * p0[i], p2[i] * p3[i]
                     free = p1[i] * (one - share) * np.sqrt(slow + share)
                     room = p2[i] * (two * (gap[i] - p4[i]) - speed[i] * p3[i])
                     root = brake * brake + room + p5[i] * ahead * ahead
                     root = np.sqrt(tiny if root < tiny else root)
                     over = free - (root - brake - speed[i]) / p3[i]
-                    command[i] = free - (zero if over < zero else over)
-            for i in range(len(speed)):
-                wanted = -braking if command[i] < -braking else command[i]
-                wanted = limit if wanted > limit else wanted
-                reached = speed[i] + time_step * wanted
+                    command = free - (zero if over < zero else over)
+                command = -braking if command < -braking else command
+                command = limit if command > limit else command
+                reached = speed[i] + time_step * command
                 reached = zero if reached < zero else reached
                 gap[i] += advance - half * (speed[i] + reached)
                 speed[i] = reached
                 error[i] += (reached - truth) * (reached - truth)
-            if apart:
-                for i in range(len(speed)):
+                if apart is not None:
                     distance[i] += (gap[i] - seen) * (gap[i] - seen)
 
 
