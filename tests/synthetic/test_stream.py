@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from helpers import MIXED
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
@@ -224,3 +225,8 @@ def test_bad_arguments_are_named(name: str, value: Any) -> None:
 def test_bad_leader_parameters_are_named(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"data\.(leader\.)?{name}|'{name}'"):
         StopAndGo(**{name: -1.0})
+
+
+def test_drivers_of_other_models_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"data\.drivers: expected IDM drivers.*gipps, idm, ovm"):
+        StreamSource(drivers=MIXED, recordings=1, platoons=2, vehicles=3).load()
