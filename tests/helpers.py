@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache
 
+import pandas as pd
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -13,13 +14,30 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
-from lcc_rl.drivers.population import bootstrap
+from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
 from lcc_rl.policies import shared_policy
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
 VARIANTS = ("alcc", "reference", "own_energy", "cbf", "idm", "direct", *PLATOON)
 POPULATION = bootstrap()
+# Two drivers of each model, all parameters of their own.
+MIXED = from_table(
+    pd.DataFrame(
+        {
+            "model": ["idm", "ovm", "fvdm", "gipps"] * 2,
+            "desired_speed_mps": [20.0 + i for i in range(8)],
+            "time_gap_s": [1.0 + 0.1 * i for i in range(8)],
+            "acceleration_mps2": [1.0, None, None, 1.5, 1.2, None, None, 1.8],
+            "deceleration_mps2": [1.5, None, None, 3.0, 1.8, None, None, 3.5],
+            "leader_deceleration_mps2": [None, None, None, 3.1, None, None, None, 3.3],
+            "min_gap_m": [1.5 + 0.1 * i for i in range(8)],
+            "sensitivity_hz": [None, 2.0, 0.5, None, None, 2.5, 0.6, None],
+            "form": [None, 1.0, 1.2, None, None, 0.8, 1.5, None],
+            "speed_gain_hz": [None, None, 0.5, None, None, None, 0.7, None],
+        }
+    )
+)
 ACTION, REWARD = ("automated", "action"), ("automated", "reward")
 OBSERVATION, TERMS = ("automated", "observation"), ("automated", "reward_terms")
 

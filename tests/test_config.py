@@ -177,6 +177,10 @@ EXCEPTIONS = {
     "calibration/base.yaml": "which mode, and nodes, are the choice of a file",
     "calibration/base.yaml.global_genetic": "second use of GeneticSettings",
     "controller/idm.yaml": "one driver without noise; the class is that of drivers who differ",
+    **{
+        f"controller/{name}.yaml": "node of the model's parameters"
+        for name in ("fvdm", "gipps", "ovm")
+    },
     "controller/acc.yaml": "tuned constants",
     "controller/idm_acc.yaml": "tuned constants",
     "data/highway.yaml": "second use of StreamSource",

@@ -60,6 +60,8 @@ def configurations() -> Iterator[DictConfig]:
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
         cfg.scenario.string = drawn_or_single
         yield cfg
+    late = ["controller@scenario.controllers.human=ovm", "scenario.controllers.human.delay=4"]
+    yield load("train", ["variant=alcc", SIZES, *late])
     handover = "controller@scenario.controllers.automated=handover"
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
     saturation = "controller@scenario.controllers.automated=pi_saturation"

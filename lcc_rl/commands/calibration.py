@@ -1,4 +1,4 @@
-"""Calibration of IDM drivers from trajectories: rows, figures and a summary in a folder."""
+"""Calibration of drivers from trajectories: rows, figures and a summary in a folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rich.table import Table
 
 from lcc_rl.config import CALLED, build_as, config_hash, plain
 from lcc_rl.drivers.calibrator import Calibrator
-from lcc_rl.drivers.idm_fit import Calibration
+from lcc_rl.drivers.fit import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source
@@ -29,6 +29,11 @@ from lcc_rl.results.report import MISSING
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import claim
+
+ERRORS = (
+    *(("rmspe", "RMSPE [%]"), ("gap_rmse_m", "gap RMSE [m]")),
+    ("gap_nrmse", "gap NRMSE [%]"),
+)
 
 
 def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
@@ -120,14 +125,16 @@ def _summary(drivers: pd.DataFrame) -> Table:
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation")
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
     table.add_row("drivers", *(str(len(part)) for part in parts.values()))
-    table.add_row(escape("RMSPE [%]"), *(_spread(100.0 * part["rmspe"]) for part in parts.values()))
+    errors = [(column, column, label) for column, label in ERRORS]
+    errors += [(column + OUT, column, f"{label}, held out") for column, label in ERRORS]
+    for column, kind, label in errors:
+        if column in drivers:
+            scale = 1.0 if kind.endswith("_m") else 100.0
+            table.add_row(escape(label), *(_spread(scale * p[column]) for p in parts.values()))
     for column in COLUMNS.values():
-        name, _, unit = column.rpartition("_")
-        unit = unit.replace("mps", "m/s").replace("s2", "s²")
-        table.add_row(
-            escape(f"{name.replace('_', ' ')} [{unit}]"),
-            *(_spread(part[column]) for part in parts.values()),
-        )
+        if column in drivers:
+            row = (_spread(part[column]) for part in parts.values())
+            table.add_row(escape(_with_unit(column)), *row)
     populations = [from_table(part).summary() for part in parts.values()]
     correlations = (row["correlation"] for row in populations)
     shown = (f"{value:.2f}" if math.isfinite(value) else MISSING for value in correlations)
@@ -135,6 +142,15 @@ def _summary(drivers: pd.DataFrame) -> Table:
     shares = (f"{100 * row['share_at_bound']:.0f} %" for row in populations)
     table.add_row("v0 on a bound", *shares)
     return table
+
+
+def _with_unit(column: str) -> str:
+    """Return a column's name and unit: ``time gap [s]`` of ``time_gap_s``."""
+    name, _, unit = column.rpartition("_")
+    if not name:
+        return column
+    unit = unit.replace("mps", "m/s").replace("s2", "s²").replace("hz", "1/s")
+    return f"{name.replace('_', ' ')} [{unit}]"
 
 
 def _spread(values: pd.Series) -> str:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import pandas as pd
 import torch
 
+from lcc_rl.drivers.fit import DEFAULT_GENETIC, Calibration, fit
+from lcc_rl.drivers.fit_error import OBJECTIVES, SPEED
 from lcc_rl.drivers.genetic import GeneticSettings, Progress
-from lcc_rl.drivers.idm_fit import DEFAULT_GENETIC, Calibration, fit
 from lcc_rl.drivers.observed import Selection, observe
-from lcc_rl.drivers.parameters import MODES, Bounds, checked_bounds
-from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.drivers.parameters import IDM, MODES, Bounds, checked_bounds, fitted, law_of
+from lcc_rl.errors import ConfigError, require_in, unknown_name
+from lcc_rl.functional.driver_models import DriverConstants
 
 
 @dataclass(frozen=True)
@@ -22,20 +23,28 @@ class Calibrator:
 
     Args:
         modes: ``local``, ``global`` or both, each once.
+        model: driver model, a key of :data:`lcc_rl.functional.laws.LAWS`.
+        objective: what is minimised, see :class:`lcc_rl.drivers.fit_error.FitError`.
+        holdout: share of each episode, its end, that is not fitted but predicted.
         bounds: lower and upper bound by parameter, in its unit.
-        constants: parameters that the local mode does not fit.
+        constants: parameters that the local mode does not fit, by name; None, or a parameter that
+            is None: the model's default.
         selection: which episodes are used.
         local_genetic: genetic algorithm of the local mode.
         global_genetic: genetic algorithm of the global mode.
         choose_constants: first choose the local mode's constants over all drivers.
 
     Raises:
-        ConfigError: if a mode is unknown, or named twice or not at all, or bounds are crossed.
+        ConfigError: if a mode, model or objective is unknown, a mode is named twice or not at
+            all, a constant is none of the model's, or bounds are crossed.
     """
 
     modes: Sequence[str] = ("local",)
+    model: str = IDM
+    objective: str = SPEED
+    holdout: float = 0.0
     bounds: Bounds | None = None
-    constants: IDMConstants = field(default_factory=IDMConstants)
+    constants: Mapping[str, float | None] | None = None
     selection: Selection = field(default_factory=Selection)
     local_genetic: GeneticSettings = DEFAULT_GENETIC["local"]
     global_genetic: GeneticSettings = DEFAULT_GENETIC["global"]
@@ -43,12 +52,30 @@ class Calibrator:
 
     def __post_init__(self) -> None:
         for mode in self.modes:
-            if mode not in MODES:
-                raise unknown_name("calibration mode", mode, MODES)
+            fitted(mode, self.model)
         if not self.modes or len(set(self.modes)) < len(self.modes):
-            raise ConfigError(f"calibration modes must be given once each, got {list(self.modes)}")
-
+            raise ConfigError(
+                f"calibration modes must be some of {', '.join(MODES)}, given once each, got "
+                f"{list(self.modes)}"
+            )
+        if self.objective not in OBJECTIVES:
+            raise unknown_name("calibration objective", self.objective, OBJECTIVES)
+        require_in("calibration", "[0, 0.9]", holdout=self.holdout)
         checked_bounds(self.bounds)
+        self.shared()
+
+    def shared(self) -> DriverConstants:
+        """Return what the local mode does not fit.
+
+        Raises:
+            ConfigError: if one is given that the model lacks.
+        """
+        law = law_of(self.model)
+        given = {name: x for name, x in (self.constants or {}).items() if x is not None}
+        for name in given:
+            if name not in law.shared:
+                raise unknown_name(f"constant of model {self.model}", name, law.shared)
+        return law.constants(**given)
 
     def __call__(
         self,
@@ -57,7 +84,7 @@ class Calibrator:
         device: torch.device | str = "cpu",
         progress: Progress | None = None,
     ) -> Calibration:
-        """Calibrate the drivers of an episode table; see :func:`lcc_rl.drivers.idm_fit.fit`.
+        """Calibrate the drivers of an episode table; see :func:`lcc_rl.drivers.fit.fit`.
 
         Returns:
             The drivers of all modes, with the column ``mode``, and one report.
@@ -69,12 +96,15 @@ class Calibrator:
                 observed,
                 mode,
                 self.bounds,
-                self.constants,
+                self.shared(),
                 genetic[mode],
                 seed,
                 self.choose_constants and mode == "local",
                 device,
                 progress,
+                self.model,
+                self.objective,
+                self.holdout,
             )
             for mode in self.modes
         ]

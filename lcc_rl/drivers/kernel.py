@@ -19,48 +19,69 @@ FOLDER = "lcc_rl"  # in the user's cache folder
 
 
 def squared_errors(
+    idm: Any,
+    ovm: Any,
+    exponent: Any,
+    apart: Any,
     leader: Any,
     follower: Any,
-    first_gap: Any,
+    gaps: Any,
     samples: Any,
     parameters: Any,
     settings: Any,
     total: Any,
 ) -> None:
-    """Sum up the squared speed errors of IDM followers, for many candidates of every driver.
+    """Sum up the squared errors of speed and gap of followers, for many candidates of each driver.
 
     The formulas are those of :func:`lcc_rl.functional.idm.simulate_follower`. The inner loop runs
-    over the candidates of one driver, in which it becomes vector instructions. Comparisons are
-    such that what is not a number stays so.
+    over the candidates of one driver, in which it becomes vector instructions: numba drops the
+    branches for arguments that are None. Comparisons are such that what is not a number stays so.
 
     Args:
+        idm: None unless the drivers are of the IDM.
+        ovm: None unless they are of optimal velocities; with both None, of Gipps' model.
+        exponent: of the IDM; None for 4.
+        apart: None unless the errors of the gap are summed up; else they are zero.
         leader: observed speeds, ``[drivers, time]`` [m/s].
         follower: the same of the followers [m/s].
-        first_gap: ``[drivers]`` [m].
+        gaps: observed gaps, ``[drivers, time]`` [m].
         samples: number of samples, ``[drivers]``.
-        parameters: 1/v0, T, a, 1/(2√(ab)) and s0, each ``[drivers, candidates]``.
-        settings: gap floor, braking limit, acceleration limit, exponent, time step, half of it
-            and the numbers 0, 1 and 4: literals would be of double precision.
-        total: is overwritten with the sums, ``[drivers, candidates]``.
+        parameters: six, each ``[drivers, candidates]``; see
+            :data:`lcc_rl.drivers.fit_error.READY`.
+        settings: gap floor, braking limit, acceleration limit, time step, half of it and the
+            numbers 0, 1, 2, 0.025 and 1e-12: literals would be of double precision.
+        total: is overwritten with the sums of speed and gap, ``[2, drivers, candidates]``.
     """
-    floor, braking, limit, exponent, time_step, half, zero, one, four = settings
-    slownesses, time_gaps, maxima, inverse_roots, min_gaps = parameters
-    squared = exponent == four
-    speed, gap = np.empty_like(total[0]), np.empty_like(total[0])
-    for driver in range(len(total)):
-        slowness, time_gap, maximum = slownesses[driver], time_gaps[driver], maxima[driver]
-        inverse_root, min_gap, error = inverse_roots[driver], min_gaps[driver], total[driver]
-        speed[:], gap[:], error[:] = follower[driver, 0], first_gap[driver], zero
+    floor, braking, limit, time_step, half, zero, one, two, slow, tiny = settings
+    speed, gap = np.empty_like(total[0, 0]), np.empty_like(total[0, 0])
+    for driver in range(total.shape[1]):
+        p0, p1, p2 = parameters[0][driver], parameters[1][driver], parameters[2][driver]
+        p3, p4, p5 = parameters[3][driver], parameters[4][driver], parameters[5][driver]
+        error, distance = total[0, driver], total[1, driver]
+        speed[:], gap[:] = follower[driver, 0], gaps[driver, 0]
+        error[:], distance[:] = zero, zero
         for step in range(samples[driver] - 1):
             ahead, truth = leader[driver, step], follower[driver, step + 1]
-            advance = half * (ahead + leader[driver, step + 1])
+            seen, advance = gaps[driver, step + 1], half * (ahead + leader[driver, step + 1])
             for i in range(len(speed)):
-                wish = speed[i] * (time_gap[i] + (speed[i] - ahead) * inverse_root[i])
-                wish = (zero if wish < zero else wish) + min_gap[i]
-                ratio = wish / (floor if gap[i] < floor else gap[i])
-                free = speed[i] * slowness[i]
-                free = free * free * (free * free) if squared else free**exponent
-                command = maximum[i] * (one - free - ratio * ratio)
+                if idm is not None:
+                    wish = speed[i] * (p1[i] + (speed[i] - ahead) * p3[i])
+                    wish = (zero if wish < zero else wish) + p4[i]
+                    ratio = wish / (floor if gap[i] < floor else gap[i])
+                    free = speed[i] * p0[i]
+                    free = free * free * (free * free) if exponent is None else free**exponent
+                    command = p2[i] * (one - free - ratio * ratio)
+                elif ovm is not None:
+                    optimal = p0[i] * np.tanh(gap[i] * p1[i] - p2[i]) + p3[i]
+                    command = p4[i] * (optimal - speed[i]) + p5[i] * (ahead - speed[i])
+                else:
+                    share, brake = speed[i] * p0[i], p2[i] * p3[i]
+                    free = p1[i] * (one - share) * np.sqrt(slow + share)
+                    room = p2[i] * (two * (gap[i] - p4[i]) - speed[i] * p3[i])
+                    root = brake * brake + room + p5[i] * ahead * ahead
+                    root = np.sqrt(tiny if root < tiny else root)
+                    over = free - (root - brake - speed[i]) / p3[i]
+                    command = free - (zero if over < zero else over)
                 command = -braking if command < -braking else command
                 command = limit if command > limit else command
                 reached = speed[i] + time_step * command
@@ -68,6 +89,8 @@ def squared_errors(
                 gap[i] += advance - half * (speed[i] + reached)
                 speed[i] = reached
                 error[i] += (reached - truth) * (reached - truth)
+                if apart is not None:
+                    distance[i] += (gap[i] - seen) * (gap[i] - seen)
 
 
 class Kernel:

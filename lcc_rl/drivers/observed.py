@@ -51,7 +51,7 @@ class Observed:
     Args:
         leader_speed: ``[time, episodes]`` [m/s]; beyond an episode's end, zero.
         follower_speed: the same for the follower [m/s].
-        gap: initial gap, ``[episodes]`` [m].
+        gaps: the same for the gap, ``[time, episodes]`` [m].
         samples: samples per episode, falling, on the CPU.
         identity: one row per episode: episode, recording, follower_id, leader_id.
         time_step: sampling interval [s].
@@ -60,7 +60,7 @@ class Observed:
 
     leader_speed: Tensor
     follower_speed: Tensor
-    gap: Tensor
+    gaps: Tensor
     samples: np.ndarray
     identity: pd.DataFrame
     time_step: float
@@ -70,6 +70,47 @@ class Observed:
     def count(self) -> int:
         """Number of episodes."""
         return len(self.samples)
+
+    @property
+    def gap(self) -> Tensor:
+        """Initial gap, ``[episodes]`` [m]."""
+        return self.gaps[0]
+
+    def split(self, share: float) -> tuple[Observed, Observed]:
+        """Cut off the end of every episode; the sample at the cut belongs to both parts.
+
+        Args:
+            share: of the samples that are cut off.
+
+        Raises:
+            DataError: if a part of the shortest episode has less than two samples.
+        """
+        last = np.floor(share * self.samples).astype(np.int64)
+        first = self.samples - last
+        if last.min() < 1 or first.min() < 2:
+            raise DataError(
+                f"holdout {share:g} of an episode of {int(self.samples.min())} samples leaves a "
+                "part without a step; expected longer episodes or another share"
+            )
+        length = int(last.max()) + 1
+        # Rows of the second part, as seen from the first sample of each episode.
+        rows = torch.from_numpy(first - 1) + torch.arange(length).unsqueeze(-1)
+        inside = torch.arange(length).unsqueeze(-1) <= torch.from_numpy(last)
+        rows = torch.where(inside, rows, 0).to(self.gaps.device)
+        inside = inside.to(self.gaps.device)
+
+        def cut(series: Tensor) -> tuple[Tensor, Tensor]:
+            head = series[: int(first.max())].clone()
+            kept = torch.arange(len(head)).unsqueeze(-1) < torch.from_numpy(first)
+            return head * kept.to(head), series.gather(0, rows) * inside
+
+        speeds, followers, gaps = map(cut, (self.leader_speed, self.follower_speed, self.gaps))
+        parts = zip(speeds, followers, gaps, (first, last + 1), strict=True)
+        one, other = (
+            replace(self, leader_speed=a, follower_speed=b, gaps=c, samples=n)
+            for a, b, c, n in parts
+        )
+        return one, other
 
     def segments(self) -> Iterator[tuple[int, int, int]]:
         """Cut time where episodes end, so that none is simulated beyond its end.
@@ -88,7 +129,7 @@ class Observed:
             self,
             leader_speed=self.leader_speed.to(device, dtype),
             follower_speed=self.follower_speed.to(device, dtype),
-            gap=self.gap.to(device, dtype),
+            gaps=self.gaps.to(device, dtype),
         )
 
 
@@ -116,15 +157,15 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
     table, report = _select(table, selection)
     table = table.sort_values("samples", ascending=False, kind="stable")
     length, count = int(table["samples"].iloc[0]), len(table)
-    padded = np.zeros((2, length, count))
-    speeds = frame[["leader_speed_mps", "follower_speed_mps"]].to_numpy(np.float64).T
+    padded = np.zeros((3, length, count))
+    series = frame[["leader_speed_mps", "follower_speed_mps", "gap_m"]].to_numpy(np.float64).T
     for column, (start, samples) in enumerate(zip(table["start"], table["samples"], strict=True)):
-        padded[:, :samples, column] = speeds[:, start : start + samples]
-    leader, follower = torch.from_numpy(padded)
+        padded[:, :samples, column] = series[:, start : start + samples]
+    leader, follower, gaps = torch.from_numpy(padded)
     return Observed(
         leader_speed=leader,
         follower_speed=follower,
-        gap=torch.from_numpy(table["first_gap"].to_numpy(np.float64).copy()),
+        gaps=gaps,
         samples=table["samples"].to_numpy(np.int64),
         identity=table[["episode", *IDENTITY]].reset_index(drop=True),
         time_step=step,
@@ -185,7 +226,6 @@ def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
             leader_id=("leader_id", "first"),
             start=("row", "first"),
             samples=("row", "size"),
-            first_gap=("gap_m", "first"),
             least_gap=("least_gap", "first"),
             mean_speed=("follower_speed_mps", "mean"),
             finite=("finite", "all"),

@@ -1,8 +1,9 @@
-"""Populations of human drivers, from which episodes draw (v0, T)."""
+"""Populations of human drivers, from which episodes draw."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,15 @@ from torch import Tensor
 from lcc_rl.drivers.parameters import (
     COLUMNS,
     DEFAULT_BOUNDS,
+    IDM,
+    MODEL,
     PLAUSIBLE,
-    SHARED,
     Bounds,
     at_bound,
     checked_bounds,
+    users,
 )
-from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers
+from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of
 from lcc_rl.errors import (
     LAST_SEED,
     ConfigError,
@@ -29,6 +32,7 @@ from lcc_rl.errors import (
     require_whole,
 )
 from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.memory import require_memory
 
 DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, and its name
@@ -36,15 +40,19 @@ DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, a
 
 @dataclass(frozen=True)
 class DriverPopulation:
-    """IDM drivers that an episode can draw.
+    """Drivers that an episode can draw.
 
     Args:
         desired_speed: v0, ``[drivers]`` [m/s].
         time_gap: T, ``[drivers]`` [s].
-        constants: the other parameters: numbers where all drivers share them, else tensors
-            ``[drivers]`` (a globally calibrated population).
+        constants: the other parameters of the IDM: numbers where all drivers share them, else
+            tensors ``[drivers]`` (a globally calibrated population). Of drivers with other
+            models, what an estimator by the IDM takes them for.
         ids: the drivers' identities, one per driver.
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
+        models: the model of every driver; None: the IDM of all.
+        own: further parameters by name, ``[drivers]``, where drivers have other models; NaN
+            where a driver's model lacks one.
 
     Raises:
         ConfigError: if there is no driver, or a parameter is not one that a driver can have.
@@ -55,13 +63,16 @@ class DriverPopulation:
     constants: IDMConstants
     ids: tuple[str, ...]
     at_bound: Tensor
+    models: tuple[str, ...] | None = None
+    own: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.ids:
             raise ConfigError("driver population: holds no drivers")
         for name, values in self.parameters().items():
             low, high = PLAUSIBLE[name]
-            wrong = ~((values >= low) & (values <= high))
+            unused = values.isnan() if self.models else torch.zeros(()).bool()
+            wrong = ~((values >= low) & (values <= high)) & ~unused
             if bool(wrong.any()):
                 found = float(values[wrong][0])
                 raise ConfigError(
@@ -86,6 +97,8 @@ class DriverPopulation:
             self.constants.with_(**own),
             tuple(self.ids[place] for place in index.tolist()),
             self.at_bound[index],
+            self.models and tuple(self.models[place] for place in index.tolist()),
+            {name: values[index] for name, values in self.own.items()},
         )
 
     def summary(self) -> dict[str, float]:
@@ -104,9 +117,13 @@ class DriverPopulation:
         }
 
     def parameters(self) -> dict[str, Tensor]:
-        """Return the five IDM parameters by name, each ``[drivers]``, float64."""
+        """Return the drivers' parameters by name, each ``[drivers]``, float64.
+
+        Of IDM drivers these are five; of a mixture of models NaN stands for what a driver lacks.
+        """
         own = {"desired_speed": self.desired_speed, "time_gap": self.time_gap}
-        own |= {name: getattr(self.constants, name) for name in SHARED}
+        shared = {name: getattr(self.constants, name) for name in LAWS[IDM].shared}
+        own |= shared if self.models is None else self.own
         device = self.desired_speed.device
         return {
             name: torch.as_tensor(values, dtype=torch.float64, device=device).expand(len(self))
@@ -146,22 +163,33 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
         DataError: if the table is not sound.
     """
     check_drivers(table, "driver table")
-    own = {name: table[COLUMNS[name]].to_numpy(np.float64) for name in SHARED}
+    models = models_of(table, "driver table")
+    shared = LAWS[IDM].shared if (models == IDM).all() else ()
+    own = {name: table[COLUMNS[name]].to_numpy(np.float64) for name in shared}
     constants = IDMConstants(
         **{name: float(values[0]) for name, values in own.items() if np.ptp(values) == 0.0}
     )
     varying = {name: _tensor(values) for name, values in own.items() if np.ptp(values) > 0.0}
-    return DriverPopulation(
+    found = DriverPopulation(
         desired_speed=_tensor(table[COLUMNS["desired_speed"]].to_numpy(np.float64)),
         time_gap=_tensor(table[COLUMNS["time_gap"]].to_numpy(np.float64)),
         constants=constants.with_(**varying),
         ids=_identities(table),
         at_bound=_flags(table),
     )
+    if shared:
+        return found
+    further = {name for model in models.unique() for name in LAWS[model].shared}
+    more = {
+        name: _tensor(table[column].where(models.isin(users(name))))
+        for name, column in COLUMNS.items()
+        if name in further
+    }
+    return replace(found, models=tuple(models), own=more)
 
 
-def _tensor(values: np.ndarray) -> Tensor:
-    return torch.tensor(values, dtype=torch.float32)
+def _tensor(values: np.ndarray | pd.Series) -> Tensor:
+    return torch.tensor(np.asarray(values, np.float64), dtype=torch.float32)
 
 
 def _identities(table: pd.DataFrame) -> tuple[str, ...]:
@@ -208,7 +236,11 @@ def kde(
     require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
     limits = checked_bounds(bounds)
     table = load_drivers(path, mode)
-    names = [name for name, column in COLUMNS.items() if np.ptp(table[column].to_numpy()) > 0.0]
+    models = sorted(set(models_of(table, "driver table")))
+    if len(models) > 1:
+        raise DataError(f"kde: expected drivers of one model, the table has {', '.join(models)}")
+    columns = {name: COLUMNS[name] for name in LAWS[models[0]].parameters}
+    names = [name for name, column in columns.items() if np.ptp(table[column].to_numpy()) > 0.0]
     values = table[[COLUMNS[name] for name in names]].to_numpy(np.float64).T
     from scipy.stats import gaussian_kde  # here: it loads for a second
 
@@ -217,10 +249,10 @@ def kde(
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DataError(f"kde: {len(table)} drivers do not span a density: {error}") from error
     draws = density.resample(drivers, seed=np.random.default_rng(seed))
-    drawn = {column: np.full(drivers, table[column].iloc[0]) for column in COLUMNS.values()}
+    drawn = {column: np.full(drivers, table[column].iloc[0]) for column in columns.values()}
     for name, row in zip(names, draws, strict=True):
         drawn[COLUMNS[name]] = row.clip(*limits[name])
-    return from_table(pd.DataFrame(drawn))
+    return from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
 
 
 def fixed(

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.drivers.parameters import COLUMNS, MODES, PLAUSIBLE
+from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, MODES, PLAUSIBLE, users
 from lcc_rl.errors import DataError, ResultsError, unknown_name
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
 
 SHIPPED = "i80_drivers.parquet"
@@ -25,7 +26,7 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
             table has, local where it has both.
 
     Returns:
-        One row per driver, columns as written by :func:`lcc_rl.drivers.idm_fit.fit`.
+        One row per driver, columns as written by :func:`lcc_rl.drivers.fit.fit`.
 
     Raises:
         ConfigError: if the mode is unknown.
@@ -57,6 +58,24 @@ def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
     return frame[frame["mode"] == mode].reset_index(drop=True)
 
 
+def models_of(frame: pd.DataFrame, name: str) -> pd.Series:
+    """Return the model of every driver of a table; without the column, the IDM.
+
+    Raises:
+        DataError: naming the table and row, if a model is unknown.
+    """
+    if MODEL not in frame.columns:
+        return pd.Series(IDM, index=frame.index)
+    unknown = ~frame[MODEL].isin(list(LAWS)).to_numpy()
+    if unknown.any():
+        row = int(unknown.argmax())
+        raise DataError(
+            f"{name}: row {row}, column {MODEL!r}: must be one of {', '.join(LAWS)}, "
+            f"got {frame[MODEL].iloc[row]!r}"
+        )
+    return frame[MODEL]
+
+
 def check_drivers(frame: pd.DataFrame, name: str) -> None:
     """Check that a table holds drivers: their parameters, each within :data:`PLAUSIBLE`, once.
 
@@ -65,15 +84,20 @@ def check_drivers(frame: pd.DataFrame, name: str) -> None:
     """
     if frame.empty:
         raise DataError(f"{name}: the table holds no drivers")
-    missing = [column for column in COLUMNS.values() if column not in frame.columns]
+    models = models_of(frame, name)
+    found = {column: models.isin(users(parameter)) for parameter, column in COLUMNS.items()}
+    needed = {column: rows for column, rows in found.items() if rows.any()}
+    missing = [column for column in needed if column not in frame.columns]
     if missing:
         raise DataError(f"{name}: missing column(s) {', '.join(missing)}")
     for parameter, column in COLUMNS.items():
+        if column not in needed:
+            continue
         if not pd.api.types.is_numeric_dtype(frame[column]):
             raise DataError(f"{name}: column {column!r} is not numeric")
         values = frame[column].to_numpy(np.float64, na_value=np.nan)
         low, high = PLAUSIBLE[parameter]
-        bad = ~((values >= low) & (values <= high))
+        bad = needed[column].to_numpy() & ~((values >= low) & (values <= high))
         if bad.any():
             row = int(bad.argmax())
             raise DataError(
@@ -88,7 +112,9 @@ def _check_identities(frame: pd.DataFrame, name: str) -> None:
     if not set(IDENTITY) <= set(frame.columns):
         return
     # A pair that was cut by a lane change is two drivers: its episodes tell them apart.
-    columns = [column for column in ("mode", "episode", *IDENTITY) if column in frame.columns]
+    columns = [
+        column for column in ("mode", MODEL, "episode", *IDENTITY) if column in frame.columns
+    ]
     twice = frame.duplicated(columns).to_numpy()
     if twice.any():
         row = int(twice.argmax())

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.idm import IDMConstants, limit, power
+from lcc_rl.functional.driver_models import limit
+from lcc_rl.functional.idm import IDMConstants, power
 
 REFERENCE_SPEED = 15.0  # v_ref [m/s]; only scales q so that it is of order one
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import require_positive
+from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, capped, limit
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
 
 @dataclass(frozen=True)
-class IDMConstants:
+class IDMConstants(DriverConstants):
     """The parameters that drivers share; desired speed v0 and time gap T are a driver's own.
 
     Args:
@@ -36,15 +36,6 @@ class IDMConstants:
     gap_floor: float = 0.1
     braking_limit: float = 8.0
     acceleration_limit: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not isinstance(value, Tensor):
-                require_positive("IDM", **{name: value})
-
-    def with_(self, **changes: Tensor | float) -> IDMConstants:
-        """Return a copy in which some constants vary by driver (tensors, for calibration)."""
-        return replace(self, **changes)  # type: ignore[arg-type]
 
 
 def desired_gap(
@@ -101,11 +92,6 @@ def power(base: Tensor, exponent: float) -> Tensor:
     return base**exponent
 
 
-def limit(acceleration: Tensor, constants: IDMConstants) -> Tensor:
-    """Hold an acceleration within what a car can do [m/s²]."""
-    return acceleration.clamp(-constants.braking_limit, constants.acceleration_limit)
-
-
 def equilibrium_gap(
     speed: Tensor,
     desired_speed: Tensor,
@@ -130,7 +116,15 @@ def equilibrium_gap(
     """
     free_road = power(speed / desired_speed, constants.exponent)
     gap = (constants.min_gap + speed * time_gap) * (1.0 - free_road).clamp(min=1e-6).rsqrt()
-    return torch.minimum(gap, 2.0 * constants.min_gap + cap_time_gap * speed)
+    return capped(gap, speed, constants, cap_time_gap)
+
+
+IDM_LAW = DriverLaw(
+    idm_acceleration,
+    equilibrium_gap,
+    IDMConstants,
+    ("desired_speed", "time_gap", "acceleration", "deceleration", "min_gap"),
+)
 
 
 def simulate_follower(
@@ -139,11 +133,12 @@ def simulate_follower(
     gap: Tensor,
     desired_speed: Tensor,
     time_gap: Tensor,
-    constants: IDMConstants,
+    constants: DriverConstants,
     time_step: float,
     noise: Callable[[int], Tensor] | None = None,
+    law: DriverLaw = IDM_LAW,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Drive an IDM follower behind recorded leaders.
+    """Drive a follower behind recorded leaders.
 
     Args:
         leader_speed: speed of the leader, shape ``[time + 1, *batch]`` [m/s].
@@ -154,6 +149,7 @@ def simulate_follower(
         constants: the shared parameters.
         time_step: duration of one step T [s].
         noise: gives the relative error ξ of the executed acceleration at a step (A18), if any.
+        law: the follower's driver model.
 
     Returns:
         Speeds and gaps of shape ``[time + 1, *batch]`` and accelerations ``[time, *batch]``.
@@ -161,7 +157,7 @@ def simulate_follower(
     speeds, gaps, accelerations = [speed], [gap], []
     for step in range(leader_speed.shape[0] - 1):
         ahead, ahead_reached = leader_speed[step], leader_speed[step + 1]
-        command = idm_acceleration(speed, gap, speed - ahead, desired_speed, time_gap, constants)
+        command = law.acceleration(speed, gap, speed - ahead, desired_speed, time_gap, constants)
         if noise is not None:
             command = command * (1.0 + noise(step))
         reached, executed = advance_speed(speed, command, time_step)

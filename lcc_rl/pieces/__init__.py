@@ -2,10 +2,12 @@
 
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
+from lcc_rl.pieces.calibrated import CalibratedDrivers
 from lcc_rl.pieces.cbf import CBFFilter, Corrected
 from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
-from lcc_rl.pieces.controllers import IDM, Action, ConstantAcceleration, Controller
+from lcc_rl.pieces.controllers import Action, ConstantAcceleration, Controller
 from lcc_rl.pieces.cruise import IDMACC, LinearACC
+from lcc_rl.pieces.drivers import FVDM, IDM, OVM, DriverModel, Gipps
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import EnergyClasses, MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.hybrid import HCFS
@@ -37,12 +39,15 @@ from lcc_rl.pieces.termination import Collision
 
 __all__ = [
     "CACC",
+    "FVDM",
     "HCFS",
     "IDM",
     "IDMACC",
     "MPC",
+    "OVM",
     "Action",
     "CBFFilter",
+    "CalibratedDrivers",
     "Collision",
     "CollisionPenalty",
     "Communication",
@@ -52,12 +57,14 @@ __all__ = [
     "Correction",
     "DeadBeat",
     "DriverEstimator",
+    "DriverModel",
     "EfficiencyReward",
     "EnergyClasses",
     "EnergyReward",
     "EquilibriumStart",
     "Feature",
     "FollowerStopper",
+    "Gipps",
     "Handover",
     "HeadwayStart",
     "JerkReward",

@@ -43,6 +43,8 @@ ENTRIES: dict[Key, tuple[str, str]] = {
     (ROLE, "driver"): ("–", "id of each vehicle's driver in the population"),
     (ROLE, "desired_speed"): ("m/s", "desired speed v0 of the driver"),
     (ROLE, "desired_time_gap"): ("s", "desired time gap T of the driver"),
+    (ROLE, "equilibrium_gap"): ("m", "gap at which the driver follows the leader's first speed"),
+    (ROLE, "motion_history"): ("m/s, m, m/s", "past (speed, gap, relative speed), latest first"),
     (ROLE, "correction"): ("m/s²", "what the safety filter added to a policy's command"),
     (ROLE, "promised"): ("–", "1 where the safety filter answers for the step: see CBFFilter"),
     (ROLE, "predicted_acceleration"): ("m/s²", "acceleration of the last step as predicted"),

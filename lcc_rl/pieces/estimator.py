@@ -31,7 +31,7 @@ class DriverEstimator(StepTransform):
     :mod:`lcc_rl.functional.estimation`).
 
     Args:
-        population: the calibrated drivers.
+        population: the calibrated drivers; what they share beside (v0, T) is taken as its mean.
         time_step: duration of a step [s].
         learning_time: time before the online fit is trusted [s]; None for the population mean
             throughout.
@@ -71,10 +71,8 @@ class DriverEstimator(StepTransform):
         )
         self.time_step, self.measurement_error = time_step, measurement_error
         self.learning_steps = inf if learning_time is None else learning_time / time_step
-        self.drivers = population.constants
-        self.mean = PopulationMean(
-            population.desired_speed, population.time_gap, population.constants
-        )
+        self.drivers = population.constants.shared()
+        self.mean = PopulationMean(population.desired_speed, population.time_gap, self.drivers)
         start = prior(population.desired_speed, population.time_gap, self.drivers.exponent)
         self.register_buffer("prior_estimate", start.estimate)
         self.register_buffer("prior_covariance", start.covariance)

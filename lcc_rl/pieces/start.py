@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import LARGEST, ConfigError, require_in, require_positive
+from lcc_rl.functional.driver_models import capped
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
@@ -78,7 +79,7 @@ class EquilibriumStart:
 
     def __init__(self, population: Population, cap_time_gap: float = 3.0) -> None:
         require_positive("scenario.start", cap_time_gap=cap_time_gap)
-        self.drivers, self.cap_time_gap = population.constants, cap_time_gap
+        self.drivers, self.cap_time_gap = population.constants.shared(), cap_time_gap
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
@@ -88,9 +89,12 @@ class EquilibriumStart:
         if desired_speed is None or time_gap is None:
             raise ConfigError(
                 f"scenario.start.{role}: EquilibriumStart needs {role}.desired_speed and "
-                f"{role}.desired_time_gap, which only IDM drivers have; say for example "
+                f"{role}.desired_time_gap, which only driver models write; say for example "
                 f"'scenario.start.{role}=${{scenario.start.automated}}'"
             )
+        told = start.get((role, "equilibrium_gap"), None)
+        if told is not None:
+            return speed, capped(told, speed, self.drivers, self.cap_time_gap)
         gap = equilibrium_gap(speed, desired_speed, time_gap, self.drivers, self.cap_time_gap)
         return speed, gap
 

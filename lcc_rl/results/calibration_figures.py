@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import DataError
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.results.drawing import new_figure, unbox
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
@@ -18,6 +19,10 @@ PARAMETERS = {
     "acceleration": ("acceleration_mps2", "acceleration $a$ [m/s²]"),
     "deceleration": ("deceleration_mps2", "deceleration $b$ [m/s²]"),
     "min_gap": ("min_gap_m", "standstill gap $s_0$ [m]"),
+    "sensitivity": ("sensitivity_hz", "sensitivity $\\kappa$ [1/s]"),
+    "form": ("form", "form $\\beta$"),
+    "speed_gain": ("speed_gain_hz", "speed gain $\\lambda$ [1/s]"),
+    "leader_deceleration": ("leader_deceleration_mps2", "believed $\\hat{b}$ [m/s²]"),
 }
 
 
@@ -34,7 +39,11 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
     """
     modes = _modes(drivers)
     # Parameters held constant in every mode would be empty panels.
-    shown = {name: pair for name, pair in PARAMETERS.items() if drivers[pair[0]].nunique() > 1}
+    shown = {
+        name: pair
+        for name, pair in PARAMETERS.items()
+        if pair[0] in drivers and drivers[pair[0]].nunique() > 1
+    }
     rows = 1 + len(shown) // 3
     figure = new_figure(10.0, 0.4 + 2.7 * rows)
     axes = figure.subplots(rows, 3).ravel()
@@ -47,7 +56,8 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
         axis.set_title(label, fontsize=10, color=INK)
         _say_bound(axis, name, modes)
     means = ", ".join(f"{mode} {100 * part['rmspe'].mean():.1f} %" for mode, part in modes.items())
-    figure.suptitle(f"IDM calibration: mean RMSPE {means}", fontsize=12, color=INK)
+    model = ", ".join(drivers["model"].unique()).upper() if "model" in drivers else "IDM"
+    figure.suptitle(f"{model} calibration: mean RMSPE {means}", fontsize=12, color=INK)
     note = "box: quartiles; whiskers: 5th to 95th percentile; line: median; diamond: mean"
     figure.supxlabel(note, fontsize=8, color=GREY)
     return figure
@@ -89,9 +99,10 @@ def joint_figure(drivers: pd.DataFrame, mode: str | None = None) -> Figure:
 
 def _modes(drivers: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Split the table by mode, local first."""
-    columns = [column for column, _ in PARAMETERS.values()]
-    flags = [f"{name}_at_bound" for name in PARAMETERS]
-    missing = [name for name in ("mode", "rmspe", *columns, *flags) if name not in drivers]
+    models = drivers["model"].unique() if "model" in drivers else ["idm"]
+    names = [name for name in PARAMETERS if any(name in LAWS[x].parameters for x in models)]
+    columns = [PARAMETERS[name][0] for name in names] + [f"{name}_at_bound" for name in names]
+    missing = [name for name in ("mode", "rmspe", *columns) if name not in drivers]
     if missing:
         raise DataError(f"driver table: missing column(s) {', '.join(missing)}")
     if drivers.empty:

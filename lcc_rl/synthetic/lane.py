@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lcc_rl.data.units import FRAME
-from lcc_rl.drivers.parameters import COLUMNS
+from lcc_rl.drivers.parameters import COLUMNS, fitted
 from lcc_rl.drivers.population import DriverPopulation
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
@@ -59,7 +60,13 @@ def drive_platoons(
         seen: recorded steps of every platoon ``[platoons]``.
         noise: relative noise of the drivers' acceleration (A18).
         generator: source of all randomness.
+
+    Raises:
+        ConfigError: if drivers have another model than the IDM.
     """
+    if drivers.models is not None:
+        known = ", ".join(sorted(set(drivers.models)))
+        raise ConfigError(f"data.drivers: expected IDM drivers for a stream, got those of {known}")
     warm_up = round(WARM_UP_S / FRAME)
     steps = warm_up + int(seen.max())
     ahead, level = leader.drive(len(seen), steps, FRAME, generator)
@@ -125,8 +132,8 @@ def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
     vehicle = _identity(len(ranks) + 1, len(ranks[0]))[1:].T.ravel()
     parameters = [drivers.parameters() for drivers in ranks]
     columns = {"vehicle": vehicle, "preceding": vehicle - 1}
-    for name, column in COLUMNS.items():
-        columns[column] = torch.stack([own[name] for own in parameters]).T.flatten().numpy()
+    for name in fitted("global"):
+        columns[COLUMNS[name]] = torch.stack([own[name] for own in parameters]).T.flatten().numpy()
     return pd.DataFrame(columns)
 
 

@@ -29,8 +29,8 @@ from tensordict.nn import TensorDictSequential
 from lcc_rl.agents.factory import make_trainer
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
+from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.genetic import GeneticSettings, minimise
-from lcc_rl.drivers.idm_fit import fit
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.envs import Inputs, StringCollector
 from lcc_rl.errors import DataError, Diverged, ResultsError
@@ -329,7 +329,7 @@ def test_a_calibration_without_any_fit_names_the_episode() -> None:
     still = pd.DataFrame({"time_s": time, "follower_speed_mps": 0.0, "leader_speed_mps": 0.0})
     still = still.assign(episode=7, gap_m=5.0, follower_position_m=0.0, leader_position_m=10.0)
     observed = observe(still.assign(leader_length_m=5.0), Selection(min_mean_speed_mps=0.0))
-    with pytest.raises(DataError, match=r"episode 7 .*no local parameters .* finite relative"):
+    with pytest.raises(DataError, match=r"episode 7 .*no local parameters .* finite speed_rmspe"):
         fit(observed, genetic=GeneticSettings(population=4, generations=1))
 
 

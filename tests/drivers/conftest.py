@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.functional.idm import IDMConstants, simulate_follower
+from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.functional.idm import simulate_follower
+from lcc_rl.functional.laws import LAWS
 
 STEP = 0.1
 
@@ -15,11 +17,13 @@ STEP = 0.1
 def build_episodes(
     desired_speed: list[float],
     time_gap: list[float],
-    constants: IDMConstants | None = None,
+    constants: DriverConstants | None = None,
     seconds: list[float] | None = None,
+    model: str = "idm",
 ) -> pd.DataFrame:
     """Episodes of drivers whose leader swings, then speeds away at 38 m/s."""
-    constants = constants or IDMConstants()
+    law = LAWS[model]
+    constants = constants or law.constants()
     seconds = seconds or [60.0] * len(desired_speed)
     parts = []
     for driver, (v0, gap_s, length) in enumerate(
@@ -30,7 +34,9 @@ def build_episodes(
         leader = torch.maximum(swing, (10.0 + 1.5 * (time - 0.4 * length)).clamp(max=38.0))
         start = torch.tensor([9.0, 4.0 + 9.0 * gap_s], dtype=torch.float64)
         own = (torch.tensor(v0).double(), torch.tensor(gap_s).double())
-        speed, gap, _ = simulate_follower(leader, start[0], start[1], *own, constants, STEP)
+        speed, gap, _ = simulate_follower(
+            leader, start[0], start[1], *own, constants, STEP, law=law
+        )
         parts.append(
             pd.DataFrame(
                 {

@@ -7,6 +7,7 @@ from pathlib import Path
 import lcc_rl.conf
 import pandas as pd
 import pytest
+import torch
 from commands import run_command
 from omegaconf import OmegaConf
 from rich.console import Console
@@ -14,7 +15,9 @@ from rich.console import Console
 from lcc_rl.commands import calibration
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
+from lcc_rl.pieces import CalibratedDrivers
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.runs.precision import prepare_torch
 
@@ -63,6 +66,21 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
         assert text in out.getvalue()
 
 
+@pytest.mark.parametrize("model", list(LAWS))
+def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
+    cfg.calibration.model, cfg.calibration.objective = model, "both"
+    cfg.calibration.holdout = 0.3
+    out = io.StringIO()
+    calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
+    for text in ("held out: RMSPE", "gap NRMSE [%], held out", "time gap [s]"):
+        assert text in out.getvalue()
+    population = bootstrap(tmp_path / "run" / "drivers.parquet", mode="global")
+    assert set(population.parameters()) == set(LAWS[model].parameters)
+    driven = CalibratedDrivers(population, 0.1)
+    state = [torch.full((3, 1, 1), x) for x in (10.0, 20.0, 0.0, 25.0, 1.2)]
+    assert driven.acceleration(*state, torch.arange(3).view(3, 1, 1)).isfinite().all()
+
+
 @pytest.mark.parametrize(
     ("key", "value", "error", "message"),
     [
@@ -75,6 +93,11 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
         ("calibration.bounds.time_gap", [2.0, 1.0], ConfigError, "time_gap"),
         ("calibration.local_genetic.population", 2, ConfigError, "population"),
         ("calibration.selection.min_gap_m", 1e3, DataError, "gap below 1000 m"),
+        ("calibration.model", "krauss", ConfigError, "driver model 'krauss'; valid: fvdm, gipps"),
+        ("calibration.objective", "gap", ConfigError, "objective 'gap'"),
+        ("calibration.holdout", 1.0, ConfigError, "holdout"),
+        ("calibration.constants.sensitivity", 1.0, ConfigError, "constant of model idm"),
+        ("calibration.bounds.speed_gain", [0.0, 1.0], ConfigError, "speed_gain"),
     ],
 )
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, error, message):

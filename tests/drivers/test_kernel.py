@@ -16,10 +16,13 @@ def episode(dtype="float32"):
     """Arguments of the kernel: one driver, two candidates, behind a leader at 10 m/s."""
     one = np.dtype(dtype).type
     speed = np.full((1, 30), 10.0, dtype)
-    parameters = tuple(np.full((1, 2), x, dtype) for x in (1 / 30, 1.0, 1.0, 0.4, 2.0))
-    settings = tuple(one(x) for x in (0.1, 8.0, 5.0, 4.0, 0.1, 0.05, 0.0, 1.0, 4.0))
-    total = np.full((1, 2), np.nan, dtype)
-    return speed, speed.copy(), np.full(1, 20.0, dtype), np.array([30]), parameters, settings, total
+    parameters = tuple(np.full((1, 2), x, dtype) for x in (1 / 30, 1.0, 1.0, 0.4, 2.0, 0.0))
+    numbers = (0.1, 8.0, 5.0, 0.1, 0.05, 0.0, 1.0, 2.0, 0.025, 1e-12)
+    settings = tuple(one(x) for x in numbers)
+    total = np.full((2, 1, 2), np.nan, dtype)
+    series = (speed, speed.copy(), np.full((1, 30), 20.0, dtype))
+    law = (True, None, None, True)
+    return *law, *series, np.array([30]), parameters, settings, total
 
 
 @pytest.fixture

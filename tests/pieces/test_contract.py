@@ -13,7 +13,16 @@ from importlib.util import find_spec
 
 import pytest
 import torch
-from helpers import ACTION, OBSERVATION, POPULATION, REWARD, TERMS, small_env, wavy_profiles
+from helpers import (
+    ACTION,
+    MIXED,
+    OBSERVATION,
+    POPULATION,
+    REWARD,
+    TERMS,
+    small_env,
+    wavy_profiles,
+)
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -26,11 +35,14 @@ from lcc_rl.envs.step import Pieces
 from lcc_rl.functional.mpc import MPCSettings
 from lcc_rl.pieces import (
     CACC,
+    FVDM,
     HCFS,
     IDM,
     IDMACC,
     MPC,
+    OVM,
     Action,
+    CalibratedDrivers,
     CBFFilter,
     Collision,
     CollisionPenalty,
@@ -41,12 +53,14 @@ from lcc_rl.pieces import (
     Correction,
     DeadBeat,
     DriverEstimator,
+    DriverModel,
     EfficiencyReward,
     EnergyClasses,
     EnergyReward,
     EquilibriumStart,
     Feature,
     FollowerStopper,
+    Gipps,
     Handover,
     HeadwayStart,
     JerkReward,
@@ -101,6 +115,7 @@ ROLES = (
     "hybrid",
     "hybrid",
     "human",
+    *("late", "optimal", "difference", "gipps", "calibrated", "calibrated"),
 )
 STRINGS = {
     "open": VehicleString(ROLES),
@@ -114,8 +129,9 @@ SCALES = {
     "memory": {"entries": 0.5},
 }
 FILTERED = "Action, filtered"
+DRIVEN = ("human", "handover", "late", "optimal", "difference", "gipps", "calibrated")
 ACTIONS = {ACTION: (2, 1), ("plain", "action"): (1, 1), ("hybrid", "action"): (2, 1)}
-BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller)
+BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, DriverModel)
 STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
 
 
@@ -135,6 +151,12 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
     def human(role: str) -> IDM:
         return IDM(POPULATION, T, noise=0.05, wiener=0.1, string=string, role=role)
 
+    def driver(kind: type, role: str, delay: int) -> DriverModel:
+        own = kind.law.constants()
+        return kind(
+            POPULATION, T, wiener=0.1, delay=delay, parameters=own, string=string, role=role
+        )
+
     def stopper(role: str, speed: float | None = None) -> FollowerStopper:
         return FollowerStopper(T, speed, window=0.5, string=string, role=role)
 
@@ -147,6 +169,13 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
         FILTERED: lambda: Action(string=string),
         "Action": lambda: Action(string=string, role="plain"),
         "IDM": lambda: human("human"),
+        "IDM, late": lambda: driver(IDM, "late", 3),
+        "OVM": lambda: driver(OVM, "optimal", 0),
+        "FVDM": lambda: driver(FVDM, "difference", 1),
+        "Gipps": lambda: driver(Gipps, "gipps", 2),
+        "CalibratedDrivers": lambda: CalibratedDrivers(
+            MIXED, T, wiener=0.1, delay=2, string=string, role="calibrated"
+        ),
         "CACC": lambda: CACC(T, k3=0.4, string=string, role="cacc"),
         "DeadBeat": lambda: DeadBeat(T, string=string, role="beat"),
         "FollowerStopper": lambda: stopper("stopper"),
@@ -172,7 +201,7 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
 
 def motion(string: VehicleString) -> StringMotion:
     start = {role: TimeGapStart() for role in string.names}
-    start |= {role: EquilibriumStart(POPULATION) for role in ("human", "handover")}
+    start |= {role: EquilibriumStart(POPULATION) for role in DRIVEN}
     start |= {role: HeadwayStart() for role in CONNECTED}
     length = 30.0 * len(string) if string.ring else None
     return StringMotion(string, T, start, length, initial_speed=8.0)

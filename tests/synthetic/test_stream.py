@@ -11,13 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from helpers import MIXED
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
-from lcc_rl.drivers.idm_fit import fit
+from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.population import bootstrap, fixed
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
@@ -224,3 +225,8 @@ def test_bad_arguments_are_named(name: str, value: Any) -> None:
 def test_bad_leader_parameters_are_named(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"data\.(leader\.)?{name}|'{name}'"):
         StopAndGo(**{name: -1.0})
+
+
+def test_drivers_of_other_models_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"data\.drivers: expected IDM drivers.*gipps, idm, ovm"):
+        StreamSource(drivers=MIXED, recordings=1, platoons=2, vehicles=3).load()

@@ -15,7 +15,7 @@ from scipy.optimize import differential_evolution
 from benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
 from benchmarks.search import batched_search
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.drivers.idm_fit import DEFAULT_GENETIC, fit
+from lcc_rl.drivers.fit import DEFAULT_GENETIC, fit
 from lcc_rl.drivers.observed import Observed, observe
 from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants

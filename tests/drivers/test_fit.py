@@ -7,13 +7,13 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.drivers import speed_error
+from lcc_rl.drivers import fit_error
 from lcc_rl.drivers.calibrator import Calibrator
+from lcc_rl.drivers.fit import fit
+from lcc_rl.drivers.fit_error import FitError
 from lcc_rl.drivers.genetic import GeneticSettings
-from lcc_rl.drivers.idm_fit import fit
 from lcc_rl.drivers.observed import Selection, observe
-from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, MODES
-from lcc_rl.drivers.speed_error import SpeedError
+from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, MODES, fitted
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 
@@ -29,7 +29,7 @@ def numba():
 @pytest.fixture
 def torch_only(monkeypatch):
     """Calibrations simulate with torch."""
-    monkeypatch.setattr(speed_error, "kernel_of", lambda name: None)
+    monkeypatch.setattr(fit_error, "kernel_of", lambda name: None)
 
 
 def random_candidates(names, *shape):
@@ -64,10 +64,10 @@ def reference_error(observed, candidates, constants, names):
 @pytest.mark.parametrize("exponent", [4.0, 2.5])
 def test_error_is_that_of_the_plain_simulation(mode, way, exponent, request, uneven_lengths):
     request.getfixturevalue(way)
-    observed, names = observe(uneven_lengths), MODES[mode]
+    observed, names = observe(uneven_lengths), fitted(mode)
     constants = IDMConstants(exponent=exponent)
     candidates = random_candidates(names, 3, 6)
-    error = SpeedError(observed, constants, names)(candidates)
+    error = FitError(observed, constants, names)(candidates)
     expected = reference_error(observed, candidates, constants, names)
     torch.testing.assert_close(error, expected, rtol=1e-9, atol=1e-12)
 
@@ -75,12 +75,12 @@ def test_error_is_that_of_the_plain_simulation(mode, way, exponent, request, une
 def test_numba_and_torch_give_the_same_errors(numba, uneven_lengths, monkeypatch):
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-4)):
         observed = observe(uneven_lengths).to("cpu", dtype)
-        for names in MODES.values():
+        for names in map(fitted, MODES):
             candidates = random_candidates(names, 3, 500)
-            by_numba = SpeedError(observed, IDMConstants(), names)(candidates.to(dtype))
+            by_numba = FitError(observed, IDMConstants(), names)(candidates.to(dtype))
             with monkeypatch.context() as patch:
-                patch.setattr(speed_error, "kernel_of", lambda name: None)
-                by_torch = SpeedError(observed, IDMConstants(), names)(candidates.to(dtype))
+                patch.setattr(fit_error, "kernel_of", lambda name: None)
+                by_torch = FitError(observed, IDMConstants(), names)(candidates.to(dtype))
             assert by_numba.dtype == dtype
             torch.testing.assert_close(by_numba, by_torch, rtol=tolerance, atol=tolerance)
 
@@ -98,7 +98,7 @@ def test_the_log_says_which_package_simulates(way, request, uneven_lengths, capl
 def test_numba_and_torch_find_the_same_drivers(numba, known_episodes, monkeypatch):
     # The same draws; roundings may let another of two equally good individuals survive.
     found = {mode: fit(known_episodes, mode, seed=2).drivers for mode in MODES}
-    monkeypatch.setattr(speed_error, "kernel_of", lambda name: None)
+    monkeypatch.setattr(fit_error, "kernel_of", lambda name: None)
     for mode, drivers in found.items():
         expected = fit(known_episodes, mode, seed=2).drivers
         columns = [COLUMNS[name] for name in ("desired_speed", "time_gap")]
@@ -110,10 +110,10 @@ def test_numba_and_torch_find_the_same_drivers(numba, known_episodes, monkeypatc
 @pytest.mark.parametrize("way", ["numba", "torch_only"])
 def test_what_is_no_number_stays_so_and_harms_no_other(way, request, uneven_lengths):
     request.getfixturevalue(way)
-    candidates = random_candidates(MODES["global"], 3, 8)
+    candidates = random_candidates(fitted("global"), 3, 8)
     for at in range(5):
         candidates[1, at, at] = np.nan
-    error = SpeedError(observe(uneven_lengths), IDMConstants(), MODES["global"])(candidates)
+    error = FitError(observe(uneven_lengths), IDMConstants(), fitted("global"))(candidates)
     assert error[1, :5].isnan().all()
     assert error[1, 5:].isfinite().all()
     assert error[[0, 2]].isfinite().all()
@@ -157,10 +157,10 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
     assert drivers["samples"].tolist() == [238, 401, 315]
     assert drivers.columns.tolist() == [
         *("episode", "recording", "follower_id", "leader_id"),
-        *COLUMNS.values(),
-        *("rmspe", "samples"),
-        *(f"{name}_at_bound" for name in COLUMNS),
-        "mode",
+        *(COLUMNS[name] for name in fitted("global")),
+        *("rmspe", "gap_rmse_m", "gap_nrmse", "samples"),
+        *(f"{name}_at_bound" for name in fitted("global")),
+        *("mode", "model"),
     ]
 
 

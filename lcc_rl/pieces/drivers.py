@@ -1,0 +1,249 @@
+"""Human drivers: driver models with noise and a reaction delay, as controllers of any role."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+
+from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole
+from lcc_rl.functional.driver_models import DriverConstants, DriverLaw
+from lcc_rl.functional.gipps import GIPPS_LAW
+from lcc_rl.functional.idm import IDM_LAW
+from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
+from lcc_rl.functional.pattern import HUMAN, VehicleString
+from lcc_rl.functional.random import choose, normal, stream_id, uniform
+from lcc_rl.pieces.base import SEED, Key, as_key, require_option
+from lcc_rl.pieces.controllers import Controller, Population, stream_name
+
+LEADER_SPEED = ("leader", "speed")
+MOTION = ("self.speed", "self.gap", "self.relative_speed")
+LONGEST = 1000.0  # time gap up to which an equilibrium is told [s]
+MOST_DELAY = 1000  # steps that a driver may be late; each is kept per vehicle
+
+
+class DriverModel(Controller):
+    """Base of human drivers: each has its own (v0, T), noise and a reaction delay.
+
+    Every vehicle draws a driver of the population by the episode's seed, unless ``(role,
+    "driver")`` is given to ``env.reset``; or all are the one driver that ``desired_speed`` and
+    ``time_gap`` describe. Constants of the episode under the role, ``[*batch, n, 1]``: driver,
+    desired_speed [m/s], desired_time_gap [s]; of other models than the IDM behind a leader also
+    equilibrium_gap, at which the driver follows at the leader's first speed [m]. With a delay,
+    ``(role, "motion_history")``, ``[*batch, n, 3 · delay]``, holds past speeds [m/s], gaps [m] and
+    relative speeds [m/s], latest first.
+
+    A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
+    :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
+
+    Args:
+        population: the drivers.
+        time_step: duration of a step [s].
+        noise: largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each
+            step from U(0, noise) (A18).
+        wiener: standard deviation of a random walk of the speed [m/s per √s].
+        desired_speed: v0 of every vehicle; None: that of drivers of the population [m/s].
+        time_gap: T of every vehicle, likewise [s].
+        delay: steps by which speed, gap and relative speed are old when the driver reacts; until
+            then, those at the start of the episode.
+        parameters: those besides v0 and T, the law's constants; None: of the population.
+        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
+
+    Raises:
+        ConfigError: if a setting is out of range, one of v0 and T is given alone, or the drivers
+            of the population have other models.
+    """
+
+    law: ClassVar[DriverLaw] = IDM_LAW
+    tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
+    further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
+    desired_speeds: Tensor
+    time_gaps: Tensor
+    index: Tensor
+
+    def __init__(
+        self,
+        population: Population,
+        time_step: float,
+        noise: float = 0.05,
+        wiener: float = 0.0,
+        desired_speed: float | None = None,
+        time_gap: float | None = None,
+        delay: int = 0,
+        parameters: DriverConstants | None = None,
+        string: VehicleString | None = None,
+        role: str = HUMAN,
+    ) -> None:
+        where = f"scenario.controllers.{role}"
+        require_in(where, "[0, 1)", noise=noise)
+        require_in(where, "[0, inf)", wiener=wiener)
+        require_whole(where, 0, MOST_DELAY, delay=delay)
+        string = VehicleString((role,)) if string is None else string
+        own = _given_driver(where, desired_speed, time_gap)
+        self.drivers = self._checked(where, population, parameters, own is not None)
+        told = ["driver", "desired_speed", "desired_time_gap"]
+        self.starts = self.tells_gap and not string.ring
+        constants = [(role, name) for name in [*told, *["equilibrium_gap"] * self.starts]]
+        history = [(role, "motion_history")] * (delay > 0)
+        names = [*MOTION, *(".".join(key) for key in constants[1:3]), "episode.seed"]
+        names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
+        names += [".".join(key) for key in history]
+        super().__init__(string, role, names, history, constants, constants[:1])
+        self.noise, self.spread, self.delay = noise, wiener / time_step**0.5, delay
+        drivers = (population.desired_speed, population.time_gap) if own is None else own
+        self.noise_stream = stream_id(f"{stream_name(role)}.noise")
+        self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
+        self.driver_stream = stream_id(f"{stream_name(role)}.driver")
+        self.register_buffer("desired_speeds", drivers[0])
+        self.register_buffer("time_gaps", drivers[1])
+        self.register_buffer("index", torch.arange(self.event_shape[0]).unsqueeze(-1))
+
+    def _checked(
+        self, where: str, population: Population, given: DriverConstants | None, one: bool
+    ) -> DriverConstants:
+        """Return the law's constants; refuse drivers that were calibrated by other models."""
+        models = getattr(population, "models", None)
+        if models and not one:
+            raise ConfigError(
+                f"{where}: the population holds drivers of the model(s) "
+                f"{', '.join(sorted(set(models)))}, expected IDM drivers; "
+                f"controller@{where}=calibrated drives each by its own model"
+            )
+        found = population.constants if given is None else given
+        if not isinstance(found, self.law.constants):
+            expected = self.law.constants.__name__
+            raise ConfigError(f"{where}.parameters: expected {expected}, got {found!r}")
+        if any(isinstance(value, Tensor) for value in vars(found).values()):
+            raise ConfigError(
+                f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
+                "drivers.mode=local), got a population in which they differ by driver; "
+                f"controller@{where}=calibrated drives each by its own"
+            )
+        return found
+
+    def command(
+        self,
+        speed: Tensor,
+        gap: Tensor,
+        relative_speed: Tensor,
+        desired_speed: Tensor,
+        time_gap: Tensor,
+        seed: Tensor,
+        step: Tensor,
+        *more: Tensor,
+    ) -> Any:
+        """Return the commands, and the history where it is kept."""
+        motion = (speed, gap, relative_speed)
+        kept = None
+        if self.delay:
+            *more, history = more  # type: ignore[assignment]
+            now = torch.cat(motion, -1)
+            # Before the first step nothing else was ever seen.
+            past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.delay), history)
+            motion = past[..., -3:].split(1, -1)
+            kept = torch.cat([now, past[..., :-3]], -1)
+        command = self.acceleration(*motion, desired_speed, time_gap, *more)
+        if self.noise:
+            draw = uniform(seed, step, self.noise_stream + self.index)
+            command = command * (1.0 + self.noise * draw)
+        if self.spread:
+            command = command + self.spread * normal(seed, step, self.wiener_stream + self.index)
+        return command if kept is None else (command, kept)
+
+    def acceleration(
+        self,
+        speed: Tensor,
+        gap: Tensor,
+        relative_speed: Tensor,
+        desired_speed: Tensor,
+        time_gap: Tensor,
+        *more: Tensor,
+    ) -> Tensor:
+        """Return what the drivers wish without noise [m/s²], all ``[*batch, n, 1]``."""
+        return self.law.acceleration(
+            speed, gap, -relative_speed, desired_speed, time_gap, self.drivers
+        )
+
+    def equilibrium_gap(
+        self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
+    ) -> Tensor:
+        """Return the gap at which drivers follow steadily [m], all ``[*batch, n, 1]``."""
+        return self.law.equilibrium_gap(speed, desired_speed, time_gap, self.drivers, LONGEST)
+
+    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        specs = super().written_specs(batch, device)
+        for key in self.targets[1:]:
+            shape = (*batch, self.event_shape[0], 3 * self.delay)
+            specs[key] = Unbounded(shape=shape, device=device)
+        return specs
+
+    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        specs = super().constant_specs(batch, device)
+        shape = (*batch, *self.event_shape)
+        specs[self.constants[0]] = Unbounded(shape=shape, dtype=torch.int64, device=device)
+        return specs
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        super().begin(given, start)
+        driver = given.get(self.reset_options[0], None)
+        count = len(self.desired_speeds)
+        if driver is None:
+            seed = start.get(SEED).unsqueeze(-2)
+            driver = choose(seed, count, self.driver_stream + self.index)
+        else:
+            require_option(self.reset_options[0], driver, count)
+        values = [driver, self.desired_speeds[driver], self.time_gaps[driver]]
+        if self.starts:
+            speed = start.get(LEADER_SPEED).unsqueeze(-2).expand_as(values[1])
+            values.append(self.equilibrium_gap(speed, values[1], values[2], driver))
+        for key, value in zip(self.constants, values, strict=True):
+            start.set(as_key(key), value)
+
+
+def _given_driver(
+    where: str, desired_speed: float | None, time_gap: float | None
+) -> tuple[Tensor, Tensor] | None:
+    """Return v0 and T as a population of one, None where neither is given."""
+    if desired_speed is None and time_gap is None:
+        return None
+    if desired_speed is None or time_gap is None:
+        raise ConfigError(f"{where}: desired_speed and time_gap belong together: give both or none")
+    require_positive(where, desired_speed=desired_speed, time_gap=time_gap)
+    return torch.tensor([float(desired_speed)]), torch.tensor([float(time_gap)])
+
+
+class IDM(DriverModel):
+    """Drivers of the Intelligent Driver Model (A3–A4); arguments as of :class:`DriverModel`."""
+
+
+class OVM(DriverModel):
+    """Drivers of the optimal velocity model, see :func:`lcc_rl.functional.ovm.ovm_acceleration`.
+
+    It does not regard the speed difference, and may collide. Arguments as of :class:`DriverModel`.
+    """
+
+    law = OVM_LAW
+    tells_gap = True
+
+
+class FVDM(DriverModel):
+    """Drivers of the full velocity difference model; arguments as of :class:`DriverModel`.
+
+    See :func:`lcc_rl.functional.ovm.fvdm_acceleration`.
+    """
+
+    law = FVDM_LAW
+    tells_gap = True
+
+
+class Gipps(DriverModel):
+    """Drivers of Gipps' model, see :func:`lcc_rl.functional.gipps.gipps_acceleration`.
+
+    Arguments as of :class:`DriverModel`.
+    """
+
+    law = GIPPS_LAW
+    tells_gap = True

@@ -1,0 +1,199 @@
+"""Human drivers of every model: in any role, with noise, late, and mixed in one population."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import MIXED, POPULATION, compose, wavy_profiles
+from torchrl.envs import check_env_specs
+
+from lcc_rl.data.profiles import from_records
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import constant_profiles
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.laws import LAWS
+from lcc_rl.functional.ovm import OVMConstants
+from lcc_rl.pieces import IDM, OVM, CalibratedDrivers
+
+MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
+EACH = pytest.mark.parametrize("model", list(MODELS))
+QUIET = "scenario.controllers.human.noise=0"
+MOTION = ("speed", "gap", "relative_speed")
+
+
+def human(controller: str, *more: str):
+    """Return the configuration of three human drivers of one controller."""
+    choice = f"controller@scenario.controllers.human={controller}"
+    return compose("direct", choice, "scenario.string=human*3", *more)
+
+
+def rolled(cfg, profiles=None, population=POPULATION, steps=20, batch=4, seed=0):
+    """Play a few steps."""
+    env = build_env(cfg, profiles or wavy_profiles(), population, batch, seed, nominal=True)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def steady(speed: float = 4.0):
+    """Return a leader at a speed that every driver wants to exceed."""
+    return constant_profiles(speed, 400, 0.1, ["steady"])
+
+
+@pytest.mark.parametrize("controller", [*MODELS.values(), "calibrated"])
+@pytest.mark.parametrize("delay", [0, 4])
+def test_every_model_passes_torchrls_check_in_any_role(controller, delay) -> None:
+    late = f"scenario.controllers.human.delay={delay}"
+    population = MIXED if controller == "calibrated" else POPULATION
+    env = build_env(human(controller, late), wavy_profiles(), population, 2)
+    check_env_specs(env)
+    other = f"scenario.controllers.automated.delay={delay}"
+    choice = f"controller@scenario.controllers.automated={controller}"
+    people = f"controller@scenario.controllers.human={controller}"
+    cfg = compose("alcc", choice, other, people)
+    check_env_specs(build_env(cfg, wavy_profiles(), population, 2))
+
+
+@EACH
+def test_drivers_start_at_their_equilibrium_and_stay(model) -> None:
+    cap = "scenario.start.human.cap_time_gap=100"
+    data = rolled(human(MODELS[model], QUIET, cap), steady(), batch=64, seed=3)
+    assert data["next", "command", "human"].abs().max() < 1e-3
+
+
+def test_calibrated_drivers_start_at_their_own_equilibrium() -> None:
+    cfg = human("calibrated", QUIET, "scenario.start.human.cap_time_gap=100")
+    data = rolled(cfg, steady(), MIXED, batch=32)
+    assert data["next", "command", "human"].abs().max() < 1e-3
+    assert set(data["human", "driver"].flatten().tolist()) == set(range(8))
+
+
+@EACH
+def test_a_delay_replays_the_same_law_on_what_was(model) -> None:
+    delay = 3
+    data = rolled(human(MODELS[model], QUIET, f"scenario.controllers.human.delay={delay}"))
+    seen = {name: data["vehicles", name] for name in MOTION}
+    law, own = LAWS[model], LAWS[model].constants()
+    for step in range(12):
+        speed, gap, relative = (values[:, max(step - delay, 0)] for values in seen.values())
+        drivers = (data["human", name][:, step] for name in ("desired_speed", "desired_time_gap"))
+        expected = law.acceleration(speed, gap, -relative, *drivers, own)
+        assert torch.equal(data["next", "command", "human"][:, step], expected), step
+
+
+def test_a_delay_makes_a_string_less_stable() -> None:
+    time = torch.arange(600) * 0.1
+    dip = 15.0 - 3.0 * torch.exp(-(((time - 15.0) / 3.0) ** 2))
+    profiles = from_records([dip], ["dip"], ["dip"], 0.1)
+    base = ["scenario.string=human*8", "scenario.horizon=500", QUIET]
+    one = ["scenario.controllers.human.desired_speed=30", "scenario.controllers.human.time_gap=1.2"]
+    lowest = []
+    for delay in (0, 8):
+        cfg = compose("direct", *base, *one, f"scenario.controllers.human.delay={delay}")
+        cfg.scenario.pieces.leader.start = "first"
+        speed = rolled(cfg, profiles, steps=500, batch=1)["next", "vehicles", "speed"]
+        lowest.append(float(speed[..., -1, :].min()))
+    assert lowest[1] < lowest[0] - 0.3
+
+
+@EACH
+def test_noise_is_that_of_the_paper_for_every_model(model) -> None:
+    quiet = rolled(human(MODELS[model], QUIET), steps=1, batch=64)["next", "command", "human"]
+    noisy = rolled(human(MODELS[model], QUIET.replace("=0", "=0.3")), steps=1, batch=64)
+    ratio = (noisy["next", "command", "human"] / quiet)[quiet.abs() > 1e-3]
+    assert ratio.min() >= 1.0 - 1e-5
+    assert ratio.max() < 1.3 + 1e-5
+    assert ratio.mean() == pytest.approx(1.15, abs=0.05)
+    walk = "scenario.controllers.human.wiener=0.5"
+    moved = rolled(human(MODELS[model], QUIET, walk), steps=1, batch=256)
+    same = rolled(human(MODELS[model], QUIET), steps=1, batch=256)
+    added = (moved["next", "command", "human"] - same["next", "command", "human"]) * 0.1**0.5
+    assert added.std().item() == pytest.approx(0.5, rel=0.1)
+
+
+def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:
+    data = rolled(human("calibrated", QUIET), population=MIXED, batch=16)
+    own, driver = MIXED.parameters(), data["human", "driver"]
+    speed, gap, relative = (data["vehicles", name] for name in MOTION)
+    command = data["next", "command", "human"]
+    for number, model in enumerate(MIXED.models):
+        law, chosen = LAWS[model], driver == number
+        values = {name: float(x[number]) for name, x in own.items()}
+        constants = law.constants(**{name: values[name] for name in law.shared})
+        expected = law.acceleration(
+            *(speed[chosen], gap[chosen], -relative[chosen]),
+            *(values["desired_speed"], values["time_gap"], constants),
+        )
+        torch.testing.assert_close(command[chosen], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_gradient_through_a_mixture_is_finite() -> None:
+    piece = CalibratedDrivers(MIXED, 0.1)
+    shape = (8, 1, 1)
+    motion = [torch.full(shape, x, requires_grad=True) for x in (10.0, 15.0, 1.0)]
+    driver = torch.arange(8).view(shape)
+    own = (MIXED.desired_speed[driver], MIXED.time_gap[driver])
+    piece.acceleration(*motion, *own, driver).sum().backward()
+    assert all(x.grad.isfinite().all() for x in motion)
+
+
+def test_calibrated_idm_drivers_are_those_of_the_idm() -> None:
+    by_idm = rolled(human("human"))
+    by_table = rolled(human("calibrated"))
+    for key in (("vehicles", "speed"), ("human", "driver")):
+        assert torch.equal(by_idm["next", key], by_table["next", key])
+    # A globally calibrated population drives, too.
+    data = rolled(human("calibrated"), population=bootstrap(mode="global"))
+    assert data["next", "vehicles", "speed"].isfinite().all()
+    with pytest.raises(ConfigError, match=r"differ by driver.*=calibrated"):
+        rolled(human("human"), population=bootstrap(mode="global"))
+
+
+@EACH
+def test_a_model_refuses_drivers_of_another_population(model) -> None:
+    with pytest.raises(ConfigError, match=r"fvdm, gipps, idm, ovm.*=calibrated"):
+        rolled(human(MODELS[model]), population=MIXED)
+    one = [f"scenario.controllers.human.{name}=20" for name in ("desired_speed", "time_gap")]
+    assert rolled(human(MODELS[model], *one), population=MIXED, steps=2).shape == (4, 2)
+
+
+@pytest.mark.parametrize(
+    ("controller", "override", "words"),
+    [
+        ("ovm", "scenario.controllers.human.parameters.sensitivity=0", "sensitivity"),
+        ("ovm", "+scenario.controllers.human.parameters.deceleration=1", "deceleration"),
+        ("gipps", "scenario.controllers.human.delay=-1", "delay"),
+        ("gipps", "scenario.controllers.human.delay=0.5", "delay"),
+        ("fvdm", "scenario.controllers.human.noise=1", "noise"),
+        ("fvdm", "scenario.controllers.human.time_gap=1", "belong together"),
+        ("calibrated", "scenario.controllers.human.wiener=-1", "wiener"),
+        ("calibrated", "+scenario.controllers.human.time_gap=1", "time_gap"),
+    ],
+)
+def test_bad_settings_end_in_one_clear_error(controller, override, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        rolled(human(controller, override))
+
+
+def test_parameters_of_another_model_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"parameters: expected IDMConstants, got OVMConstants"):
+        IDM(POPULATION, 0.1, parameters=OVMConstants())
+    with pytest.raises(ConfigError, match=r"parameters: expected OVMConstants, got IDMConstants"):
+        OVM(POPULATION, 0.1)
+
+
+def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:
+    cfg = compose(
+        "reference",
+        "scenario=ring",
+        "controller@scenario.controllers.automated=handover",
+        "scenario.controllers.human.delay=2",
+        "scenario.string=automated human*3",
+        "scenario.horizon=20",
+    )
+    check_env_specs(build_env(cfg, steady(), POPULATION, 2))
+
+
+def test_a_population_keeps_models_when_drivers_are_selected() -> None:
+    chosen = MIXED.select(torch.tensor([3, 1]))
+    assert chosen.models == ("gipps", "ovm")
+    assert chosen.parameters()["sensitivity"].isnan().tolist() == [True, False]
