@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from lcc_rl.config import load
-from lcc_rl.data.drives import COLUMNS, DriveLeaders, hashed, read_drives
+from lcc_rl.data.drive_tables import COLUMNS, read_drives
+from lcc_rl.data.drives import DriveLeaders, hashed
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 
