@@ -83,7 +83,7 @@ class NgsimSource:
             raise DataError(f"{source}: {error}") from error
         remedy = "" if self.smoothing else f", smooth it ({SMOOTHING}),"
         lines = [*trajectories.report.lines(), *report.lines()]
-        return _plausible(self.plausible, episodes, source, lines, remedy)
+        return plausible_episodes(self.plausible, episodes, source, lines, remedy)
 
 
 @dataclass(frozen=True)
@@ -109,17 +109,17 @@ class EpisodesSource:
         episodes = read_episodes(path)
         count = episodes["episode"].nunique()
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}"]
-        return _plausible(self.plausible, episodes, str(path), lines)
+        return plausible_episodes(self.plausible, episodes, str(path), lines)
 
 
-def _plausible(
+def plausible_episodes(
     limits: Plausible | None,
     episodes: pd.DataFrame,
     source: str,
     lines: list[str],
     remedy: str = "",
 ) -> LoadedEpisodes:
-    """Leave out implausible episodes, and say so."""
+    """Leave out implausible episodes, and say so; see :meth:`Plausible.select`."""
     place = pair_place(episodes)
     kept, said = (limits or Plausible()).select(episodes, source, place, remedy=remedy)
     return LoadedEpisodes(kept, [*lines, *said])
