@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl.data.car_following import Criteria, extract
-from lcc_rl.data.episodes import read_episodes
+from lcc_rl.data.episodes import load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
 from lcc_rl.data.trajectories import Trajectories
@@ -88,7 +88,7 @@ class NgsimSource:
 
 @dataclass(frozen=True)
 class EpisodesSource:
-    """Episodes from a parquet file.
+    """Episodes from a parquet or CSV file.
 
     Args:
         path: see :func:`lcc_rl.data.episodes.read_episodes`.
@@ -106,9 +106,9 @@ class EpisodesSource:
                 implausible than ``plausible`` allows.
         """
         path = Path(self.path).expanduser()
-        episodes = read_episodes(path)
+        episodes, notes = load_episodes(path)
         count = episodes["episode"].nunique()
-        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}"]
+        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}", *notes]
         return plausible_episodes(self.plausible, episodes, str(path), lines)
 
 

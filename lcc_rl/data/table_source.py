@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.delimited import stem
+from lcc_rl.data.episodes import DERIVED, derive_positions
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.sources import LoadedEpisodes, find_files, plausible_episodes
 from lcc_rl.data.table_rows import Rows, to_trajectories
@@ -168,27 +169,9 @@ def episodes_of(
         raise DataError(f"{source}: {error}") from error
     lines = [*report.lines(), *extraction.lines()]
     if not trajectories.samples["position_m"].to_numpy().any():
-        place(episodes)
-        lines.append("no positions given: those of leaders are the integral of their speeds")
+        derive_positions(episodes)
+        lines.append(DERIVED)
     return plausible_episodes(plausible, episodes, source, lines, remedy)
-
-
-def place(episodes: pd.DataFrame) -> None:
-    """Write positions that agree with speeds and gaps: the leader's is 0 m at an episode's start.
-
-    Args:
-        episodes: see :mod:`lcc_rl.data.episodes`; changed in place.
-    """
-    speed = episodes["leader_speed_mps"].to_numpy(np.float64)
-    time = episodes["time_s"].to_numpy(np.float64)
-    first = episodes["episode"].ne(episodes["episode"].shift()).to_numpy()
-    way = np.append(0.0, (speed[1:] + speed[:-1]) / 2 * np.diff(time))
-    way[first] = 0.0
-    total = np.cumsum(way)
-    position = total - np.repeat(total[first], np.diff(np.append(np.flatnonzero(first), len(way))))
-    behind = episodes["gap_m"].to_numpy() + episodes["leader_length_m"].to_numpy()
-    episodes["leader_position_m"] = position.astype(np.float32)
-    episodes["follower_position_m"] = (position - behind).astype(np.float32)
 
 
 def _recording(table: Table, tables: Sequence[Table]) -> str:
