@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import gzip
+import os
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
@@ -95,6 +97,21 @@ class Delimited:
             ) from error
 
 
+def unpacked_size(name: str) -> int:
+    """Return the bytes of a file, of a compressed one those of its content; 0 for none."""
+    if not Path(name).is_file():  # a pipe would be waited for; who reads it says so
+        return 0
+    with suppress(OSError), open(name, "rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+        size = file.seek(0, os.SEEK_END)
+        if not packed:
+            return size
+        file.seek(max(0, size - 4))
+        # Of the content, modulo 4 GiB, which is never less than the file itself.
+        return max(size, int.from_bytes(file.read(4), "little"))
+    return 0
+
+
 def unpacked(file: Path) -> bytes:
     """Return the content of a plain or gzipped file.
 
@@ -102,14 +119,9 @@ def unpacked(file: Path) -> bytes:
         DataError: if it cannot be read or is damaged.
         ConfigError: if it does not fit into memory.
     """
+    require_memory({f"reading {file}": TAKEN * unpacked_size(str(file))})
     try:
         with opened(str(file)) as stream:
-            size = file.stat().st_size
-            if isinstance(stream, gzip.GzipFile):  # its content's size, modulo 4 GiB, ends it
-                with open(file, "rb") as raw:
-                    raw.seek(max(0, size - 4))
-                    size = max(size, int.from_bytes(raw.read(4), "little"))
-            require_memory({f"reading {file}": TAKEN * size})
             return stream.read()
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{file}: the compressed file is damaged or cut off: {error}") from error

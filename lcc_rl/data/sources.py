@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from glob import glob, has_magic
 from pathlib import Path
@@ -12,14 +10,13 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl.data.car_following import Criteria, extract
+from lcc_rl.data.delimited import TAKEN, unpacked_size
 from lcc_rl.data.episodes import load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.memory import require_memory
-
-READ = 3  # bytes of memory that reading a byte of text takes
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class NgsimSource:
             )
         files = find_files(self.path)
         if self.location is None:  # of one location of several, nobody knows how much there is
-            require_memory({f"reading {name}": READ * unpacked_size(name) for name in files})
+            require_memory({f"reading {name}": TAKEN * unpacked_size(name) for name in files})
         trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
@@ -123,21 +120,6 @@ def plausible_episodes(
     place = pair_place(episodes)
     kept, said = (limits or Plausible()).select(episodes, source, place, remedy=remedy)
     return LoadedEpisodes(kept, [*lines, *said])
-
-
-def unpacked_size(name: str) -> int:
-    """Return the bytes of a file, of a compressed one those of its content; 0 for none."""
-    if not Path(name).is_file():  # a pipe would be waited for; who reads it says so
-        return 0
-    with suppress(OSError), open(name, "rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-        size = file.seek(0, os.SEEK_END)
-        if not packed:
-            return size
-        file.seek(max(0, size - 4))
-        # Of the content, modulo 4 GiB, which is never less than the file itself.
-        return max(size, int.from_bytes(file.read(4), "little"))
-    return 0
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:

@@ -15,6 +15,8 @@ from lcc_rl.errors import DataError
 
 UNEVEN = 0.1  # of a step, by which a time may be off the common grid
 HOLE = 1.5  # of the usual step; a longer one is a missing sample
+LONGEST = 10.0  # s; samples farther apart tell of no following
+LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
 LEAST_WAY = 50.0  # m, below which that is not compared
 EXACT, ALONE = "exact duplicate (vehicle, time)", "stretch without a sample on the time grid"
@@ -88,6 +90,13 @@ def to_trajectories(rows: Rows, names: list[str], report: ReadReport) -> Traject
     origin = np.array([rows.time[rows.recording == code].min() for code in range(len(names))])
     segment = np.append(0, np.cumsum(cut))
     place = (rows.time - origin[rows.recording]) / FRAME
+    late = place > LAST
+    if late.any():
+        row = int(np.argmax(late))
+        raise DataError(
+            f"{_place(rows, row, names, report)} is {FRAME * place[row]:g} s after the first; "
+            "is the time in another unit?"
+        )
     frame = np.rint(place).astype(np.int64)
     if abs(step - FRAME) > UNEVEN * FRAME or np.abs(place - frame).max() > UNEVEN:
         rows, frame, segment = _interpolated(rows, place, segment, report)
@@ -145,6 +154,11 @@ def _stretches(rows: Rows, names: list[str], report: ReadReport) -> tuple[float,
             f"{', '.join(report.files)}: no vehicle has two samples; expected trajectories"
         )
     step = float(np.median(steps[inner]))
+    if step > LONGEST:
+        raise DataError(
+            f"{', '.join(report.files)}: samples of a vehicle are {step:g} s apart; expected at "
+            f"most {LONGEST:g} s; is the time in another unit?"
+        )
     short = inner & (steps < step / 2)
     if short.any():
         row = int(np.argmax(short)) + 1
@@ -198,7 +212,7 @@ def _interpolated(
     first = np.maximum(first, 0)
     after = np.minimum(first + 1, len(rows) - 1)
     weight = np.zeros(len(first))
-    inside = segment[after] == segment[first]
+    inside = (segment[after] == segment[first]) & (after > first)
     span = np.where(inside, place[after] - place[first], 1.0)
     weight[inside] = ((frame - place[first]) / span)[inside].clip(0.0, 1.0)
     weight[weight < 1e-5] = 0.0

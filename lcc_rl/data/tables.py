@@ -20,6 +20,7 @@ from lcc_rl.io.memory import require_memory
 
 PARQUET = (".parquet", ".pq")
 UNPACKED = 8  # bytes of memory that reading a byte of parquet takes
+LARGEST = 1e12  # in SI: beyond any time or place, and within every type
 SHOWN = 40  # names of columns that a message lists
 
 
@@ -68,7 +69,9 @@ class Table:
         values = np.asarray(numbers.to_numpy(), dtype=np.float64)
         wrong = np.isinf(values) if blank else ~np.isfinite(values)
         self.refuse(wrong, key, "is not a number")
-        return values * factor
+        values = values * factor
+        self.refuse(np.abs(values) > LARGEST, key, f"is beyond {LARGEST:g}")
+        return values
 
     def texts(self, key: str, blank: bool = False) -> NDArray:
         """Return a column as text, ``""`` for blank; refused unless ``blank``.

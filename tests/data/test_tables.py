@@ -188,6 +188,9 @@ WRONG = {
         "data row 501 and data row 500 differ, but are of one vehicle",
     ),
     "close": (change(500, t=9.91), r"data row 501 is 0\.01 s after the sample before it"),
+    "huge": (change(500, v=1e20), r"data row 501, column 'v' is beyond 1e\+12"),
+    "late": (change(1199, t=1e11), r"data row 1200 is 1e\+11 s after the first"),
+    "ms": (lambda frame: frame.assign(t=1e3 * frame["t"]), "are 100 s apart; .*another unit"),
     "missing": (
         lambda frame: frame.rename(columns={"v": "V"}),
         r"lacks the column v; .*'V' for 'v'",
