@@ -83,6 +83,8 @@ def _read(
 
     kept, lines = (plausible or Plausible()).select(samples, str(file), place, LEADER)
     line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {file}"
+    if table.preamble:
+        line += ": native OpenACC, its first car"
     return kept.assign(file=str(file)), [line, *table.notes, *said, *lines]
 
 

@@ -81,7 +81,8 @@ def _cars(table: Table, recording: int, report: ReadReport) -> Rows:
     leader = np.broadcast_to(np.arange(count)[:, None], speed.shape)
     unknown = int((np.isnan(gap[1:]) & seen[1:]).sum())
     report.rows_read += speed.size
-    report.dropped[NO_SPEED] = report.dropped.get(NO_SPEED, 0) + int((~seen).sum())
+    if not seen.all():
+        report.dropped[NO_SPEED] = report.dropped.get(NO_SPEED, 0) + int((~seen).sum())
     report.notes += table.notes
     order = table.preamble.get("Vehicle_order", "").strip(", ").replace(",", ", ")
     report.notes.append(f"{table.file}: {count} cars{': ' if order else ''}{order}")

@@ -14,6 +14,7 @@ from lcc_rl.config import build, load
 from lcc_rl.data.episodes import read_episodes, validate_episodes
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
+from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
@@ -339,6 +340,13 @@ def test_its_first_car_leads(openacc, tmp_path) -> None:
     assert drives == {f"file{number}" for number in range(12)}
     assert not set(inputs.training.recordings) & set(inputs.evaluation.recordings)
     assert any("left out 1 rows with a blank Speed1" in line for line in inputs.report)
+
+
+def test_a_record_too_short_for_the_cut_at_900_s_names_the_way_out(openacc) -> None:
+    with pytest.raises(DataError, match=r"covers 430–469\.9 s, .* leader=record takes a record of"):
+        load_inputs(load("train", ["variant=cacc", "leader=openacc", f"leader.path={openacc}"]))
+    time, own = read_speed_record(openacc)
+    np.testing.assert_allclose(own, speed(time - 430, 1))
 
 
 def test_a_real_openacc_file(shared_data) -> None:
