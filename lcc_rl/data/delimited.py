@@ -53,6 +53,8 @@ class Delimited:
             content = single_spaces(content)
         first, _, self.rows = content.partition(b"\n")
         self.header = [name.strip() for name in _cells(first, self.separator)]
+        if not self.header:
+            raise DataError(f"{file}: not a readable table: the first line names no columns")
         self.decimal_comma = self.separator == ";" and b"," in self.rows and b"." not in self.rows
         self.notes = []
         if self.separator != ",":
@@ -146,7 +148,10 @@ def _preamble(content: bytes) -> tuple[dict[str, str], bytes]:
 
 
 def _cells(line: bytes, separator: str) -> list[str]:
-    return next(csv.reader([line.decode().rstrip("\r\n")], delimiter=separator), [])
+    """Cells of a line; none of one that cannot be divided, as with a stray line end in it."""
+    with suppress(csv.Error):
+        return next(csv.reader([line.decode().rstrip("\r\n")], delimiter=separator), [])
+    return []
 
 
 def _separator(content: bytes) -> str:

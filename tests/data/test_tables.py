@@ -227,6 +227,7 @@ def test_what_is_wrong_with_a_table_is_said(tmp_path, case) -> None:
         (b"", "it is empty|: empty; expected"),
         (b"id,t,v,ahead,gap\n1,0,1,0\n", "data row 1 has 4 columns; expected 5"),
         (b"id,t,v,ahead,gap\n1,0,\xff,0,1\n", "line 2 is not text"),
+        (b"id,t\r,v\n1,0,5\n", "the first line names no columns"),
         (b"1,0,5,0,1\n1,0.1,5,0,1\n", "its first line holds numbers"),
     ],
 )
