@@ -23,7 +23,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution, minimize
 
-from lcc_rl.data.drives import COLUMNS, DriveLeaders, hashed, read_drives
+from lcc_rl.data.drive_tables import COLUMNS, read_drives
+from lcc_rl.data.drives import DriveLeaders, hashed
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
 from lcc_rl.data.units import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap

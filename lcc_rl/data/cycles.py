@@ -97,7 +97,8 @@ def stretch(
         raise ConfigError(f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
     if begin < time[0] or end > time[-1] + 1e-6:
         raise DataError(
-            f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s"
+            f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s; "
+            "leader=record takes a record of any length"
         )
     limit = (plausible or Plausible()).max_speed
     if scale * speed.max() > limit:

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
 
 from lcc_rl.data.cycles import Leaders, varying
+from lcc_rl.data.drive_tables import COLUMNS, UNITS, read_drives
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, nothing
-from lcc_rl.data.speed_records import LEADER, SPEED, TIME, resample
+from lcc_rl.data.units import factors
 from lcc_rl.errors import ConfigError, DataError, require_in, unknown_name
-
-# What a table of drives has, and how the columns are called by default.
-COLUMNS = {"drive": "drive", "time": TIME, "speed": SPEED}
-UNEVEN = 0.1  # of the median step, by which a step may differ from it
 
 
 @dataclass(frozen=True)
@@ -32,9 +26,12 @@ class DriveLeaders:
     every file. Of a single record the end is held out.
 
     Args:
-        path: a .csv or .parquet file.
+        path: a .csv or .parquet file, of drives also several or a pattern. A native OpenACC file
+            is the drive of its first car, named after the file.
         columns: what its columns are called: ``drive``, the name of the record, null for a table
-            that holds one record; ``time`` [s], even in a record; ``speed`` [m/s].
+            that holds one record; ``time``, even in a record; ``speed``.
+        units: of the columns ``time`` and ``speed``, such as ``{"speed": "km/h"}``; s and m/s
+            where they are not named.
         evaluation_share: share of the names, or of the single record, that is held out, 0…1; 1
             evaluates on everything and leaves nothing to train on.
         together: regular expression; drives whose names begin with the same match are on the same
@@ -49,8 +46,9 @@ class DriveLeaders:
         ConfigError: if a column is unknown, a number out of range or the expression is none.
     """
 
-    path: str
+    path: str | Sequence[str]
     columns: Mapping[str, str | None] = field(default_factory=lambda: dict(COLUMNS))
+    units: Mapping[str, str] = field(default_factory=lambda: dict(UNITS))
     evaluation_share: float = 1 / 3
     together: str | None = None
     tuning: bool = False
@@ -76,15 +74,17 @@ class DriveLeaders:
                 raise unknown_name("key of leader.columns", str(key), COLUMNS)
             if not (isinstance(name, str) or (key == "drive" and name is None)):
                 raise ConfigError(f"leader.columns.{key} must name a column, got {name!r}")
+        factors(self.units, COLUMNS, "leader.units")
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read everything; see :meth:`lcc_rl.data.cycles.RecordLeaders.load`."""
         columns = {**COLUMNS, **self.columns}
-        profiles, report = read_drives(self.path, columns, time_step, self.plausible)
+        profiles, report = read_drives(self.path, columns, time_step, self.plausible, self.units)
         divide = self._by_time if columns["drive"] is None else self._by_name
         training, held_out = divide(profiles)
         if self.tuning:
             training, held_out = divide(training, again=True)
+        self._check_lengths(profiles, (training, held_out), horizon)
         windows = varying(held_out.at_least(horizon).windows(horizon), self.least_variation)
         windows = slow(windows, self.fastest)
         if len(training):
@@ -94,10 +94,30 @@ class DriveLeaders:
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
         return Leaders(training, windows, report=(*report, line))
 
+    def _check_lengths(self, all_: Profiles, parts: Sequence[Profiles], horizon: int) -> None:
+        """Check that both sides hold a record of an episode's length; say what can be done."""
+        step = all_.time_step
+        whole, *sides = (int(x.lengths.max()) - 1 if len(x) else horizon for x in (all_, *parts))
+        shortest = min(sides)
+        if shortest >= horizon:
+            return
+        needs = f"shorter than the horizon: an episode needs {horizon} steps ({horizon * step:g} s)"
+        has = f"the longest record has {whole} ({whole * step:g} s)"
+        lower = f"lower scenario.horizon to at most {max(1, min(whole, shortest))}"
+        if whole < horizon:
+            lower = f"lower scenario.horizon to at most {whole}"
+            raise DataError(f"{self.path}: {needs}, {has}; {lower} or give longer records")
+        side = ("training", "evaluation")[sides.index(shortest)]
+        raise DataError(
+            f"{self.path}: {needs}, {has}, its part for {side} only {shortest}; {lower}, give "
+            "longer records, or say leader.evaluation_share=1 to evaluate on all of it and train "
+            "on nothing"
+        )
+
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; once more for tuning."""
         share = self.evaluation_share
-        place = np.array([hashed(self._family(name)) for name in profiles.names])
+        place = np.array([hashed(self._family(name)) for name in profiles.recordings])
         if again:  # what is left lies in share…1
             place = (place - share) / (1 - share)
         held = place < share
@@ -165,98 +185,3 @@ def hashed(name: str) -> float:
     """
     digest = hashlib.sha256(f"lcc_rl held out: {name}".encode()).digest()
     return int.from_bytes(digest[:6], "big") / 2**48
-
-
-def read_drives(
-    path: str,
-    columns: Mapping[str, str | None],
-    time_step: float,
-    plausible: Plausible | None = None,
-) -> tuple[Profiles, list[str]]:
-    """Read the speed records of a table.
-
-    Args:
-        path, columns, plausible: see :class:`DriveLeaders`.
-        time_step: step of the profiles [s]; the records are interpolated to it.
-
-    Returns:
-        A profile for each record, in the order of their names, and lines on what was read.
-
-    Raises:
-        DataError: naming file, row and column, if a value is missing, no number or negative, a
-            time is there twice, the steps of a record are uneven, or too much is implausible.
-    """
-    file = Path(path).expanduser()
-    table = _sound(_table(file, columns), columns, str(file))
-    names, row = table["name"], table["row"].to_numpy()
-
-    def place(number: int, column: str) -> str:
-        own = {TIME: columns["time"], SPEED: columns["speed"]}.get(column, column)
-        return f"data row {row[number] + 1} ({names.iloc[number]}), column {own!r}"
-
-    kept, lines = (plausible or Plausible()).select(table, str(file), place, LEADER)
-    groups = list(kept.groupby("name", sort=True))
-    records = [
-        resample(part[TIME].to_numpy(), part[SPEED].to_numpy(), time_step) for _, part in groups
-    ]
-    labels = [str(name) for name, _ in groups]
-    line = f"read {len(groups):,} speed record(s), {len(kept):,} rows, {file}"
-    return from_records(records, labels, labels, time_step), [line, *lines]
-
-
-def _table(file: Path, columns: Mapping[str, str | None]) -> pd.DataFrame:
-    """Columns of a file as they stand there, all names as text."""
-    if not file.is_file():
-        raise DataError(f"{file}: no such file; expected a .csv or .parquet of speed records")
-    drive = columns["drive"]
-    try:
-        if file.suffix == ".parquet":
-            frame = pd.read_parquet(file)
-        else:  # as text, or the drive "01" would be the number 1
-            frame = pd.read_csv(file, dtype={drive: str} if drive else None)
-    except (ValueError, OSError) as error:
-        raise DataError(f"{file}: not a readable table: {error}") from error
-    missing = [name for name in columns.values() if name is not None and name not in frame]
-    if missing:
-        raise DataError(
-            f"{file}: lacks the column {', '.join(missing)}; it has {', '.join(map(str, frame))}; "
-            "say which is which by leader.columns.drive, .time and .speed"
-        )
-    return frame
-
-
-def _sound(frame: pd.DataFrame, columns: Mapping[str, str | None], file: str) -> pd.DataFrame:
-    """Name, time, speed and row of every sample, record by record, or a DataError."""
-    drive, time, speed = (columns[key] for key in COLUMNS)
-    names = frame[drive] if drive else pd.Series(Path(file).stem, index=frame.index)
-    _refuse(names.isna().to_numpy(), np.arange(len(frame)), file, drive, "is empty")
-    table = pd.DataFrame({"name": names.astype(str).to_numpy(), "row": np.arange(len(frame))})
-    for column, own in ((TIME, time), (SPEED, speed)):
-        values = pd.to_numeric(frame[own], errors="coerce").to_numpy(np.float64)
-        _refuse(~np.isfinite(values), table["row"], file, own, "is not a number")
-        table[column] = values
-    _refuse(table[SPEED] < 0, table["row"], file, speed, "is negative")
-    if len(table) < 2:
-        raise DataError(f"{file}: holds {len(table)} samples, at least 2 are needed")
-    table = table.sort_values("name", kind="stable", ignore_index=True)
-    table["episode"] = table["name"].ne(table["name"].shift()).cumsum()
-    step = table.groupby("episode")[TIME].diff()
-    _refuse(step <= 0, table["row"], file, time, "does not follow the time before it in its record")
-    usual = step.groupby(table["episode"]).transform("median")
-    _refuse(usual.isna(), table["row"], file, time, "is the only sample of its record")
-    uneven = (step - usual).abs() > UNEVEN * usual
-    _refuse(uneven, table["row"], file, time, "is not evenly spaced in its record")
-    return table
-
-
-def _refuse(
-    wrong: NDArray[np.bool_] | pd.Series,
-    row: NDArray | pd.Series,
-    file: str,
-    column: object,
-    words: str,
-) -> None:
-    """Raise a DataError that names the first row at fault, if there is one."""
-    if np.any(wrong):
-        first = int(np.asarray(row)[np.asarray(wrong)].min())
-        raise DataError(f"{file}: data row {first + 1}, column {column!r} {words}")

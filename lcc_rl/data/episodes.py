@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lcc_rl.data.delimited import Delimited, stem
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import read_parquet, write_parquet
 
@@ -31,15 +32,20 @@ COLUMNS = tuple(SCHEMA)
 ALIASES = {"event": "episode", "period": "recording"}
 NUMBERS = tuple(name for name, kind in SCHEMA.items() if kind != "str")
 SPEEDS = ("follower_speed_mps", "leader_speed_mps")
+POSITIONS = ("leader_position_m", "follower_position_m")
+OPTIONAL = ("recording", "leader_length_m", *POSITIONS)  # in a file
+TEXT = (".csv", ".gz", ".txt", ".tsv")
+DERIVED = "no positions given: those of leaders are the integral of their speeds"
 LARGEST = 1e12  # beyond any time or place, and within every type
 
 
 def read_episodes(path: str | Path) -> pd.DataFrame:
-    """Read an episode table from a parquet file and validate it.
+    """Read an episode table from a parquet or CSV file and validate it.
 
     Args:
-        path: parquet file with the columns of ``SCHEMA``; ``event`` and ``period`` are taken for
-            ``episode`` and ``recording``. Further columns are left out.
+        path: file with the columns of ``SCHEMA``, of which those in ``OPTIONAL`` may be missing;
+            ``event`` and ``period`` are taken for ``episode`` and ``recording``. Further columns
+            are left out. CSV may be gzipped, see :class:`lcc_rl.data.delimited.Delimited`.
 
     Returns:
         Columns ``SCHEMA`` in SI: episode, recording, follower_id, leader_id, time_s, follower and
@@ -48,14 +54,75 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     Raises:
         DataError: if the file cannot be read or its content is not a valid episode table.
     """
+    return load_episodes(path)[0]
+
+
+def load_episodes(path: str | Path) -> tuple[pd.DataFrame, list[str]]:
+    """Read an episode table, see :func:`read_episodes`, and lines on what it lacks."""
+    text = Path(path).suffix in TEXT
+    frame, notes = _from_text(Path(path)) if text else (_from_parquet(path), [])
+    names = {old: new for old, new in ALIASES.items() if new not in frame.columns}
+    frame = frame.rename(columns=names)
+    lacking = [name for name in OPTIONAL if name not in frame.columns]
+    placed = not set(POSITIONS) & set(lacking)
+    filled = frame.assign(
+        **{name: stem(path) if name == "recording" else 0.0 for name in lacking if len(frame)}
+    )
+    table = validate_episodes(filled, str(path))
+    if "recording" in lacking:
+        notes.append(f"no column recording: all of {path} is one")
+    if "leader_length_m" in lacking:
+        notes.append("no column leader_length_m: lengths are not known")
+    if not placed:
+        derive_positions(table)
+        notes.append(DERIVED)
+    return table, notes
+
+
+def _from_parquet(path: str | Path) -> pd.DataFrame:
     try:
         frame = read_parquet(path)
         for name in map(str, frame.select_dtypes("str").columns):
             pa.array(frame[name]).validate(full=True)  # damaged text would fail only when used
     except Exception as error:  # a damaged parquet file raises errors of many kinds
         raise DataError(f"{path}: is not a readable episode table: {error}") from error
-    names = {old: new for old, new in ALIASES.items() if new not in frame.columns}
-    return validate_episodes(frame.rename(columns=names), str(path))
+    return frame
+
+
+def _from_text(path: Path) -> tuple[pd.DataFrame, list[str]]:
+    """The columns of a text file as text, and lines on how it is laid out."""
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected a table of episodes")
+    text = Delimited(path)
+    known = [name for name in text.header if name in (*COLUMNS, *ALIASES)]
+    twice = [name for name in known if known.count(name) > 1]
+    if twice:
+        raise DataError(f"{path}: has column {twice[0]!r} twice; expected it once")
+    places = {text.header.index(name): name for name in known}
+    frame = text.parse([*places]).to_pandas()
+    frame = frame.rename(columns={str(place): name for place, name in places.items()})
+    if text.decimal_comma:
+        for name in set(NUMBERS) & set(known):
+            frame[name] = frame[name].str.replace(",", ".")
+    others = {name: None for name in text.header if name not in known}
+    return frame.assign(**others), text.notes
+
+
+def derive_positions(episodes: pd.DataFrame) -> None:
+    """Write positions that agree with speeds and gaps: the leader's is 0 m at an episode's start.
+
+    Args:
+        episodes: the table in SI; changed in place.
+    """
+    speed = episodes["leader_speed_mps"].to_numpy(np.float64)
+    time = episodes["time_s"].to_numpy(np.float64)
+    starts = _starts(episodes["episode"].to_numpy())
+    way = np.append(0.0, (speed[1:] + speed[:-1]) / 2 * np.diff(time))
+    total = np.cumsum(way)
+    position = total - np.repeat(total[starts], np.diff(np.append(starts, len(total))))
+    behind = episodes["gap_m"].to_numpy() + episodes["leader_length_m"].to_numpy()
+    episodes["leader_position_m"] = position.astype(np.float32)
+    episodes["follower_position_m"] = (position - behind).astype(np.float32)
 
 
 def write_episodes(frame: pd.DataFrame, path: str | Path) -> None:

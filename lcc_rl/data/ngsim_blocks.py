@@ -221,7 +221,7 @@ def read_blocks(path: str | Path) -> Iterator[Block]:
             layout, lines = detect_layout(name, bare)
             first_line += layout.header
         if layout.spaced:
-            lines = _single_spaces(lines)
+            lines = single_spaces(lines)
         if lines.strip(b"\r\n"):
             empty = False
             yield Block(name, lines, first_line, layout)
@@ -235,7 +235,7 @@ def _line_chunks(name: str) -> Iterator[bytes]:
     """Whole lines of the decompressed file, some megabytes at a time."""
     rest = b""
     try:
-        with _opened(name) as file:
+        with opened(name) as file:
             while data := file.read(BLOCK_BYTES):
                 cut = data.rfind(b"\n") + 1
                 if cut:
@@ -253,7 +253,7 @@ def _line_chunks(name: str) -> Iterator[bytes]:
         yield rest
 
 
-def _opened(name: str) -> IO[bytes]:
+def opened(name: str) -> IO[bytes]:
     """Open a file, decompressed where its first bytes are those of gzip."""
     if Path(name).exists() and not Path(name).is_file():  # a pipe would be waited for
         raise DataError(f"{name}: cannot be read: a folder, pipe or device; expected a file")
@@ -269,7 +269,7 @@ def _is_text(lines: bytes) -> bool:
         return False
 
 
-def _single_spaces(lines: bytes) -> bytes:
+def single_spaces(lines: bytes) -> bytes:
     """Lines with one space between columns and none around the row."""
     lines = re.sub(rb" {2,}", b" ", lines.replace(b"\t", b" "))
     lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n").replace(b"\n ", b"\n")

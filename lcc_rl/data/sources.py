@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from glob import glob, has_magic
 from pathlib import Path
@@ -12,14 +10,13 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl.data.car_following import Criteria, extract
-from lcc_rl.data.episodes import read_episodes
+from lcc_rl.data.delimited import TAKEN, unpacked_size
+from lcc_rl.data.episodes import load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.memory import require_memory
-
-READ = 3  # bytes of memory that reading a byte of text takes
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class NgsimSource:
             )
         files = find_files(self.path)
         if self.location is None:  # of one location of several, nobody knows how much there is
-            require_memory({f"reading {name}": READ * unpacked_size(name) for name in files})
+            require_memory({f"reading {name}": TAKEN * unpacked_size(name) for name in files})
         trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
@@ -83,12 +80,12 @@ class NgsimSource:
             raise DataError(f"{source}: {error}") from error
         remedy = "" if self.smoothing else f", smooth it ({SMOOTHING}),"
         lines = [*trajectories.report.lines(), *report.lines()]
-        return _plausible(self.plausible, episodes, source, lines, remedy)
+        return plausible_episodes(self.plausible, episodes, source, lines, remedy)
 
 
 @dataclass(frozen=True)
 class EpisodesSource:
-    """Episodes from a parquet file.
+    """Episodes from a parquet or CSV file.
 
     Args:
         path: see :func:`lcc_rl.data.episodes.read_episodes`.
@@ -106,38 +103,23 @@ class EpisodesSource:
                 implausible than ``plausible`` allows.
         """
         path = Path(self.path).expanduser()
-        episodes = read_episodes(path)
+        episodes, notes = load_episodes(path)
         count = episodes["episode"].nunique()
-        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}"]
-        return _plausible(self.plausible, episodes, str(path), lines)
+        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}", *notes]
+        return plausible_episodes(self.plausible, episodes, str(path), lines)
 
 
-def _plausible(
+def plausible_episodes(
     limits: Plausible | None,
     episodes: pd.DataFrame,
     source: str,
     lines: list[str],
     remedy: str = "",
 ) -> LoadedEpisodes:
-    """Leave out implausible episodes, and say so."""
+    """Leave out implausible episodes, and say so; see :meth:`Plausible.select`."""
     place = pair_place(episodes)
     kept, said = (limits or Plausible()).select(episodes, source, place, remedy=remedy)
     return LoadedEpisodes(kept, [*lines, *said])
-
-
-def unpacked_size(name: str) -> int:
-    """Return the bytes of a file, of a compressed one those of its content; 0 for none."""
-    if not Path(name).is_file():  # a pipe would be waited for; who reads it says so
-        return 0
-    with suppress(OSError), open(name, "rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-        size = file.seek(0, os.SEEK_END)
-        if not packed:
-            return size
-        file.seek(max(0, size - 4))
-        # Of the content, modulo 4 GiB, which is never less than the file itself.
-        return max(size, int.from_bytes(file.read(4), "little"))
-    return 0
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import torch
 from torch import Tensor
 
 import lcc_rl.assets
+from lcc_rl.data.delimited import is_openacc
 from lcc_rl.data.plausible import Plausible
+from lcc_rl.data.tables import Table, read_table
 from lcc_rl.errors import DataError
 
 CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
@@ -30,7 +33,8 @@ def read_speed_record(
 
     Args:
         path: name of a shipped cycle (``udds``, ``us06``, ``wltc_3b``, ``hwfet``), or a .csv or
-            .parquet file with the columns ``time_s`` [s] and ``speed_mps`` [m/s].
+            .parquet file with the columns ``time_s`` [s] and ``speed_mps`` [m/s], or a native
+            OpenACC file, of which the first car is taken.
         plausible: thresholds that every sample must keep; None for the defaults.
 
     Returns:
@@ -47,35 +51,32 @@ def read_speed_record(
         raise DataError(
             f"{path}: no such file, and no shipped cycle ({', '.join(shipped_cycles())})"
         )
-    try:
-        frame = pd.read_parquet(file) if file.suffix == ".parquet" else pd.read_csv(file)
-    except (ValueError, OSError) as error:
-        raise DataError(f"{file}: not a readable table: {error}") from error
-    time, speed = _checked(frame, str(file))
+    table = read_table(file, named(file, {"time": TIME, "speed": SPEED}), "leader.columns")
+    time, speed = _checked(table)
     record = pd.DataFrame({"episode": 0, TIME: time, SPEED: speed})
     limits = plausible or Plausible()
     limits.select(record, str(file), lambda row, name: f"data row {row + 1}, {name}", LEADER)
     return time, speed
 
 
-def _checked(frame: pd.DataFrame, file: str) -> tuple[np.ndarray, np.ndarray]:
+def named(file: Path, columns: Mapping[str, str | None]) -> dict[str, str | None]:
+    """Return the names of a record's columns; of a native OpenACC file those of its first car."""
+    native = is_openacc(file)
+    return {
+        key: {TIME: "Time", SPEED: "Speed1"}.get(str(name), name) if native else name
+        for key, name in columns.items()
+        if not (native and key == "drive")
+    }
+
+
+def _checked(table: Table) -> tuple[np.ndarray, np.ndarray]:
     """Time and speed of a table, or a DataError."""
-    missing = {TIME, SPEED} - set(frame.columns)
-    if missing:
-        raise DataError(f"{file}: lacks the column {', '.join(sorted(missing))}")
-    try:
-        time, speed = (frame[name].to_numpy(float) for name in (TIME, SPEED))
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{file}: {TIME} and {SPEED} must be numbers: {error}") from error
+    time, speed = table.numbers("time"), table.numbers("speed")
     if len(time) < 2:
-        raise DataError(f"{file}: holds {len(time)} samples, at least 2 are needed")
-    for wrong, words in (
-        (~np.isfinite(time) | ~np.isfinite(speed), "is not a number"),
-        (speed < 0, "has a negative speed"),
-        (np.diff(time, prepend=-np.inf) <= 0, "does not follow the row before it in time"),
-    ):
-        if wrong.any():
-            raise DataError(f"{file}: data row {int(wrong.argmax()) + 1} {words}")
+        raise DataError(f"{table.file}: holds {len(time)} samples, at least 2 are needed")
+    table.refuse(speed < 0, "speed", "has a negative speed")
+    late = np.diff(time, prepend=-np.inf) <= 0
+    table.refuse(late, "time", "does not follow the row before it in time")
     return time, speed
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
 
@@ -58,3 +58,43 @@ def check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None
                 f"{', '.join(files)}: recording {name}: {what} is {published:.3g} {units}; "
                 f"expected {low:g} to {high:g} m: {remedy}"
             )
+
+
+# Units that the columns of a table may be in, by what they measure, and their size in SI.
+QUANTITIES: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
+    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600},
+    "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
+}
+# What the columns of tables measure, by their key.
+MEASURES = {
+    "time": "time",
+    "speed": "speed",
+    "position": "length",
+    "gap": "length",
+    "length": "length",
+}
+
+
+def factors(units: Mapping[str, str], keys: Iterable[str], option: str) -> dict[str, float]:
+    """Return the factor to SI of every column of numbers.
+
+    Args:
+        units: the unit by the column's key; SI for those that are not named.
+        keys: of the columns that there may be.
+        option: where the configuration has the units, for messages.
+
+    Raises:
+        ConfigError: if a key or a unit is unknown.
+
+    Examples:
+        >>> factors({"speed": "km/h"}, ["time", "speed"], "leader.units")
+        {'time': 1.0, 'speed': 0.2777777777777778}
+    """
+    known = [key for key in keys if key in MEASURES]
+    for key, unit in units.items():
+        if key not in known:
+            raise unknown_name(f"key of {option}", str(key), known)
+        if unit not in QUANTITIES[MEASURES[key]]:
+            raise unknown_name(f"unit in {option}.{key}:", str(unit), QUANTITIES[MEASURES[key]])
+    return {key: QUANTITIES[MEASURES[key]][units[key]] if key in units else 1.0 for key in known}

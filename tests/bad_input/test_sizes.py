@@ -14,16 +14,19 @@ import pytest
 import torch
 from commands import NO_AGENT, run_command, tiny
 from omegaconf import OmegaConf
+from table_text import long_table
 
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
-from lcc_rl.data.sources import unpacked_size
+from lcc_rl.data.delimited import unpacked_size
+from lcc_rl.data.table_source import TableSource
 from lcc_rl.drivers.genetic import GeneticSettings, minimise
 from lcc_rl.errors import ConfigError
 from lcc_rl.io import memory
 from lcc_rl.io.files import read_parquet
 from lcc_rl.io.memory import amount, available, require_memory
 
+BY_GAP = {"leader": "ahead", "gap": "gap"}
 NOWHERE = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": "nowhere.parquet"}
 HUGE = 10**15
 
@@ -223,6 +226,17 @@ def test_files_larger_than_memory(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(GeneticSettings, "check_memory", lambda *_: None)
     with pytest.raises(ConfigError, match=r"reading .*big\.csv needs about 29 KiB"):
         calibration.run(cfg, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["big.csv", "big.csv.gz", "big.parquet"])
+def test_tables_larger_than_memory(tmp_path, monkeypatch, name) -> None:
+    frame, path = long_table(rows=200), tmp_path / name
+    frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
+    source = TableSource(str(path), {"vehicle": "id", "time": "t", "speed": "v", **BY_GAP})
+    source.load()
+    monkeypatch.setattr(memory, "available", lambda device: 29_000)
+    with pytest.raises(ConfigError, match=rf"reading .*{name} needs about"):
+        source.load()
 
 
 # -- estimate and truth ---------------------------------------------------------------------------

@@ -73,12 +73,12 @@ def test_any_rate_and_format(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ("time_s,speed_mps\n0,1\n1,-1\n", "row 2 has a negative speed"),
-        ("time_s,speed_mps\n0,1\n0,1\n", "row 2 does not follow"),
-        ("time_s,speed_mps\n0,1\n1,\n", "row 2 is not a number"),
-        ("time_s,speed_mps\n0,1\n1,fast\n", "must be numbers"),
+        ("time_s,speed_mps\n0,1\n1,-1\n", "row 2, column 'speed_mps' has a negative speed"),
+        ("time_s,speed_mps\n0,1\n0,1\n", "row 2, column 'time_s' does not follow"),
+        ("time_s,speed_mps\n0,1\n1,\n", "row 2, column 'speed_mps' is not a number: blank"),
+        ("time_s,speed_mps\n0,1\n1,fast\n", "row 2, column 'speed_mps' is not a number: 'fast'"),
         ("time_s,speed_mps\n0,1\n", "at least 2"),
-        ("time,speed\n0,1\n1,1\n", "lacks the column speed_mps, time_s"),
+        ("time,speed\n0,1\n1,1\n", "lacks the column time_s, speed_mps; .*leader.columns"),
         ("", "not a readable table"),
     ],
 )

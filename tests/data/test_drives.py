@@ -8,9 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from helpers import VARIANTS
 
 from lcc_rl.config import load
-from lcc_rl.data.drives import COLUMNS, DriveLeaders, hashed, read_drives
+from lcc_rl.data.drive_tables import COLUMNS, read_drives
+from lcc_rl.data.drives import DriveLeaders, hashed
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 
@@ -185,6 +187,56 @@ def test_impossible_drives(table, overrides, error, words) -> None:
     said = ["variant=alcc", "leader=drives", f"leader.path={table}", *overrides]
     with pytest.raises(error, match=words):
         load_inputs(load("train", said))
+
+
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ","), ("\t", ".")])
+def test_units_and_separators(tmp_path, separator, decimal) -> None:
+    path = tmp_path / "record.csv"
+    frame = drives(["x"], 120.0)
+    other = pd.DataFrame({"t": 1000 * frame["time_s"], "v": 3.6 * frame["speed_mps"]})
+    other.to_csv(path, index=False, sep=separator, decimal=decimal)
+    said = ["leader.columns={time: t, speed: v}", "leader.units={time: ms, speed: km/h}"]
+    cfg = load("train", ["variant=alcc", "leader=record", f"leader.path={path}", *said])
+    inputs = load_inputs(cfg)
+    expected = frame["speed_mps"].to_numpy()[: len(inputs.training.record(0))]
+    np.testing.assert_allclose(inputs.training.record(0), expected, atol=1e-3)
+    assert any("separated by" in line for line in inputs.report) == (separator != ",")
+    with pytest.raises(ConfigError, match=r"leader\.units\.speed: 'kmh'.*Did you mean 'km/h'"):
+        DriveLeaders(str(path), units={"speed": "kmh"})
+    with pytest.raises(DataError, match=r"holds 90 m/s .*km/h|leader\.plausible\.max_speed"):
+        read_drives(
+            str(path), {"drive": None, "time": "t", "speed": "v"}, 0.1, None, {"time": "ms"}
+        )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (20.1, r"the longest record has 200 \(20 s\); lower scenario\.horizon to at most 200 or"),
+        (60.1, r"its part for evaluation only 199; .*at most 199, .*leader\.evaluation_share=1"),
+    ],
+)
+def test_a_short_record_says_what_to_set(tmp_path, seconds, words) -> None:
+    path = tmp_path / "record.csv"
+    drives(["x"], seconds).to_csv(path, index=False)
+    said = ["variant=alcc", "leader=record", f"leader.path={path}"]
+    with pytest.raises(DataError, match=rf"record\.csv: shorter than the horizon: .*{words}"):
+        load_inputs(load("train", said))
+    if seconds > 30:
+        whole = load_inputs(load("train", [*said, "leader.evaluation_share=1"]))
+        assert (len(whole.training), len(whole.evaluation)) == (0, 1)
+    shorter = load_inputs(load("train", [*said, f"scenario.horizon={60 if seconds < 30 else 199}"]))
+    assert len(shorter.training) == 1
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_one_record_serves_every_variant(tmp_path, variant) -> None:
+    path = tmp_path / "record.csv"
+    drives(["x"], 300.0).to_csv(path, index=False)
+    said = [f"variant={variant}", "leader=record", f"leader.path={path}"]
+    inputs = load_inputs(load("train", said))
+    assert len(inputs.training) == 1
+    assert len(inputs.evaluation) >= 1
 
 
 def test_real_drives(shared_data) -> None:

@@ -7,16 +7,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from table_text import long_table, openacc_text
 
 from lcc_rl.config import config_hash, identity, load, plain
+from lcc_rl.data.car_following import Criteria
+from lcc_rl.data.drive_tables import COLUMNS as COLUMNS_OF_DRIVES
+from lcc_rl.data.drive_tables import read_drives
 from lcc_rl.data.episodes import COLUMNS, read_episodes, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.openacc import OpenAccSource
+from lcc_rl.data.sources import EpisodesSource
+from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError, LccError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.io.tensors import read_torch
@@ -85,6 +94,80 @@ def test_any_bytes_are_read_or_refused(tmp_path, content, name) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(DataError, match=r"a\."):
         read_ngsim([str(tmp_path / name)])
+
+
+BY_GAP = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
+BY_LANE = {**BY_GAP, "leader": None, "gap": None, "lane": "lane", "position": "x"}
+SHORT = Criteria(min_duration_s=0.1, passenger_cars_only=False)
+
+
+def rows_of(path: Path, layout: str) -> pd.DataFrame:
+    """Read a file as a layout; the rows, and that the report is one line per entry."""
+    if layout == "record":
+        profiles, report = read_drives(str(path), {**COLUMNS_OF_DRIVES, "drive": None}, 0.1)
+        assert not any("\n" in line for line in report)
+        return pd.DataFrame({"leader_speed_mps": profiles.speeds.numpy()})
+    source = {
+        "by gap": TableSource(str(path), BY_GAP, criteria=SHORT),
+        "by lane": TableSource(str(path), BY_LANE, vehicle_length=5.0, criteria=SHORT),
+        "openacc": OpenAccSource(str(path), SHORT),
+        "episodes": EpisodesSource(str(path)),
+    }[layout]
+    loaded = source.load()
+    validate_episodes(loaded.episodes, "what was read")
+    return loaded.episodes
+
+
+def text_of(layout: str) -> str:
+    """Return a small file of a layout that is valid."""
+    if layout == "openacc":
+        return openacc_text(rows=20)
+    if layout == "episodes":
+        return pair_table().assign(leader_length_m=5.0).to_csv(index=False)
+    if layout == "record":
+        record = pd.DataFrame({"time_s": np.arange(20) / 10, "speed_mps": 5.0})
+        return record.to_csv(index=False)
+    return long_table(rows=20).to_csv(index=False)
+
+
+LAYOUTS = ("by gap", "by lane", "openacc", "episodes", "record")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_tables_that_are_mutated_are_valid(tmp_path, layout) -> None:
+    (tmp_path / "a.csv").write_text(text_of(layout))
+    assert len(rows_of(tmp_path / "a.csv", layout)) >= 5
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@FUZZ
+@given(
+    st.lists(st.tuples(st.integers(0, 99), st.integers(0, 17), words), min_size=1, max_size=6),
+    st.sampled_from([",", ";", "\t", " "]),
+)
+def test_a_mutated_table_is_read_or_refused_by_name(tmp_path, layout, changes, separator) -> None:
+    lines = [line.split(",") for line in text_of(layout).splitlines()]
+    for row, column, word in changes:
+        line = lines[row % len(lines)]
+        line[column % len(line)] = word
+    text = "\n".join(separator.join(line) for line in lines)
+    (tmp_path / "a.csv").write_text(text, errors="surrogatepass")
+    found = []
+    error = refused(lambda: found.append(rows_of(tmp_path / "a.csv", layout)))
+    if error is not None:
+        assert "a.csv" in error
+        return
+    assert np.isfinite(found[0].select_dtypes("number").to_numpy()).all()
+    assert (found[0]["leader_speed_mps"] >= 0).all()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@FUZZ
+@given(st.binary(max_size=400), st.sampled_from(["a.csv", "a.csv.gz", "a.parquet"]))
+def test_any_bytes_are_no_trajectories(tmp_path, layout, content, name) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(DataError, match=r"a\."):
+        rows_of(tmp_path / name, layout)
 
 
 @FUZZ

@@ -1,0 +1,61 @@
+"""Small tables of trajectories: native OpenACC files and tables of a row per vehicle and moment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+PREAMBLE = (
+    "Date,8,10,2019\nVehicle_order,SMART,MAZDA,TESLA,\nNumber_of_vehicles,{cars}\nACC,1\n"
+    "Distance_setting,S\n"
+)
+GAP, LENGTH = 20.0, 5.0  # m
+
+
+def speed(time: np.ndarray, car: int) -> np.ndarray:
+    """A wavy speed, a little later for every car [m/s]."""
+    return 12.0 + 3.0 * np.sin((time - 0.5 * car) / 4.0)
+
+
+def way(time: np.ndarray, car: int) -> np.ndarray:
+    """Position of a car of which the first begins at 0 m: the integral of its speed [m]."""
+    start = -(car - 1) * (GAP + LENGTH)
+    phase = 0.5 * car / 4.0
+    return start + 12.0 * time + 12.0 * (np.cos(phase) - np.cos(time / 4.0 - phase))
+
+
+def openacc_text(cars: int = 3, rows: int = 400, blank: dict[str, list[int]] | None = None) -> str:
+    """A native OpenACC file at 10 Hz from 430 s on; ``blank`` rows of columns have no value."""
+    time = np.arange(rows) / 10
+    frame = pd.DataFrame({"Time": 430 + time})
+    for car in range(1, cars + 1):
+        frame[f"Speed{car}"] = speed(time, car)
+        frame[f"E{car}"] = frame[f"N{car}"] = way(time, car)
+    for car in range(1, cars):
+        frame[f"IVS{car}"] = way(time, car) - way(time, car + 1) - LENGTH
+    for name, places in (blank or {}).items():
+        frame.loc[places, name] = np.nan
+    return PREAMBLE.format(cars=cars) + frame.to_csv(index=False)
+
+
+def long_table(cars: int = 3, rows: int = 400, step: float = 0.1) -> pd.DataFrame:
+    """A row per vehicle and moment, with every column that there may be, in SI."""
+    parts = []
+    for car in range(1, cars + 1):
+        time = step * np.arange(rows)
+        ahead = way(time, car - 1) - way(time, car) - LENGTH if car > 1 else np.nan
+        parts.append(
+            pd.DataFrame(
+                {
+                    "id": car,
+                    "t": time,
+                    "v": speed(time, car),
+                    "x": way(time, car),
+                    "lane": "left",
+                    "ahead": car - 1,
+                    "gap": ahead,
+                    "length": LENGTH,
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
