@@ -18,7 +18,8 @@ import pandas as pd
 import torch
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.commands.evaluation import strategies_of, task_of
+from lcc_rl.commands.evaluation import strategies_of
+from lcc_rl.commands.tasks import task_of
 from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env

@@ -12,7 +12,8 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
-from lcc_rl.config import build_as, identity, plain
+from lcc_rl.commands.tasks import only_named, task_of
+from lcc_rl.config import identity
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
@@ -31,22 +32,19 @@ from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
-from lcc_rl.results.scores import Task, scores
 from lcc_rl.results.scores import as_rich as scores_as_rich
+from lcc_rl.results.scores import scores
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
-from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present, claim, forget
-from lcc_rl.targets import TARGET
 
 log = logging.getLogger("lcc_rl")
 
 EPISODES, STEPS, IDENTITY = "episodes.parquet", "steps.parquet", "lcc_rl.config"
 ROWS = ("episodes", "vehicles")
-TASK = "lcc_rl.results.scores.Task"
 
 
 def run(
@@ -110,7 +108,7 @@ def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
-    own = own and not _only_named(cfg)
+    own = own and not only_named(cfg)
     if own:
         check_variant(cfg)
     strategies, inputs = strategies_of(cfg, own)
@@ -134,11 +132,6 @@ def _draw(cfg: DictConfig, folder: Path) -> None:
     draw(folder)
 
 
-def _only_named(cfg: DictConfig) -> bool:
-    """Whether a task compares those that are named only: nobody's policy is its own variant's."""
-    return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
-
-
 def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
     """Build all strategies of an evaluation, and read what they are evaluated on.
 
@@ -149,7 +142,7 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
     Raises:
         LccError: one clear error for whatever is wrong with settings, data or files.
     """
-    own = not _only_named(cfg) if own is None else own
+    own = not only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust, policy = tuple(cfg.trust), None
     if cfg.policy is not None and learns(cfg):
@@ -267,19 +260,6 @@ def _play_missing(
             done += counts[block]
             if where is not None:
                 progress.update(done)
-
-
-def task_of(cfg: DictConfig) -> Task | None:
-    """Return the task of a configuration; None without one.
-
-    Raises:
-        ConfigError: naming the option at fault.
-    """
-    if cfg.get("task") is None:
-        return None
-    task: Task = build_as("a task", Task, {TARGET: TASK, **plain(cfg.task)}, "task")
-    check_unit(task.unit, build_energy(cfg))
-    return task
 
 
 def _show(rows: Rows, cfg: DictConfig, inputs: Inputs) -> None:

@@ -6,7 +6,7 @@ import pytest
 from commands import DATA, tiny
 
 from lcc_rl.commands import evaluation
-from lcc_rl.commands.evaluation import task_of
+from lcc_rl.commands.tasks import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import BASELINES, DIRECT, rules

@@ -1,0 +1,32 @@
+"""The task of a configuration, and whom it compares."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from lcc_rl.agents.factory import learns
+from lcc_rl.config import build_as, plain
+from lcc_rl.energy import build_energy
+from lcc_rl.results.scores import Task
+from lcc_rl.results.units import check_unit
+from lcc_rl.targets import TARGET
+
+TASK = f"{Task.__module__}.{Task.__name__}"
+
+
+def task_of(cfg: DictConfig) -> Task | None:
+    """Return the task of a configuration; None without one.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    if cfg.get("task") is None:
+        return None
+    task: Task = build_as("a task", Task, {TARGET: TASK, **plain(cfg.task)}, "task")
+    check_unit(task.unit, build_energy(cfg))
+    return task
+
+
+def only_named(cfg: DictConfig) -> bool:
+    """Whether a task compares those that are named only: nobody's policy is its own variant's."""
+    return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
