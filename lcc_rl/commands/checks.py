@@ -58,6 +58,11 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         ConfigError: naming the option.
     """
     check_sizes(cfg)
+    require(
+        cfg.evaluation.shards == 1,
+        f"evaluation.shards={cfg.evaluation.shards}: a training's evaluation is one table; divide "
+        "that of python -m lcc_rl.evaluate policy=<run>",
+    )
     check_installed(cfg)
     check_objective(cfg)
     build_logger(cfg)
@@ -167,6 +172,11 @@ def check_sizes(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the option.
     """
+    shard, shards = cfg.evaluation.shard, cfg.evaluation.shards
+    require(
+        0 <= shard < shards,
+        f"evaluation.shard must lie from 0 to evaluation.shards - 1 = {shards - 1}, got {shard}",
+    )
     pieces = cfg.scenario.pieces
     measured = [name for name in MEASURED if pieces.get(name) is None]
     require(

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
-from lcc_rl.commands.tasks import only_named, task_of
+from lcc_rl.commands.tasks import check_named, only_named, task_of
 from lcc_rl.config import identity
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
@@ -24,6 +24,7 @@ from lcc_rl.evaluation.strategies import (
     Strategy,
     applies,
     baseline,
+    no_policy,
     rules,
     studied,
     trained,
@@ -145,6 +146,9 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
     own = not only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust, policy = tuple(cfg.trust), None
+    check_named(cfg.compare)
+    if own and learns(cfg) and cfg.policy is None:
+        raise no_policy(cfg)
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
@@ -227,7 +231,9 @@ def _by_blocks(
     except KeyboardInterrupt as error:
         if len(plan.own) == 1:
             raise
-        raise Interrupted(f"stopped; resume={folder} plays the blocks that are missing") from error
+        raise Interrupted(
+            f"stopped; go on with: python -m lcc_rl.evaluate resume={folder}"
+        ) from error
     check_present(folder)
     write_parquet(store.steps(), folder / STEPS, metadata)
     write_parquet(store.rows(), folder / EPISODES, metadata)  # last, as above
@@ -252,6 +258,9 @@ def _play_missing(
     player = episodes.Episodes(strategy, inputs, plan, *how)
     counts = {block: plan.count(block) for block in plan.own}
     done = sum(counts.values()) - sum(counts[block] for block in missing)
+    if done:
+        there = len(counts) - len(missing)
+        log.info("%s: %d of %d blocks are there already", strategy.name, there, len(counts))
     where = folder if len(plan.own) > 1 else None
     title = f"evaluate {strategy.name} ({place + 1} of {len(store.marks)})"
     with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.config import build_as, plain
 from lcc_rl.energy import build_energy
+from lcc_rl.errors import unknown_name
+from lcc_rl.evaluation.strategies import rules
+from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.scores import Task
 from lcc_rl.results.units import check_unit
 from lcc_rl.targets import TARGET
@@ -30,3 +36,16 @@ def task_of(cfg: DictConfig) -> Task | None:
 def only_named(cfg: DictConfig) -> bool:
     """Whether a task compares those that are named only: nobody's policy is its own variant's."""
     return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
+
+
+def check_named(names: Sequence[str]) -> None:
+    """Check that whom ``compare`` names exists: a controller, a baseline, a folder or a policy.
+
+    Raises:
+        ConfigError: naming the nearest that does.
+    """
+    for name in names:
+        plain_name = Path(name).name == name and not Path(name).suffix
+        if plain_name and name not in rules() and name != PRETRAINED and not Path(name).exists():
+            known = [*rules(), PRETRAINED, "<run folder>", "<policy.pt>"]
+            raise unknown_name("strategy (compare)", name, known)

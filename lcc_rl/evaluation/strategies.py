@@ -193,6 +193,14 @@ def _baseline_controllers(cfg: DictConfig) -> list[Any]:
     ]
 
 
+def no_policy(cfg: DictConfig) -> ConfigError:
+    """Return the error for a learned variant without a policy."""
+    return ConfigError(
+        f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
+        f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
+    )
+
+
 def studied(
     cfg: DictConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
@@ -213,10 +221,7 @@ def studied(
         named = strategy.name in cfg.evaluation.baselines
         return [] if same or named else [strategy]
     if policy is None:
-        raise ConfigError(
-            f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
-            f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
-        )
+        raise no_policy(cfg)
     weights, own_cfg = policy
     check_policy(cfg, own_cfg)
     cfg = _copy(cfg)

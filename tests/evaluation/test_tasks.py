@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from commands import DATA, tiny
 
-from lcc_rl.commands import evaluation
+from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.tasks import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
@@ -56,3 +56,25 @@ def test_mistakes_of_a_task_are_named_before_it_begins(override, words, tmp_path
     with pytest.raises(ConfigError, match=words):
         evaluation.run(cfg, tmp_path / "run")
     assert not (tmp_path / "run" / "episodes.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["variant=idm", "compare=[follower_stoper]"], "compare.*Did you mean 'follower_stopper'"),
+        (["variant=alcc"], "variant alcc is learned: give policy="),
+        (["variant=idm", "evaluation.shards=2", "evaluation.shard=2"], "shard must lie from 0 to"),
+    ],
+)
+def test_what_is_wrong_is_said_before_the_data_are_read(
+    words, message, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(evaluation, "load_inputs", lambda cfg: pytest.fail("data were read"))
+    with pytest.raises(ConfigError, match=message):
+        evaluation.run(load("evaluate", words), tmp_path)
+
+
+def test_a_training_refuses_to_leave_out_shards_of_its_evaluation(tmp_path) -> None:
+    cfg = load("train", ["experiment=smoke", "evaluation.shards=2"])
+    with pytest.raises(ConfigError, match=r"evaluation.shards=2: a training's evaluation"):
+        training.run(cfg, tmp_path)
