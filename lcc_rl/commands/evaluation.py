@@ -288,6 +288,7 @@ def _show(rows: Rows, cfg: DictConfig, inputs: Inputs) -> None:
         title = f"{of}{count} held-out profiles × {drivers}, {cfg.scenario.horizon} steps"
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
+            task = task.among(part["strategy"])
             table = scores(part, task, build_energy(cfg))
             show(scores_as_rich(table, task, f"task {task.name}: {title}"))
         else:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import pandas as pd
 from rich.table import Table
@@ -59,6 +59,14 @@ class Task:
                     f"{LEAST} or {SHARE}"
                 )
             require_in("task.limits", "[0, inf)", **{column: bound})
+
+    def among(self, strategies: Iterable[str]) -> Task:
+        """Return the task; where whom it compares with is not there, with the first who is.
+
+        A training ends with an evaluation of its own policy, which meets nobody.
+        """
+        names = list(dict.fromkeys(map(str, strategies)))
+        return self if self.against in names else replace(self, against=names[0])
 
     @property
     def label(self) -> str:

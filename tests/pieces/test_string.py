@@ -19,6 +19,7 @@ from lcc_rl.functional.string import advance_string, selector
 from lcc_rl.pieces import (
     FollowerStopper,
     Observation,
+    PISaturation,
     StringMotion,
     TimeGapStart,
     parse_string,
@@ -308,9 +309,10 @@ def test_follower_stopper_keeps_time_gaps_and_its_limits() -> None:
 def test_follower_stopper_desires_its_own_mean_speed() -> None:
     piece = FollowerStopper(1.0, window=3.0)
     history, ahead, gap = torch.zeros(1, 1, 3), torch.full((1, 1, 1), 50.0), 1e3
-    for speed, mean in ((3.0, 1.0), (6.0, 3.0), (9.0, 6.0), (9.0, 8.0)):
-        own = torch.full((1, 1, 1), speed)
-        command, history = piece.command(own, torch.full_like(own, gap), ahead, history)
+    # The mean of what was driven, from the first step on.
+    for step, (speed, mean) in enumerate(((3.0, 3.0), (6.0, 4.5), (9.0, 6.0), (9.0, 8.0))):
+        own, at = torch.full((1, 1, 1), speed), torch.full((1, 1, 1), step)
+        command, history = piece.command(own, torch.full_like(own, gap), ahead, at, history)
         assert float(command) == pytest.approx(min(max(mean - speed, -3.0), 1.5))
 
 
@@ -352,3 +354,20 @@ def test_a_moment_before_the_episode_is_refused() -> None:
     own = "scenario.controllers.automated"
     with pytest.raises(ConfigError, match="from_s must not be negative"):
         small_env("idm", 1, [f"controller@{own}=handover", f"{own}.from_s=-1"])
+
+
+def test_pi_saturation_follows_its_formula() -> None:
+    piece = PISaturation(1.0, window=2.0, max_acceleration=50.0, max_deceleration=50.0)
+    history, before = torch.zeros(1, 4, 2), torch.full((1, 4, 1), 9.0)
+    speed, ahead = torch.full((1, 4, 1), 10.0), torch.tensor([10.0, 12.0, 10.0, 4.0]).view(1, 4, 1)
+    gap = torch.tensor([40.0, 18.5, 5.0, 3.0]).view(1, 4, 1)
+    step = torch.zeros(1, 1, 1)
+    command, _, wanted = piece.command(speed, gap, ahead, before, step, history)
+    # At the first step the command before is the own speed; the targets are 11, 10.5, 10 and 10.
+    # Δx_s is 4, 4, 4 and 2·6 = 12 m, so α is 1, 1, ½ and 0 and β 0.5, 0.5, 0.75 and 1.
+    expected = [10.5, 10.25, 0.75 * (0.5 * 10.0 + 0.5 * 10.0) + 0.25 * 10.0, 4.0]
+    assert wanted.flatten().tolist() == pytest.approx(expected)
+    assert command.flatten().tolist() == pytest.approx([v - 10.0 for v in expected])
+    late, _, later = piece.command(speed, gap, ahead, before, step + 1, history)
+    assert later.flatten().tolist()[0] == pytest.approx(0.5 * (5.0 + 1.0) + 0.5 * 9.0)
+    assert late.shape == (1, 4, 1)

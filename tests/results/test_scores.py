@@ -88,6 +88,14 @@ def test_a_column_may_be_the_score_and_the_table_shows_it() -> None:
     assert [str(column.header) for column in drawn.columns] == ["", "human", "own"]
 
 
+def test_a_training_that_meets_nobody_is_compared_with_itself() -> None:
+    table = rows("own", [1.0, 2.0])
+    task = TASK.among(table["strategy"])
+    assert task.against == "own"
+    assert scores(table, task, MOTOR)["saving"].isna().all()
+    assert TASK.among(["own", "human"]) is TASK
+
+
 def test_units() -> None:
     fuel = CirclesFuel()
     kj = 45.0 * fuel.heating_value / 1e3  # 45 g/km
