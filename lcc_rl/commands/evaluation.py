@@ -147,8 +147,6 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust, policy = tuple(cfg.trust), None
     check_named(cfg.compare)
-    if own and learns(cfg) and cfg.policy is None:
-        raise no_policy(cfg)
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
@@ -160,6 +158,8 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
         if path not in rivals
     ]
     compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
+    if own and learns(cfg) and cfg.policy is None:
+        raise no_policy(cfg)
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)

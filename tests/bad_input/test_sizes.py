@@ -100,7 +100,8 @@ def test_the_gradient_of_too_many_episodes_is_refused(tmp_path) -> None:
     ],
 )
 def test_a_stream_that_is_larger_than_memory(tmp_path, entry, run, size) -> None:
-    cfg = load(entry, [f"data.{size}={HUGE}"])
+    given = ["policy=pretrained"] if entry == "evaluate" else []
+    cfg = load(entry, [f"data.{size}={HUGE}", *given])
     with pytest.raises(ConfigError, match=r"recordings × platoons × vehicles = \d+.* needs about"):
         run(cfg, tmp_path)
 

@@ -153,6 +153,7 @@ def test_options_that_the_leader_ignores(overrides, words) -> None:
     load("train", ["variant=alcc", *MIXTURE, "split=vehicle"])
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_from_what_is_all_for_evaluation(tmp_path) -> None:
     cfg = tiny("train", "variant=alcc", "split=none")
     with pytest.raises(ConfigError, match="no profile is left to train on: split=none"):
@@ -204,6 +205,7 @@ def test_a_platoon_is_evaluated_by_source(tmp_path) -> None:
     assert set(rows.loc[rows["case"] == "case 1", "source"]) == {""}
 
 
+@pytest.mark.slow
 def test_a_pipeline_calibrates_on_data_and_trains_behind_other_leaders(
     tmp_path, monkeypatch
 ) -> None:

@@ -308,6 +308,7 @@ def test_every_parameter_has_a_column_and_bounds_within_what_is_plausible():
     assert not set(COLUMNS.values()) & set(ALIASES)
 
 
+@pytest.mark.slow
 def test_real_drivers_by_every_model(shared_data):
     observed = observe(pd.read_parquet(shared_data / "i80_pairs.parquet"))
     means = {}

@@ -313,6 +313,7 @@ def test_parts_of_a_table_must_have_the_same_columns(tmp_path) -> None:
 COMPILER = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its own making
 
 
+@pytest.mark.slow
 @COMPILER
 def test_a_compiled_evaluation_differs_by_rounding() -> None:
     cfg = compose("alcc", "agent.hidden=[8]")

@@ -97,6 +97,7 @@ def test_path_energy_at_constant_speed() -> None:
     assert float(path_energy(moment(10.0, 0.0, 5.0), 0.1)) == pytest.approx(watts * 1e-4)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, capsys) -> None:
     path = Path(__file__).parents[2] / "tools" / "clairvoyant.py"
     spec = importlib.util.spec_from_file_location("clairvoyant_tool", path)

@@ -84,6 +84,7 @@ def test_quick_run_writes_sane_rows(benchmark, tmp_path, capsys, name) -> None:
     assert name in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_given_episodes_are_calibrated(benchmark, tmp_path, capsys) -> None:
     episodes = StreamSource(2, 2, 2, (35.0, 40.0)).load().episodes
     episodes.to_parquet(tmp_path / "pairs.parquet")
