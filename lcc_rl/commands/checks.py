@@ -19,7 +19,7 @@ from lcc_rl.envs.inputs import (
     string_of,
 )
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.evaluation.episodes import any_leader, needed
+from lcc_rl.evaluation.episodes import any_leader, check_shard, needed
 from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
@@ -172,11 +172,7 @@ def check_sizes(cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    shard, shards = cfg.evaluation.shard, cfg.evaluation.shards
-    require(
-        0 <= shard < shards,
-        f"evaluation.shard must lie from 0 to evaluation.shards - 1 = {shards - 1}, got {shard}",
-    )
+    check_shard(cfg.evaluation.shard, cfg.evaluation.shards)
     pieces = cfg.scenario.pieces
     measured = [name for name in MEASURED if pieces.get(name) is None]
     require(

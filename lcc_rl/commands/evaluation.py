@@ -22,8 +22,7 @@ from lcc_rl.evaluation.blocks import Store
 from lcc_rl.evaluation.naming import POLICY, check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
     Strategy,
-    applies,
-    baseline,
+    baselines,
     no_policy,
     rules,
     studied,
@@ -164,8 +163,7 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
     for line in inputs.report:
         log.info(line)
     check_evaluation(cfg, inputs)
-    named = [*cfg.evaluation.baselines, *(x for x in rivals if x not in cfg.evaluation.baselines)]
-    strategies = [baseline(cfg, name) for name in named if applies(cfg, name)]
+    strategies = baselines(cfg, rivals)
     strategies += [trained(cfg, path, compared[path], inputs.population) for path in paths]
     if own:
         strategies += studied(cfg, policy, inputs.population)

@@ -42,6 +42,18 @@ WORTH_COMPILING = 20_000_000
 MOST = 10**9  # episodes of a run: each is a row of its table
 
 
+def check_shard(shard: int, shards: int) -> None:
+    """Check the number of a shard.
+
+    Raises:
+        ConfigError: if there is none of that number.
+    """
+    message = (
+        f"evaluation.shard must lie from 0 to evaluation.shards - 1 = {shards - 1}, got {shard}"
+    )
+    require(0 <= shard < shards, message)
+
+
 @dataclass(frozen=True)
 class Plan:
     """The episodes of an evaluation, in blocks of one size that are played and written one by one.
@@ -74,11 +86,7 @@ class Plan:
         require(
             self.batch_size >= 1, f"evaluation.batch_size must be at least 1, got {self.batch_size}"
         )
-        require(
-            0 <= self.shard < self.shards,
-            f"evaluation.shard must lie from 0 to evaluation.shards - 1 = {self.shards - 1}, got "
-            f"{self.shard}",
-        )
+        check_shard(self.shard, self.shards)
         require(
             self.shards <= self.blocks,
             f"evaluation.shards={self.shards}: the {len(self)} episodes are {self.blocks} blocks "

@@ -7,7 +7,7 @@ and pieces. A strategy differs in who drives the automated vehicles and what tha
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -95,13 +95,14 @@ def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
     return cfg
 
 
-def baselines(cfg: DictConfig) -> list[Strategy]:
-    """Build the baselines that an evaluation names, in the scenario under study.
+def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
+    """Build the baselines that an evaluation names, and further ones, in the scenario under study.
 
     Raises:
         ConfigError: if there is none of a name.
     """
-    return [baseline(cfg, name) for name in cfg.evaluation.baselines if applies(cfg, name)]
+    names = dict.fromkeys([*cfg.evaluation.baselines, *further])
+    return [baseline(cfg, name) for name in names if applies(cfg, name)]
 
 
 def applies(cfg: DictConfig, name: str) -> bool:
@@ -130,11 +131,12 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
-def rules() -> list[str]:
+@cache  # looked up for every name
+def rules() -> tuple[str, ...]:
     """Return the names of all baselines and of the files of conf/controller, no name twice."""
     shipped = Path(str(files("lcc_rl.conf"))) / "controller"
     found = sorted(path.stem for path in shipped.glob("*.yaml") if path.stem not in NEEDY)
-    return list(dict.fromkeys([DIRECT, *BASELINES, *found]))
+    return tuple(dict.fromkeys([DIRECT, *BASELINES, *found]))
 
 
 @cache  # composed once: an evaluation asks for each several times
