@@ -14,7 +14,7 @@ export OMP_NUM_THREADS ?= 1
 .PHONY: run test test-all coverage lint clean
 
 run: $(STAMP)
-	$(BIN)/python -m lcc_rl.pipeline experiment=quickstart $(ARGS)
+	$(BIN)/python -m lcc_rl.pipeline experiment=main $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" $(ARGS)

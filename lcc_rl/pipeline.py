@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -11,8 +10,8 @@ from omegaconf import DictConfig
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.cli import entry_point, root_key, run_folder
-
-log = logging.getLogger("lcc_rl")
+from lcc_rl.runs.console import headlines, tell
+from lcc_rl.version import __version__
 
 
 @entry_point("pipeline", "lcc_rl.commands.pipeline")
@@ -40,9 +39,9 @@ def main(cfg: DictConfig) -> None:
     else:
         check_folder(cfg, folder)
     save_config(cfg, folder)
-    run(cfg, folder, overrides)
-    log.info("results in %s", folder)
-    log.info("figures in %s", folder / "evaluation" / "figures")
+    with headlines():
+        tell(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
+        run(cfg, folder, overrides)
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ def test_every_option_of_a_group_builds(group) -> None:
 
 
 # Recipes that choose what learns serve those variants only in which it can.
-CHOOSING = {"limits": LEARNED, "limits_tuned": ("alcc", "reference", "own_energy")}
+CHOOSING = {"limits": LEARNED, "main": LEARNED, "limits_tuned": ("alcc", "reference", "own_energy")}
 RECIPES = [(e, v) for e in options("experiment") for v in options("variant")]
 
 

@@ -239,7 +239,13 @@ def test_a_policy_for_those_that_learn_nothing_is_refused(trained, tmp_path) -> 
 def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
     jobs_in_threads(monkeypatch)
     overrides = [*TINY, QUICK, "variants=[reference,alcc]"]
-    rows = pipeline.run(load("pipeline", overrides), tmp_path, overrides)
+    done = run_command("lcc_rl.pipeline", *overrides, f"hydra.run.dir={tmp_path}", cwd=tmp_path)
+    told = done.stdout.splitlines()
+    assert len(told) <= 25, done.stdout
+    assert told[-1] == f"page: {tmp_path / 'report.html'}"
+    assert (tmp_path / "report.html").read_text().count("<img") >= 5
+    assert "candidates: stretches" in (tmp_path / "pipeline.log").read_text()
+    rows = read_parquet(tmp_path / "evaluation" / "episodes.parquet")
     assert set(rows["strategy"]) == {*UNTRAINED, "reference", "alcc"}
     for name in ("reference", "alcc"):
         assert (tmp_path / name / "policy.pt").exists()
@@ -250,6 +256,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     assert rows["desired_speed_mps"].isin(drivers["desired_speed_mps"].astype("float32")).all()
     # Completing a complete job changes nothing.
     again = pipeline.run(load("pipeline", overrides), tmp_path, overrides)
+    assert isinstance(again, pd.DataFrame)
     pd.testing.assert_frame_equal(rows, again, check_exact=True)
 
 

@@ -117,19 +117,19 @@ def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet and isinstance(rows, pd.DataFrame):
-        _draw(cfg, folder)
+        draw(folder, cfg.evaluation.rows)
     elif not quiet:
         log.info("no figures: there are more than %d rows", FEW)
     return rows
 
 
-def _draw(cfg: DictConfig, folder: Path) -> None:
+def draw(folder: Path, rows: str = "episodes") -> None:
+    """Draw the figures of an evaluation, whose rows are ``episodes`` or ``vehicles``."""
     # Here: a training, which draws nothing, need not load matplotlib.
     from lcc_rl.results.figures import write_study_figures
     from lcc_rl.results.string_figures import write_platoon_figures
 
-    draw = write_study_figures if cfg.evaluation.rows == "episodes" else write_platoon_figures
-    draw(folder)
+    (write_study_figures if rows == "episodes" else write_platoon_figures)(folder)
 
 
 def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:

@@ -10,11 +10,13 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from functools import cache
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
 
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
@@ -24,11 +26,15 @@ from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source
 from lcc_rl.errors import Interrupted, ResultsError
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.drawing import save
-from lcc_rl.results.figures import learning_curve
+from lcc_rl.results.main_page import as_rich, write_page
+from lcc_rl.results.tables import show
+from lcc_rl.results.training_figures import training_figure
 from lcc_rl.results.trust import check_targets
 from lcc_rl.runs.cli import root_key
+from lcc_rl.runs.console import tell
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
@@ -46,7 +52,7 @@ EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
-def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFrame:
+def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> Rows:
     """Read trajectories, calibrate drivers, train the variants, evaluate and draw.
 
     A folder that already holds parts of the same job is completed.
@@ -66,7 +72,7 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> pd.DataFra
         return _run(cfg, Path(folder), overrides)
 
 
-def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> pd.DataFrame:
+def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     prepare_torch(cfg)
     require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
     shared = [item for item in overrides if root_key(item) not in OWN]
@@ -88,15 +94,29 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> pd.DataFrame:
     }
     for part in (*parts.values(), final):
         part.update(inputs)
+    tell(f"training {', '.join(cfg.variants)}, {cfg.jobs} at a time; details in */train.log")
     _train_all(parts, folder, cfg.jobs)
     final.compare = [
         str(folder / name) for name in cfg.variants if (folder / name / "policy.pt").exists()
     ]
-    episodes = evaluation.run(final, folder / "evaluation", own=False)
+    tell("evaluating them and the baselines on held-out windows")
+    paged = final.evaluation.rows == "episodes"
+    rows = evaluation.run(final, folder / "evaluation", own=False, quiet=paged)
     if final.compare:
-        curve = learning_curve(results.load(folder, "training"))
+        curve = training_figure(results.load(folder, "training"))
         save(curve, folder / "evaluation" / "figures" / "learning_curve.png")
-    return episodes
+    if paged and isinstance(rows, pd.DataFrame):
+        _conclude(folder, overrides)
+    return rows
+
+
+def _conclude(folder: Path, overrides: list[str]) -> None:
+    """Draw the figures, print the headline and write the page."""
+    evaluation.draw(folder / "evaluation")
+    page, table = write_page(folder, [" ".join(["python -m lcc_rl.pipeline", *overrides])])
+    show(as_rich(table, "A leader, the car, and a human driver behind it: held-out windows"))
+    tell(f"rows, figures and policies: {folder}")
+    tell(f"page: {page}")
 
 
 def stored_overrides(path: Path, trust: Sequence[str]) -> list[str]:
@@ -151,12 +171,17 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
         loaded = build_source(cfg.data).load()
         for line in loaded.report:
             log.info(line)
+        tell(f"data: {loaded.report[-1]}")
         write_episodes(loaded.episodes, table)
     if not drivers.exists():
         own = OmegaConf.create(plain(cfg))
         assert isinstance(own, DictConfig)
         own.data = _episodes(cfg, folder)
-        calibration.run(own, drivers.parent)
+        said = StringIO()
+        found = calibration.run(own, drivers.parent, Console(file=said, width=100))
+        for line in said.getvalue().splitlines():
+            log.info(line)
+        tell(f"drivers: {len(found)} calibrated, mean RMSPE {100.0 * found['rmspe'].mean():.2f} %")
     return drivers
 
 

@@ -8,11 +8,12 @@ from typing import Any
 
 from torch import compile
 from torch._dynamo.exc import TorchDynamoException
-from torch._inductor.exc import InductorError
+from torch._inductor.exc import CppCompileError, InductorError
 
 log = logging.getLogger("lcc_rl")
 
-COMPILER_ERRORS = (TorchDynamoException, InductorError)
+# CppCompileError: of a compiler that is there, but refuses the processor's code.
+COMPILER_ERRORS = (TorchDynamoException, InductorError, CppCompileError)
 # Where an object whose method is compiled keeps the environment and its pieces, and an environment
 # its pieces.
 CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import new_figure, save, unbox
-from lcc_rl.results.intervals import Estimate, band, share_saved
+from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, paired, savings, worse_off
 
 # Distinct without colour vision and in grey.
@@ -30,7 +30,6 @@ VEHICLES = {
     "cav": ("controlled car", "#0072b2"),
     "hdv": ("human follower", "#d55e00"),
 }
-WINDOW = 10  # iterations of the rolling mean
 
 
 def colour(strategy: str) -> str:
@@ -43,51 +42,6 @@ def style(axis: Axes, xlabel: str, ylabel: str) -> None:
     axis.set_xlabel(xlabel)
     axis.set_ylabel(ylabel)
     unbox(axis)
-
-
-def learning_curve(training: pd.DataFrame) -> Figure:
-    """Episode reward over episodes, see :func:`draw_curve` (Fig. 6).
-
-    Args:
-        training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
-    """
-    figure = new_figure(7.0, 4.0)
-    axis = figure.subplots()
-    floor = 0.0
-    for variant, rows in training.groupby("variant", sort=False):
-        mean, label = draw_curve(axis, rows, "episode_reward", str(variant))
-        axis.lines[-1].set_label(label)
-        floor = min(floor, float(mean.iloc[len(mean) // 5 :].min()))
-    # The first, random episodes would set the scale.
-    axis.set_ylim(bottom=1.6 * floor - 1.0)
-    style(axis, "training episodes", "mean reward per episode")
-    axis.legend(frameon=False)
-    axis.set_title(f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included")
-    axis.title.set_fontsize(10)
-    return figure
-
-
-def draw_curve(axis: Axes, rows: pd.DataFrame, column: str, variant: str) -> tuple[pd.Series, str]:
-    """Draw the rolling mean of one variant's column with a band.
-
-    Of several seeds the line is the mean and the band its 95 % bootstrap interval, as far as all
-    seeds have trained; of one seed the band spans the 5th to 95th percentile of the window.
-
-    Returns:
-        The line, and a label with the number of seeds.
-    """
-    curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
-    smooth = curves.rolling(WINDOW, min_periods=1)
-    line = smooth.mean().mean(axis=1)
-    if curves.shape[1] > 1:
-        low, high = band(smooth.mean().to_numpy(float))
-        label = f"{variant} (n = {curves.shape[1]} seeds, 95 % band)"
-    else:
-        low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
-        label = f"{variant} (1 seed; band: 5–95 % of {WINDOW} batches)"
-    axis.fill_between(line.index, low, high, color=colour(variant), alpha=0.2, lw=0)
-    axis.plot(line.index, line, color=colour(variant))
-    return line, label
 
 
 def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:

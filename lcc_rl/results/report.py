@@ -177,7 +177,7 @@ def _smaller(png: bytes) -> bytes:
 
 def _table(caption: str, frame: pd.DataFrame) -> str:
     shown = [c for c in frame.columns if not _is_bound(frame, str(c))]
-    columns = {name: _column(frame, name) for name in shown}
+    columns = {name: column_cells(frame, name) for name in shown}
     # Text stands left, numbers right.
     right = {c: ' class="number"' if _is_number(frame[c]) else "" for c in shown}
     head = "".join(f"<th{right[c]}>{escape(heading(str(c)))}</th>" for c in shown)
@@ -214,8 +214,8 @@ def _is_number(values: pd.Series) -> bool:
     return kinds.is_numeric_dtype(values) and not kinds.is_bool_dtype(values)
 
 
-def _column(frame: pd.DataFrame, name: str) -> list[str]:
-    """Format the cells of a column, with its interval where it has one."""
+def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
+    """Return the cells of a column as text, with its interval where the frame has one."""
     values = frame[name]
     places = _places(values)
     cells = [_cell(value, places) for value in values]

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from lcc_rl.config import is_sweep
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.runs.console import tell
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")
@@ -131,13 +132,16 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
         while wait(futures, 1.0, FIRST_EXCEPTION).not_done:
             due = not console.is_terminal and time.monotonic() - last >= every
             last = time.monotonic() if due else last
+            told = []
             for name, (folder, future) in jobs.items():
                 state = read_progress(folder)
                 if state is None:
                     continue
                 note = f"reward {state.get('reward', 0.0):.4g}  ETA {clock(state['eta_s'])}"
                 shown.update(tasks[name], completed=state["done"], total=state["total"], note=note)
-                if due and not future.done():
-                    log.info("%s: iteration %s/%s  %s", name, state["done"], state["total"], note)
+                if not future.done():
+                    told.append(f"{name} {state['done']}/{state['total']}, {note}")
+            if due and told:
+                tell("; ".join(told))
             if any(future.done() and future.exception() for future in futures):
                 return

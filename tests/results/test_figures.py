@@ -8,6 +8,7 @@ from matplotlib.text import Text
 from study_frames import episodes, training
 
 from lcc_rl.results import figures as study_figures
+from lcc_rl.results import training_figures
 from lcc_rl.results.drawing import save
 from lcc_rl.studies.alcc import comparison_figures
 from lcc_rl.studies.alcc import figures as alcc_figures
@@ -59,7 +60,7 @@ def single() -> pd.DataFrame:
 
 FIGURES = {
     "power_map": (lambda: alcc_figures.power_map(), ["kW", "speed [m/s]"]),
-    "learning_curve": (lambda: study_figures.learning_curve(training()), ["n = 2 seeds, 95 %"]),
+    "learning_curve": (lambda: training_figures.learning_curve(training()), ["n = 2 seeds, 95 %"]),
     "reward_terms": (lambda: alcc_figures.reward_terms(training()), ["HDV energy", "safety"]),
     "sample_episode": (lambda: study_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
     "human_energy": (
@@ -126,5 +127,14 @@ def test_a_sample_episode_is_of_one_seed_only() -> None:
 def test_seeds_of_different_length_share_the_shorter_curve() -> None:
     frame = training()
     short = frame[~((frame["seed"] == 1) & (frame["iteration"] > 12))]
-    figure = study_figures.learning_curve(short)
+    figure = training_figures.learning_curve(short)
     assert len(figure.axes[0].lines[0].get_xdata()) == 12
+
+
+def test_of_a_training_with_limits_the_shares_are_shown_with_the_limit() -> None:
+    frame = training().assign(loss_actor=3.0, share_efficiency=0.02)
+    frame["agent.limits.efficiency"] = 0.01
+    figure = training_figures.training_figure(frame)
+    assert "limit 1 %" in texts(figure)
+    assert figure.axes[1].lines[0].get_ydata() == pytest.approx(2.0)
+    assert len(training_figures.training_figure(training()).axes) == 1

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.drawing import new_figure
-from lcc_rl.results.figures import colour, draw_curve, style
+from lcc_rl.results.figures import colour, style
 from lcc_rl.results.savings import by_driver, savings
+from lcc_rl.results.training_figures import draw_curve
 from lcc_rl.studies.alcc.comparison_figures import INK, SOFT, whiskers
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 

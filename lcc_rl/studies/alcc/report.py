@@ -11,8 +11,8 @@ from lcc_rl import results
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
-from lcc_rl.results.figures import learning_curve
 from lcc_rl.results.runs import CONFIG
+from lcc_rl.results.training_figures import learning_curve
 from lcc_rl.studies.alcc import figures, tables
 from lcc_rl.studies.alcc.comparison_figures import (
     comparison_figure,

@@ -9,9 +9,9 @@ import pandas as pd
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results import string_figures
-from lcc_rl.results.figures import learning_curve
 from lcc_rl.results.runs import CONFIG
 from lcc_rl.results.string_tables import case_table
+from lcc_rl.results.training_figures import learning_curve
 from lcc_rl.studies.hcfs.study import BASELINES, LEARNED
 from lcc_rl.studies.hcfs.tables import printed, weights, win_rates
 from lcc_rl.studies.page import Page
