@@ -62,7 +62,7 @@ def look(folder: str, console: Console, watching: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Show the folder given on the command line."""
-    parser = argparse.ArgumentParser("lcc_rl.status", description=__doc__)
+    parser = argparse.ArgumentParser("lcc-rl status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
     options = parser.parse_args(arguments)

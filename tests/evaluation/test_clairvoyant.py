@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import pandas as pd
 import pytest
 import torch
@@ -99,12 +96,8 @@ def test_path_energy_at_constant_speed() -> None:
 
 @pytest.mark.slow
 def test_the_command(tmp_path, capsys) -> None:
-    path = Path(__file__).parents[2] / "tools" / "clairvoyant.py"
-    spec = importlib.util.spec_from_file_location("clairvoyant_tool", path)
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
+    from lcc_rl.commands import clairvoyant as tool
+
     short = ["scenario.horizon=30", "evaluation.profiles=1", "evaluation.drivers=2"]
     own = ["--iterations", "2", "--no-compile", "--out", str(tmp_path)]
     assert tool.main([*own, *short]) == 0

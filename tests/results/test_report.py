@@ -44,7 +44,7 @@ def page(tmp_path) -> Path:
     )
     sections = [
         Section("First & last", "One < two.\n\nNext.", [("A table", table)], pictures),
-        made(["python tools/reproduce.py alcc"], [("Configuration", "seed: 0")]),
+        made(["lcc-rl reproduce alcc"], [("Configuration", "seed: 0")]),
     ]
     return write_report(tmp_path, "A study", sections)
 
@@ -105,7 +105,7 @@ def test_cells_are_formatted_for_readers(page) -> None:
 
 def test_how_it_was_made(page) -> None:
     html = page.read_text()
-    assert "python tools/reproduce.py alcc" in html
+    assert "lcc-rl reproduce alcc" in html
     assert "<td>torch</td>" in html
     assert re.search(r"written on \d{4}-\d\d-\d\d", html)
 

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import reproduce
 from matplotlib.figure import Figure
 from PIL import Image
 
 from lcc_rl import config
-from lcc_rl.commands import evaluation, training
+from lcc_rl.commands import evaluation, reproduce, training
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.studies import page, runner

@@ -43,9 +43,12 @@ COLUMNS = [
 ]
 
 
+EXTRAS = ("collect", "update", "calibrate")  # those that compare with packages of an extra
+
+
 @pytest.fixture(scope="module")
 def benchmark() -> ModuleType:
-    module = importlib.import_module("benchmark")
+    module = importlib.import_module("lcc_rl.commands.benchmark")
     assert set(module.BENCHMARKS) == set(NAMES)
     return module
 
@@ -113,7 +116,7 @@ def test_bad_input_ends_in_one_clear_error(benchmark, tmp_path, capsys, argument
 
 
 def test_a_wrong_plain_loop_is_not_timed(benchmark, monkeypatch) -> None:
-    monkeypatch.setattr("benchmarks.plain.motor_power", lambda speed, acceleration: speed)
+    monkeypatch.setattr("lcc_rl.benchmarks.plain.motor_power", lambda speed, acceleration: speed)
     options = benchmark.parse(["env", "--quick", "--device", "cpu"])
     with pytest.raises(RuntimeError, match="plain loop is off"):
         benchmark.env(options)
@@ -122,7 +125,7 @@ def test_a_wrong_plain_loop_is_not_timed(benchmark, monkeypatch) -> None:
 def test_a_wrong_plain_python_loop_is_not_timed(benchmark, monkeypatch) -> None:
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setattr("benchmarks.scalar.power", lambda speed, acceleration: speed)
+    monkeypatch.setattr("lcc_rl.benchmarks.scalar.power", lambda speed, acceleration: speed)
     options = benchmark.parse(["collect", "--quick", "--device", "cpu"])
     with pytest.raises(RuntimeError, match="plain Python loop is off"):
         benchmark.collect(options)
@@ -130,8 +133,8 @@ def test_a_wrong_plain_python_loop_is_not_timed(benchmark, monkeypatch) -> None:
 
 @pytest.mark.slow
 def test_without_the_extra_it_says_what_is_left_out(benchmark, monkeypatch, tmp_path, capsys):
-    for module in ("benchmark", *(f"benchmarks.{x}" for x in ("collect", "update", "calibrate"))):
-        monkeypatch.setattr(f"{module}.installed", lambda *names: False)
+    for module in ("commands.benchmark", *(f"benchmarks.{x}" for x in EXTRAS)):
+        monkeypatch.setattr(f"lcc_rl.{module}.installed", lambda *names: False)
     out = tmp_path / "rows.parquet"
     names = ["collect", "update", "calibrate"]
     assert benchmark.main([*names, "--quick", "--out", str(out)]) == 0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from xml.etree import ElementTree
 
-import export_drivers
 import pandas as pd
 import pytest
 
+from lcc_rl.commands import export_drivers
 from lcc_rl.drivers.tables import load_drivers
 
 NETWORK = """<net version="1.9">

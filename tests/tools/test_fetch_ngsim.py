@@ -9,9 +9,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlparse
 
-import fetch_ngsim
 import pytest
 
+from lcc_rl.commands import fetch as fetch_ngsim
 from lcc_rl.data.ngsim import read_ngsim
 
 Capture = pytest.CaptureFixture[str]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
-import reproduce as tool
+
+from lcc_rl.commands import reproduce as tool
+from lcc_rl.runs.cli import main_guard
 
 
 @pytest.mark.parametrize(
@@ -19,7 +21,7 @@ import reproduce as tool
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, words, expected) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as caught:
-        tool.main_guard(tool.main)(words)
+        main_guard(tool.main)(words)
     assert caught.value.code == 2
     said = capsys.readouterr().err
     assert expected in said

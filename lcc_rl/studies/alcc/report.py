@@ -36,7 +36,7 @@ def write_results(folder: str | Path) -> Path:
     Sections whose runs do not exist are left out.
 
     Args:
-        folder: a study's folder, written by ``tools/reproduce.py alcc``.
+        folder: a study's folder, written by ``lcc-rl reproduce alcc``.
 
     Returns:
         The page's path.
@@ -47,7 +47,7 @@ def write_results(folder: str | Path) -> Path:
     page = Page(folder)
     if not any(page.folder.glob("**/evaluation/episodes.parquet")):
         raise ResultsError(
-            f"{folder}: no evaluation/episodes.parquet; python tools/reproduce.py alcc makes it"
+            f"{folder}: no evaluation/episodes.parquet; lcc-rl reproduce alcc makes it"
         )
     for add in (add_main, _filter, _learning, _ablations, _single, _followers, _people):
         add(page)

@@ -26,7 +26,7 @@ def write_results(folder: str | Path) -> Path:
     """Write tables/*.parquet, figures/*.png and report.html from a study's parquet files alone.
 
     Args:
-        folder: a study's folder, written by ``tools/reproduce.py hcfs``.
+        folder: a study's folder, written by ``lcc-rl reproduce hcfs``.
 
     Returns:
         The page's path.
@@ -62,7 +62,7 @@ def read_evaluations(folder: Path, table: str) -> pd.DataFrame:
     seeds = sorted(root.glob(f"seed_*/{table}.parquet"), key=lambda p: int(p.parent.name[5:]))
     paths = [root / BASELINES / f"{table}.parquet", *seeds]
     if not seeds:
-        raise ResultsError(f"{folder}: no evaluation; python tools/reproduce.py hcfs makes it")
+        raise ResultsError(f"{folder}: no evaluation; lcc-rl reproduce hcfs makes it")
     return pd.concat([read_parquet(path) for path in paths], ignore_index=True)
 
 

@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from benchmarks.harness import TOLERANCE, Row, Run, alternate, rows_of, times
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.fused import FusedUpdate
+from lcc_rl.benchmarks.harness import TOLERANCE, Row, Run, alternate, rows_of, times
 
 ONE_BY_ONE = "one after the other"
 TOGETHER = "together"

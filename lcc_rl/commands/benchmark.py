@@ -1,4 +1,4 @@
-"""Measure speed against named alternatives: python tools/benchmark.py [read env …] [--quick].
+"""Measure speed against named alternatives: lcc-rl benchmark [read env …] [--quick].
 
 A figure is the median of alternating repeats (A B A B …); a ratio is the median over the repeats
 of value / value of the alternative, both of the same run, so that a busy machine slows both.
@@ -15,21 +15,21 @@ from shutil import which
 
 import pandas as pd
 import torch
-from benchmarks.calibrate import calibrate
-from benchmarks.collect import collect
-from benchmarks.env import env
-from benchmarks.estimator import estimator
-from benchmarks.evaluate import evaluate
-from benchmarks.harness import EXTRA, Row, drawn, installed
-from benchmarks.infer import infer
-from benchmarks.read import read
-from benchmarks.scale import scale
-from benchmarks.seeds import seeds
-from benchmarks.sweep import sweep
-from benchmarks.train import train
-from benchmarks.update import update
 from rich.console import Console
 
+from lcc_rl.benchmarks.calibrate import calibrate
+from lcc_rl.benchmarks.collect import collect
+from lcc_rl.benchmarks.env import env
+from lcc_rl.benchmarks.estimator import estimator
+from lcc_rl.benchmarks.evaluate import evaluate
+from lcc_rl.benchmarks.harness import EXTRA, Row, drawn, installed
+from lcc_rl.benchmarks.infer import infer
+from lcc_rl.benchmarks.read import read
+from lcc_rl.benchmarks.scale import scale
+from lcc_rl.benchmarks.seeds import seeds
+from lcc_rl.benchmarks.sweep import sweep
+from lcc_rl.benchmarks.train import train
+from lcc_rl.benchmarks.update import update
 from lcc_rl.errors import LccError, unknown_name
 from lcc_rl.io.files import processor, write_parquet
 
@@ -114,7 +114,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     console.print(f"{len(rows)} rows: {options.out}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

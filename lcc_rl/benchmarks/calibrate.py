@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import differential_evolution
 
-from benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
-from benchmarks.search import batched_search
+from lcc_rl.benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
+from lcc_rl.benchmarks.search import batched_search
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.fit import DEFAULT_GENETIC, fit
 from lcc_rl.drivers.observed import Observed, observe

@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from benchmarks.env import collecting
-from benchmarks.harness import Row, Run, alternate, endings, rows_of
-from benchmarks.plain import PlainLoop, alcc
+from lcc_rl.benchmarks.env import collecting
+from lcc_rl.benchmarks.harness import Row, Run, alternate, endings, rows_of
+from lcc_rl.benchmarks.plain import PlainLoop, alcc
 from lcc_rl.envs.rollout import ACTION
 
 

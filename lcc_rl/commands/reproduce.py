@@ -1,12 +1,12 @@
-"""Reproduce a paper's study, from trajectories to one page: python tools/reproduce.py alcc.
+"""Reproduce a paper's study, from trajectories to one page: lcc-rl reproduce alcc.
 
-  python tools/reproduce.py alcc                            # embedded stream, 8 seeds, Table III
-  python tools/reproduce.py alcc data=ngsim data.path=...   # real trajectories; any override
-  python tools/reproduce.py alcc --recipe quickstart --parts main,filter   # in an hour, not days
-  python tools/reproduce.py alcc --parts main,filter agent=analytic   # another agent, its settings
-  python tools/reproduce.py alcc --recipe smoke --seeds 1   # everything once, in seconds
-  python tools/reproduce.py hcfs                            # platoon: 8 DDPG parents, hybrids
-  python tools/reproduce.py report outputs/alcc             # tables, figures and page, from parquet
+  lcc-rl reproduce alcc                            # embedded stream, 8 seeds, Table III
+  lcc-rl reproduce alcc data=ngsim data.path=...   # real trajectories; any override
+  lcc-rl reproduce alcc --recipe quickstart --parts main,filter   # in an hour, not days
+  lcc-rl reproduce alcc --parts main,filter agent=analytic   # another agent, its settings
+  lcc-rl reproduce alcc --recipe smoke --seeds 1   # everything once, in seconds
+  lcc-rl reproduce hcfs                            # platoon: 8 DDPG parents, hybrids
+  lcc-rl reproduce report outputs/alcc             # tables, figures and page, from parquet
 
 The same command resumes where it stopped: finished runs are skipped, interrupted trainings are
 resumed, failed ones are listed and do not stop the others.
@@ -17,12 +17,10 @@ from __future__ import annotations
 import argparse
 import logging
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.runs.cli import main_guard
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.alcc.settings import ABLATIONS, chooses_agent
@@ -137,8 +135,4 @@ def main(words: list[str]) -> int:
     check_overrides(overrides)
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
-    return int(arguments.run(arguments, shlex.join(["python", "tools/reproduce.py", *words])))
-
-
-if __name__ == "__main__":
-    sys.exit(main_guard(main)(sys.argv[1:]))
+    return int(arguments.run(arguments, shlex.join(["lcc-rl", "reproduce", *words])))

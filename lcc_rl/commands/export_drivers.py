@@ -1,6 +1,6 @@
 """Write calibrated drivers as vehicle types of SUMO, one ``vType`` each.
 
-    python tools/export_drivers.py drivers.parquet vtypes.xml
+    lcc-rl drivers drivers.parquet vtypes.xml
 
 SUMO's IDM has the same law (``tests/properties/test_sumo.py`` compares both, with SUMO's ballistic
 steps); it has no optimal velocity model, full velocity difference model or Gipps' model.
@@ -98,7 +98,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     print(f"{count} vehicle types in {options.target}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,8 +8,8 @@ from functools import partial
 import torch
 from torchrl.envs.utils import step_mdp
 
-from benchmarks.harness import Row, Run, alternate, endings, rows_of, times
-from benchmarks.plain import alcc
+from lcc_rl.benchmarks.harness import Row, Run, alternate, endings, rows_of, times
+from lcc_rl.benchmarks.plain import alcc
 from lcc_rl.envs.rollout import ACTION
 
 

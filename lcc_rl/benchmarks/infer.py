@@ -13,8 +13,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.harness import TOLERANCE, Row, Run, alternate, rows_of, times
 from lcc_rl.agents import DDPG
+from lcc_rl.benchmarks.harness import TOLERANCE, Row, Run, alternate, rows_of, times
 from lcc_rl.pieces import MPC
 
 

@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.harness import Row, installed, rows_of
 from lcc_rl import results
+from lcc_rl.benchmarks.harness import Row, installed, rows_of
 from lcc_rl.errors import ResultsError
 from lcc_rl.runs.sweeps import parallel_jobs
 

@@ -1,6 +1,6 @@
 """Download the official NGSIM export of the US Department of Transportation, page by page.
 
-    python tools/fetch_ngsim.py --location i-80 --output data/ngsim_i80.csv
+    lcc-rl fetch --location i-80 --output data/ngsim_i80.csv
 
 The portal holds 11.8 million rows of four locations. The download is paged; the same command
 resumes an interrupted one. The file gets its name only when it is complete, with as many rows as
@@ -267,7 +267,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     print(f"{options.output}: {rows:,} rows")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

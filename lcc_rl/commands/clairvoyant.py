@@ -1,8 +1,8 @@
 """Upper bound of the saving, and of what regard for the drivers behind can be worth.
 
-    python tools/clairvoyant.py data=ngsim data.path=...          # beside idm and the policy
-    python tools/clairvoyant.py --policy outputs/train/<run> --iterations 100 evaluation.drivers=3
-    python tools/clairvoyant.py --regard --policy pretrained --policy pretrained/reference ...
+    lcc-rl clairvoyant data=ngsim data.path=...          # beside idm and the policy
+    lcc-rl clairvoyant --policy outputs/train/<run> --iterations 100 evaluation.drivers=3
+    lcc-rl clairvoyant --regard --policy pretrained --policy pretrained/reference ...
 
 Plans every held-out episode by the gradient through the simulator, with knowledge of the whole
 profile, starting from a learned policy's actions, and evaluates the plan like any other strategy.
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -42,7 +41,6 @@ from lcc_rl.io.files import write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
-from lcc_rl.runs.cli import main_guard
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.studies.runner import check_overrides
@@ -58,7 +56,7 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
     """Evaluate human driver, policies and plans; write and return the rows of episodes.parquet."""
     own = ["variant=alcc", f"evaluation.drivers={DRIVERS}"]
     cfg = load("evaluate", [*own, *overrides])
-    require(cfg.device == "cpu", "tools/clairvoyant.py runs on device=cpu")
+    require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     learned = [start(cfg, path, inputs) for path in options.policy or ["pretrained"]]
@@ -178,7 +176,3 @@ def main(arguments: list[str]) -> int:
     if options.regard:
         Console().print(regard(episodes), highlight=False)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main_guard(main)(sys.argv[1:]))

@@ -1,0 +1,80 @@
+"""The console command ``lcc-rl``: all commands of the package under one name."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from lcc_rl.runs import interrupts
+from lcc_rl.version import __version__
+
+# Name, module and what it does. Each module has a main: of the first four, which Hydra reads,
+# without arguments.
+HYDRA = {
+    "run": ("lcc_rl.pipeline", "the main job: data, drivers, policies, results, one page"),
+    "train": ("lcc_rl.train", "train a variant and evaluate it; -m for a sweep"),
+    "evaluate": ("lcc_rl.evaluate", "compare policies, controllers and baselines"),
+    "calibrate": ("lcc_rl.calibrate", "fit driver models to trajectories"),
+}
+TOOLS = {
+    "status": ("lcc_rl.status", "what runs are running, waiting, finished, failed"),
+    "reproduce": ("lcc_rl.commands.reproduce", "a paper's study, to one page"),
+    "benchmark": ("lcc_rl.commands.benchmark", "speed, against named alternatives"),
+    "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
+    "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
+    "drivers": ("lcc_rl.commands.export_drivers", "calibrated drivers as SUMO vehicle types"),
+}
+COMMANDS = {**HYDRA, **TOOLS}
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run ``lcc-rl <command> …``; exits as the command does.
+
+    Args:
+        words: what is typed after ``lcc-rl``; by default this process's arguments.
+    """
+    words = list(sys.argv[1:] if words is None else words)
+    if not words or words[0] in ("-h", "--help"):
+        print(_help())
+    elif words[0] == "--version":
+        print(f"lcc-rl {__version__}")
+    elif words[0] not in COMMANDS:
+        from lcc_rl.errors import unknown_name
+
+        print(f"lcc-rl: error: {unknown_name('command', words[0], COMMANDS)}", file=sys.stderr)
+        sys.exit(interrupts.BAD_INPUT)
+    else:
+        _run(words[0], words[1:])
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"lcc-rl {__version__}: learn and compare car-following controllers in mixed traffic",
+            "",
+            "usage: lcc-rl <command> …      lcc-rl <command> -h      lcc-rl --version",
+            "",
+            *lines,
+            "",
+            "run, train, evaluate and calibrate take settings as key=value (experiment=smoke).",
+        ]
+    )
+
+
+def _run(name: str, words: list[str]) -> None:
+    """Run one command, with the words that follow it as this process's arguments."""
+    interrupts.end_quietly()
+    sys.argv = [f"lcc-rl {name}", *words]
+    module = import_module(COMMANDS[name][0])
+    if name in HYDRA:
+        module.main()
+    elif name == "status":
+        module.main(words)
+    else:
+        from lcc_rl.runs.cli import main_guard
+
+        with interrupts.interruptible():
+            sys.exit(main_guard(module.main)(words))
