@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import torch
 from torch import Tensor
 
@@ -16,7 +18,7 @@ SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has 
 
 
 class CBFFilter(StepTransform):
-    """Changes a command as little as needed for the vehicle to stay between two limits.
+    """Changes a command as little as needed for the vehicle to stay between its limits.
 
     Two functions of the state are to stay positive: ``gap − margin − τ·(v − v_ahead)``, which
     keeps time-to-collision above τ, and ``longest(v) − gap``, which keeps the time gap below
@@ -34,6 +36,9 @@ class CBFFilter(StepTransform):
     :class:`Promised` of :meth:`watch` writes. Where a measurement or the command is no number, the
     filter brakes fully.
 
+    With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
+    expectation as comfort: as far as the vehicle ahead keeps its acceleration and braking suffices.
+
     Behind a leader at standstill both limits are about the same number, gap / speed, so who comes
     from afar must break one. With a ``full_speed``, ``longest(v)`` is ``time_gap·v`` from there on
     and falls with the square of the speed below: the vehicle is near before its leader stands, and
@@ -49,7 +54,8 @@ class CBFFilter(StepTransform):
         margin: gap that counts as contact [m].
         braking_ahead: hardest braking of the vehicle ahead that is reckoned with [m/s²].
         time_gap: longest allowed [s]; None: no limit.
-        time_gap_rate: how fast that limit may be approached [1/s].
+        shortest_time_gap: shortest allowed [s]; None: no limit.
+        time_gap_rate: how fast the limits of the time gap may be approached [1/s].
         full_speed: speed below which the longest time gap falls in proportion; 0: it does not
             [m/s].
         least_gap: gap that the limit of the time gap always allows [m].
@@ -70,6 +76,7 @@ class CBFFilter(StepTransform):
         margin: float = 0.2,
         braking_ahead: float = 2.6,
         time_gap: float | None = 2.45,
+        shortest_time_gap: float | None = None,
         time_gap_rate: float = 0.2,
         full_speed: float = 0.0,
         least_gap: float = 2.0,
@@ -83,6 +90,8 @@ class CBFFilter(StepTransform):
         require_positive(where, **limits)
         if time_gap is not None:
             require_positive(where, time_gap=time_gap)
+        if shortest_time_gap is not None:
+            require_in(where, f"(0, {time_gap or inf})", shortest_time_gap=shortest_time_gap)
         require_in(where, "[0, inf)", full_speed=full_speed, least_gap=least_gap)
         string = VehicleString((role,)) if string is None else string
         seen = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
@@ -92,7 +101,8 @@ class CBFFilter(StepTransform):
         self.rate, self.margin = rate, margin
         self.braking = Braking(max_acceleration, braking_ahead, time_to_collision)
         self.string, self.role = string, role
-        self.longest, self.time_gap_rate = time_gap, time_gap_rate
+        self.longest, self.shortest = time_gap, shortest_time_gap
+        self.time_gap_rate = time_gap_rate
         self.full_speed, self.least_gap = max(full_speed, SLOWEST), least_gap
 
     def watch(self) -> Promised:
@@ -118,6 +128,11 @@ class CBFFilter(StepTransform):
         expected = ahead_acceleration + slower / (shortest + 0.5 * self.time_step)
         safe = safe_acceleration(speed, free, ahead, self.braking, self.time_step)
         command = torch.minimum(command, torch.minimum(expected, safe))
+        if self.shortest is not None:
+            room = gap - self.shortest * speed
+            opening = 0.5 * self.time_step * ahead_acceleration - closing
+            held = (self.time_gap_rate * room + opening) / (self.shortest + 0.5 * self.time_step)
+            command = torch.minimum(command, held)
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
         # Any of them that is no number, or infinite, shows in the sum.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()

@@ -43,6 +43,21 @@ def test_no_policy_passes_the_limits(action) -> None:
     assert broken.double().mean() > 0.1
 
 
+def test_a_shortest_time_gap_is_kept_where_braking_suffices() -> None:
+    both = ["+filter=cbf", "scenario.filters.automated.time_to_collision=0.5"]
+    limit = "scenario.filters.automated.shortest_time_gap=1.2"
+    without, held = driven(1.0, *both), driven(1.0, *both, limit)
+    assert (without["time_gap"] < 1.0).double().mean() > 0.2
+    assert (held["time_gap"][50:] < 1.19).double().mean() < 0.01
+    assert held["time_gap"][50:].median() < 1.6  # it is a limit, not a longer gap
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, 2.5])
+def test_a_shortest_time_gap_lies_below_the_longest(seconds) -> None:
+    with pytest.raises(ConfigError, match="shortest_time_gap"):
+        CBFFilter(0.1, time_gap=2.45, shortest_time_gap=seconds)
+
+
 @pytest.mark.parametrize("variant", ["alcc", "reference", "idm"])
 def test_specs(variant) -> None:
     check_env_specs(small_env(variant, 2, ["+filter=cbf"]))
