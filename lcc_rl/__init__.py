@@ -1,8 +1,8 @@
 """Learn and compare car-following controllers in mixed traffic.
 
-``lcc_rl.make_env`` builds a TorchRL environment of a string of vehicles, ``lcc_rl.results`` reads
-what runs leave behind. The commands are ``python -m lcc_rl.train``, ``evaluate``, ``calibrate``,
-``pipeline`` and ``status``.
+``lcc_rl.make_env`` builds a TorchRL environment of a string of vehicles, ``lcc_rl.learn`` trains a
+policy, ``lcc_rl.compare`` evaluates several, ``lcc_rl.export`` writes one for other software and
+``lcc_rl.results`` reads what runs leave behind. The command is ``lcc-rl``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ from typing import Any
 from lcc_rl.runs import interrupts
 from lcc_rl.version import __version__
 
-__all__ = ["__version__", "make_env", "results"]
+__all__ = ["__version__", "compare", "export", "learn", "make_env", "results"]
+# Where what loads torch is defined.
+LAZY = {
+    "make_env": "lcc_rl.envs.factory",
+    "learn": "lcc_rl.api",
+    "compare": "lcc_rl.api",
+    "export": "lcc_rl.interfaces.export",
+}
 
 if interrupts.is_command():
     interrupts.end_quietly()
@@ -21,8 +28,8 @@ if interrupts.is_command():
 
 def __getattr__(name: str) -> Any:
     # Lazy: asking for the version must not load torch.
-    if name == "make_env":
-        return import_module("lcc_rl.envs.factory").make_env
+    if name in LAZY:
+        return getattr(import_module(LAZY[name]), name)
     if name == "results":
         return import_module("lcc_rl.results")
     raise AttributeError(f"module 'lcc_rl' has no attribute {name!r}")

@@ -23,6 +23,7 @@ TOOLS = {
     "benchmark": ("lcc_rl.commands.benchmark", "speed, against named alternatives"),
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
+    "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX or PyTorch program"),
     "drivers": ("lcc_rl.commands.export_drivers", "calibrated drivers as SUMO vehicle types"),
 }
 COMMANDS = {**HYDRA, **TOOLS}

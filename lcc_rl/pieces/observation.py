@@ -88,6 +88,7 @@ class Observation(Feature):
             for key, first, base in zip(seen, firsts, bases, strict=True)
             if not base
         }
+        self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
         self.register_buffer("constants", torch.tensor([1.0] * len(values) if raw else values))
@@ -101,6 +102,19 @@ class Observation(Feature):
         if name not in self.layout:
             raise ConfigError(f"a rule needs {name}, which observation.scales does not name")
         return self.layout[name]
+
+    def columns(self) -> list[list[str]]:
+        """Return of every column what is seen, and from what it is a difference, if from any.
+
+        Of a view with several columns the number of the column follows: ``"memory.entries.0"``.
+        """
+        found = []
+        for name, bases, repeat in zip(self.seen, self.bases, self.repeats, strict=True):
+            width = max(len(bases), 1) * repeat
+            for column in range(width):
+                own = name if width == 1 else f"{name}.{column}"
+                found.append([own, *(self.names[i] for i in bases[column // repeat :][:1])])
+        return found
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the scaled observation, ``[*batch, A, entries]``."""

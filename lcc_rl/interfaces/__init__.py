@@ -1,0 +1,1 @@
+"""Interfaces to other software: Gymnasium environments, exported policies, SUMO."""

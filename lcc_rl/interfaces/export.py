@@ -1,0 +1,229 @@
+"""Trained policies as files that other software runs: ONNX, or PyTorch's ``.pt2``.
+
+An exported policy takes what one vehicle measures in SI units and returns its acceleration: the
+scales of the observation, the network and the safety filter, where it has one, are inside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import warnings
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs.factory import build_env
+from lcc_rl.envs.inputs import constant_profiles
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.evaluation.strategies import with_weights
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.pieces import Action, CBFFilter, Observation
+from lcc_rl.pieces.entries import ENTRIES
+from lcc_rl.results.policies import load_policy
+from lcc_rl.version import __version__
+
+# What follows from other measurements is computed inside: v_ahead − v.
+DERIVED = {
+    "self.relative_speed": ("ahead.speed", "self.speed"),
+    "behind.relative_speed": ("self.speed", "behind.speed"),
+}
+FILTERED = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
+
+
+class Input(NamedTuple):
+    """A column of an exported policy's input: its name, unit and meaning."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+class ExportedPolicy(nn.Module):
+    """From measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
+
+    Args:
+        network: of the scaled observation, with actions in [−1, 1].
+        observation: the piece that gathers and scales.
+        action: the piece that makes accelerations of actions.
+        safety: the filter behind them; None: none.
+    """
+
+    constants: Tensor
+
+    def __init__(
+        self, network: nn.Module, observation: Observation, action: Action, safety: Any
+    ) -> None:
+        super().__init__()
+        self.network, self.largest, self.safety = network, action.max_acceleration, safety
+        self.register_buffer("constants", observation.constants.clone())
+        seen = observation.columns()
+        needed = [name for column in seen for name in column]
+        needed += FILTERED if safety is not None else ()
+        flat = [base for name in needed for base in DERIVED.get(name, (name,))]
+        self.names = list(dict.fromkeys(flat))
+        self.columns = [[self._places(name) for name in column] for column in seen]
+
+    def _places(self, name: str) -> tuple[int, ...]:
+        return tuple(self.names.index(base) for base in DERIVED.get(name, (name,)))
+
+    def _value(self, state: Tensor, places: tuple[int, ...]) -> Tensor:
+        """Return a measurement, or the difference of two, ``[batch, 1]``."""
+        first = state[:, places[0] : places[0] + 1]
+        return first if len(places) == 1 else first - state[:, places[1] : places[1] + 1]
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Return the acceleration to command."""
+        rows = []
+        for value, *bases in self.columns:
+            seen = self._value(state, value)
+            rows.append(seen - self._value(state, bases[0]) if bases else seen)
+        action = self.network(torch.cat(rows, -1) * self.constants)
+        command = action.clamp(-1.0, 1.0) * self.largest
+        if self.safety is None:
+            return command
+        measured = (self._value(state, self._places(name)) for name in FILTERED)
+        filtered: Tensor = self.safety.filtered(command, *measured)
+        return filtered
+
+    def inputs(self) -> list[Input]:
+        """Return what the columns of the input are, in order."""
+        return [described(name) for name in self.names]
+
+
+def described(name: str) -> Input:
+    """Return unit and meaning of a measurement by its name, as ``"ahead.speed"``."""
+    view, entry = name.split(".")[:2]
+    whose = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
+    for key in (("vehicles", entry), (view, entry), ("role", entry)):
+        if key in ENTRIES:
+            unit, meaning = ENTRIES[key]
+            return Input(name, unit, f"{meaning} ({whose.get(view, view)})")
+    return Input(name, "–", f"{entry} ({whose.get(view, view)})")
+
+
+def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy:
+    """Build the module that is exported.
+
+    Args:
+        policy: a run folder, a policy file, or ``pretrained/<name>``.
+        trust: modules outside this package that it may name.
+
+    Raises:
+        ConfigError: if no such policy ships, or it cannot be exported.
+        ResultsError: if the file is missing or damaged.
+    """
+    weights, cfg = load_policy(policy, trust=trust)
+    population = bootstrap()
+    scenario = cfg.scenario
+    leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
+    env = build_env(cfg, leader, population)
+    pieces = pieces_of(env)
+    found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
+    if not all(found.values()):
+        raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
+    safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
+    learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
+    assert isinstance(learned, TensorDictModule)
+    (observation,), (action,) = found.values()
+    module = ExportedPolicy(learned.module, observation, action, safety)
+    return module.eval().requires_grad_(False)
+
+
+def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> Path:
+    """Write a trained policy, with its safety filter, as ONNX or PyTorch's exported program.
+
+    The input ``state`` is ``[batch, inputs]`` in SI units, the output ``acceleration``
+    ``[batch, 1]`` [m/s²]; names, units and meanings of the inputs are in the file's metadata under
+    ``lcc_rl`` as JSON.
+
+    Args:
+        policy: a run folder, a policy file, or ``pretrained/<name>``.
+        path: the file to write; its ending, ``.onnx`` or ``.pt2``, chooses the form.
+        trust: modules outside this package that the policy may name.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ConfigError: if the ending is another one, an extra is missing, or the policy cannot be
+            exported.
+        ResultsError: if the policy cannot be read, or the file exists or cannot be written.
+
+    Examples:
+        >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
+    """
+    path = Path(path)
+    if path.suffix not in FORMS:
+        raise unknown_name("ending", path.suffix, FORMS)
+    if path.exists():
+        raise ResultsError(f"{path}: exists already; remove it or choose another name")
+    module = exported_policy(policy, trust)
+    inputs = [item._asdict() for item in module.inputs()]
+    about: dict[str, Any] = {"policy": str(policy), "lcc_rl": __version__, "inputs": inputs}
+    about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
+    example = torch.ones(2, len(module.names))
+    batch = {"state": {0: torch.export.Dim("batch", min=1)}}
+    program = torch.export.export(module, (example,), dynamic_shapes=batch)
+    with atomic_path(path) as temporary:
+        text = json.dumps(about, ensure_ascii=False)
+        temporary.write_bytes(FORMS[path.suffix](program, text))
+    return path
+
+
+def _as_pt2(program: Any, about: str) -> bytes:
+    buffer = BytesIO()
+    torch.export.save(program, buffer, extra_files={"lcc_rl": about})
+    return buffer.getvalue()
+
+
+def _as_onnx(program: Any, about: str) -> bytes:
+    try:
+        import onnx
+        import onnxscript  # noqa: F401 - what torch exports with
+    except ImportError as error:
+        raise ConfigError(
+            f"{error.name} is not installed; pip install 'lcc_rl[interfaces]', or write a .pt2"
+        ) from error
+    registry = logging.getLogger("torch.onnx._internal.exporter._registration")
+    registry.setLevel(logging.ERROR)  # that torchvision, of no use here, is missing
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of torch, about itself
+        made = torch.onnx.export(
+            program,
+            (),
+            dynamo=True,
+            verbose=False,
+            input_names=["state"],
+            output_names=["acceleration"],
+        )
+    assert made is not None
+    proto = made.model_proto
+    onnx.helper.set_model_props(proto, {"lcc_rl": about})
+    content: bytes = proto.SerializeToString()
+    return content
+
+
+FORMS = {".onnx": _as_onnx, ".pt2": _as_pt2}
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Export the policy named on the command line."""
+    parser = argparse.ArgumentParser(description="Export a policy for other software.")
+    parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
+    parser.add_argument("path", help="file to write, .onnx or .pt2")
+    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    options = parser.parse_args(words)
+    path = export(options.policy, options.path, options.trust)
+    for item in exported_policy(options.policy, options.trust).inputs():
+        print(f"  {item.name} [{item.unit}]: {item.meaning}")
+    print(f"{path}: from these, in this order, the acceleration [m/s²]")
+    return 0

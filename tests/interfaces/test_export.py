@@ -1,0 +1,112 @@
+"""Exported policies command what the environment's vehicles obey, filter included."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers import small_env
+
+import lcc_rl
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.interfaces.export import ExportedPolicy, exported_policy, main
+from lcc_rl.results.policies import load_policy
+
+KEYS = [("vehicles", name) for name in ("speed", "gap", "acceleration")]
+
+
+@pytest.fixture(scope="module")
+def module() -> ExportedPolicy:
+    return exported_policy("pretrained/i80-follow")
+
+
+def states(module: ExportedPolicy, count: int = 256) -> torch.Tensor:
+    chance = torch.Generator().manual_seed(0)
+    return 20.0 * torch.rand(count, len(module.names), generator=chance)
+
+
+def test_inputs_are_measurements_with_units(module) -> None:
+    units = {item.name: item.unit for item in module.inputs()}
+    assert units["self.gap"] == "m"
+    assert units["ahead.acceleration"] == "m/s²"
+    assert not any("relative" in name for name in units)
+
+
+def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
+    own = load_policy("pretrained/i80-follow")[1]
+    extra = ["+filter=cbf", "+observation.scales.ahead.acceleration=0.3", "agent=analytic"]
+    env = small_env("alcc", 16, ["scenario.horizon=60", *extra], nominal=True)
+    assert own.observation == env_observation(extra)
+
+    def policy(td):
+        state = torch.stack([value(td, name) for name in module.names], -1)
+        said.append(module(state).squeeze(-1))
+        return td.set(("automated", "action"), said[-1].view(-1, 1, 1) / 3.0)
+
+    said: list[torch.Tensor] = []
+    record, _ = play(env, policy, None, [("command", "automated")])
+    obeyed = record["command", "automated"].flatten(1)[-60:]
+    # Filtered inside already, the environment's own filter changes nothing.
+    torch.testing.assert_close(torch.stack(said)[: len(obeyed)], obeyed, atol=2e-3, rtol=0.0)
+
+
+def env_observation(extra: list[str]):
+    from lcc_rl.config import load
+
+    return load("train", ["variant=alcc", *extra]).observation
+
+
+def value(td, name: str) -> torch.Tensor:
+    view, entry = name.split(".")
+    if view == "ahead":
+        return td["leader", entry].squeeze(-1)
+    return td["vehicles", entry][:, 0 if view == "self" else 1, 0]
+
+
+def test_the_filter_is_inside(module) -> None:
+    near = {"ahead.speed": 0.0, "self.gap": 5.0}
+    state = torch.tensor([[near.get(name, 15.0) for name in module.names]])
+    assert module(state).item() == -3.0
+    assert torch.isfinite(module(torch.full_like(state, torch.nan))).all()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_path) -> None:
+    path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.pt2")
+    about = {"lcc_rl": ""}
+    program = torch.export.load(path, extra_files=about).module()
+    torch.testing.assert_close(program(states(module)), module(states(module)))
+    assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
+    with pytest.raises(ResultsError, match="exists already"):
+        lcc_rl.export("pretrained/i80-follow", path)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
+    runtime = pytest.importorskip("onnxruntime", reason="extra interfaces")
+    pytest.importorskip("onnxscript", reason="extra interfaces")
+    path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.onnx")
+    session = runtime.InferenceSession(path)
+    state = states(module)
+    (found,) = session.run(None, {"state": state.numpy()})
+    np.testing.assert_allclose(found, module(state).numpy(), atol=1e-5)
+    about = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])
+    assert about["filter"] is True
+    assert [item["name"] for item in about["inputs"]] == module.names
+
+
+def test_a_policy_with_memory_names_every_moment() -> None:
+    names = exported_policy("pretrained/i24-follow5").names
+    assert any(name.startswith("memory.entries.") for name in names)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [(["pretrained/alcc", "x.tflite"], "ending"), (["pretrained/nobody", "x.onnx"], "nobody")],
+)
+def test_bad_input_is_one_clear_error(words, expected) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        main(words)
