@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import new_figure, save, unbox
 from lcc_rl.results.intervals import Estimate, share_saved
+from lcc_rl.results.runs import load_config
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, paired, savings, worse_off
+from lcc_rl.results.space_time import space_time
 
 # Distinct without colour vision and in grey.
 COLOURS = {
@@ -232,6 +234,9 @@ def write_study_figures(folder: str | Path) -> list[Path]:
     target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
     paths = []
+    diagram = space_time(steps, [names[0], *cars[-2:]], load_config(folder)) if len(steps) else None
+    if diagram is not None:
+        paths.append(save(diagram, target / "space_time.png"))
     if len(steps) and "idm" in names and cars[-1] not in UNTRAINED:
         paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
     for name in cars:
