@@ -234,7 +234,9 @@ def write_study_figures(folder: str | Path) -> list[Path]:
     target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
     paths = []
-    diagram = space_time(steps, [names[0], *cars[-2:]], load_config(folder)) if len(steps) else None
+    diagram = (
+        space_time(steps, [*names[:1], *names[-2:]], load_config(folder)) if len(steps) else None
+    )
     if diagram is not None:
         paths.append(save(diagram, target / "space_time.png"))
     if len(steps) and "idm" in names and cars[-1] not in UNTRAINED:

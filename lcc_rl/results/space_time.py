@@ -40,16 +40,22 @@ def space_time(steps: pd.DataFrame, names: Sequence[str], cfg: DictConfig) -> Fi
     roles = parse_string(cfg.scenario.string).roles
     if len(roles) < FEWEST:
         return None
-    names = list(names)[:WIDEST]
     first = steps.iloc[0]
     same = (steps["profile"] == first["profile"]) & (steps["driver_id"] == first["driver_id"])
     rows = {name: _one(steps[same & (steps["strategy"] == name)]) for name in names}
-    top = max(float(_speeds(part, roles).max()) for part in rows.values())
+    # Of strategies that drive all of the string.
+    rows = {name: part for name, part in rows.items() if len(part) and _drives(part, roles)}
+    if not rows:
+        return None
+    names = list(rows)[:WIDEST]
+    top = max(
+        float(_columns(rows[name], _shown(rows[name], roles), "speed").max()) for name in names
+    )
     figure = new_figure(1.5 + 4.0 * len(names), 4.2)
     axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     lines: LineCollection | None = None
-    for axis, (name, part) in zip(axes, rows.items(), strict=True):
-        lines = _panel(axis, part, roles, cfg, top)
+    for axis, name in zip(axes, names, strict=True):
+        lines = _panel(axis, rows[name], roles, cfg, top)
         axis.set_title(name, fontsize=10)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
@@ -68,6 +74,16 @@ def _one(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _columns(rows: pd.DataFrame, roles: Sequence[str], entry: str) -> np.ndarray:
     """Return an entry of all vehicles from front to back, ``[time, vehicles]``."""
+    return rows[_names(rows, roles, entry)].to_numpy(float)
+
+
+def _drives(rows: pd.DataFrame, roles: Sequence[str]) -> bool:
+    """Whether the rows have every vehicle of a string."""
+    names = _names(rows, _shown(rows, roles), "speed")
+    return set(names) <= set(rows) and bool(rows[names].notna().all(axis=None))
+
+
+def _names(rows: pd.DataFrame, roles: Sequence[str], entry: str) -> list[str]:
     counts: dict[str, int] = {}
     found = []
     for role in roles:
@@ -75,11 +91,7 @@ def _columns(rows: pd.DataFrame, roles: Sequence[str], entry: str) -> np.ndarray
         counts[kind] = counts.get(kind, 0) + 1
         numbered = f"{kind}{counts[kind]}_{entry}"
         found.append(numbered if numbered in rows else f"{kind}_{entry}")
-    return rows[found].to_numpy(float)
-
-
-def _speeds(rows: pd.DataFrame, roles: Sequence[str]) -> np.ndarray:
-    return _columns(rows, _shown(rows, roles), "speed")
+    return found
 
 
 def _shown(rows: pd.DataFrame, roles: Sequence[str]) -> list[str]:
