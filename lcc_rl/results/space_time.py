@@ -75,9 +75,11 @@ def _panel(axis: Axes, motion: Motion, top: float) -> LineCollection:
         points = np.stack([motion.time, shown[:, vehicle]], -1)
         parts = np.stack([points[:-1], points[1:]], 1)
         whole = np.abs(parts[:, 1, 1] - parts[:, 0, 1]) < 0.5 * around
+        above = 3 if role == AUTOMATED else 2  # no other line hides the frame
         if role == AUTOMATED:
-            axis.add_collection(LineCollection(list(parts[whole]), colors="black", linewidths=2.6))
-        lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=1.1)
+            frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.6, zorder=above)
+            axis.add_collection(frame)
+        lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=1.1, zorder=above)
         lines.set_array(motion.speed[:-1, vehicle][whole])
         lines.set_clim(0.0, top)
         axis.add_collection(lines)
