@@ -18,7 +18,7 @@ from lcc_rl.commands.tasks import task_of
 from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.drawing import new_figure, save
+from lcc_rl.results.drawing import legend_above, new_figure, save
 from lcc_rl.results.figures import style
 from lcc_rl.results.runs import load_config
 from lcc_rl.results.scores import scores
@@ -26,13 +26,13 @@ from lcc_rl.runs.cli import main_guard
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km [%]", "distance_lost": "distance lost [%]"}
-COLOURS = {
-    LEARNED: "#0072b2",
-    "idm_acc": "#009e73",
-    "acc": "#e69f00",
-    "follower_stopper": "#cc79a7",
-    "pi_saturation": "#d55e00",
-    "idm": "#6b6b6b",
+SHOWN_AS = {
+    LEARNED: (LEARNED, "#0072b2"),
+    "idm_acc": ("IDM as cruise control, tuned", "#009e73"),
+    "acc": ("linear ACC, tuned", "#e69f00"),
+    "follower_stopper": ("FollowerStopper", "#cc79a7"),
+    "pi_saturation": ("PI with saturation", "#d55e00"),
+    "idm": ("one human driver (IDM)", "#6b6b6b"),
 }
 
 
@@ -54,10 +54,10 @@ def drawn(table: pd.DataFrame) -> Figure:
     figure = new_figure(10.0, 4.0)
     axes = figure.subplots(1, len(SHOWN))
     for axis, (column, label) in zip(axes, SHOWN.items(), strict=True):
-        for name, colour in COLOURS.items():
+        for name, (words, colour) in SHOWN_AS.items():
             rows = table[table["strategy"] == name].sort_values(SHARE)
             x, y = 100.0 * rows[SHARE], 100.0 * rows[column]
-            axis.plot(x, y, color=colour, lw=1.3, label=name)
+            axis.plot(x, y, color=colour, lw=1.3, label=words)
             face = [colour if kept else "white" for kept in rows["kept"]]
             axis.scatter(x, y, c=face, edgecolors=colour, zorder=3, s=28)
             if name == LEARNED and column == "saving":
@@ -69,7 +69,7 @@ def drawn(table: pd.DataFrame) -> Figure:
         axis.set_xticks(shares, [f"{share:g}" for share in shares])
         axis.minorticks_off()
         style(axis, "automated vehicles [%]", label)
-    axes[0].legend(frameon=False, fontsize=9, loc="upper left")
+    legend_above(axes[0], 2)
     figure.suptitle("i24-mixed; filled: keeps all limits; band: 95 % of learned", fontsize=10)
     return figure
 
