@@ -24,7 +24,9 @@ WIDEST = 3  # panels
 COLOURS = LinearSegmentedColormap.from_list("speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"])
 
 
-def space_time(steps: pd.DataFrame, names: Sequence[str], cfg: DictConfig) -> Figure | None:
+def space_time(
+    steps: pd.DataFrame, names: Sequence[str], cfg: DictConfig, every: int = EVERY
+) -> Figure | None:
     """Positions over time of one sample episode, a panel per strategy (the same episode).
 
     Lines of automated vehicles are framed in black.
@@ -33,11 +35,12 @@ def space_time(steps: pd.DataFrame, names: Sequence[str], cfg: DictConfig) -> Fi
         steps: rows of steps.parquet.
         names: the strategies to show, at most :data:`WIDEST`.
         cfg: the evaluation's configuration.
+        every: rows between the points of a line.
 
     Returns:
         The figure; None of strings with fewer than :data:`FEWEST` vehicles.
     """
-    found = {name: _motion(steps, name, cfg) for name in names}
+    found = {name: _motion(steps, name, cfg, every) for name in names}
     most = max((len(m.roles) for m in found.values() if m), default=0)
     # Of strategies that drive all of the string.
     motions = {name: m for name, m in found.items() if m and len(m.roles) == most >= FEWEST}
@@ -56,13 +59,13 @@ def space_time(steps: pd.DataFrame, names: Sequence[str], cfg: DictConfig) -> Fi
     return figure
 
 
-def _motion(steps: pd.DataFrame, name: str, cfg: DictConfig) -> Motion | None:
+def _motion(steps: pd.DataFrame, name: str, cfg: DictConfig, every: int) -> Motion | None:
     """Return a strategy's motion in the first episode of all; None where it does not drive it."""
     first = steps.iloc[0]
     same = (steps["profile"] == first["profile"]) & (steps["driver_id"] == first["driver_id"])
     try:
         rows = next(iter(sample_episodes(steps[same], name).values()))
-        return motion_of(rows, cfg.scenario).at(slice(None, None, EVERY))
+        return motion_of(rows, cfg.scenario).at(slice(None, None, every))
     except ResultsError:
         return None
 
