@@ -20,7 +20,6 @@ EXTRAS = {
     "joblib": "sweeps",
     "submitit_local": "sweeps",
     "submitit_slurm": "sweeps",
-    "optuna": "sweeps",
     "ray": "ray",
 }
 

@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import lcc_rl.conf
 import torch
 from omegaconf import OmegaConf
 
+import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.checks import check_settings

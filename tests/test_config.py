@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import fuzz
-import lcc_rl.conf
 import pytest
 from helpers import POPULATION, VARIANTS, compose, wavy_profiles
 from omegaconf import DictConfig, OmegaConf
 
 import lcc_rl
+import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import build, config_hash, load
 from lcc_rl.envs import build_env

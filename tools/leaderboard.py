@@ -150,6 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parts = []
         for path in sorted(reference.glob("*.parquet")):
             table = read_parquet(path)
+            if "score_name" not in table:  # of fleets, of damping
+                continue
             found = [name for name in map(str, table.columns) if name.startswith("limit_")]
             first = table.iloc[0]
             limits = {name.removeprefix("limit_"): float(first[name]) for name in found}

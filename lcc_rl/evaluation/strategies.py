@@ -17,7 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import load, plain, short_name
+from lcc_rl.config import load, plain, require, short_name
 from lcc_rl.config_checks import AUTO
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
@@ -101,8 +101,8 @@ def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
     Raises:
         ConfigError: if there is none of a name.
     """
-    names = dict.fromkeys([*cfg.evaluation.baselines, *further])
-    return [baseline(cfg, name) for name in names if applies(cfg, name)]
+    names = [*cfg.evaluation.baselines, *further]
+    return [baseline(cfg, name) for name in dict.fromkeys(names) if applies(cfg, name)]
 
 
 def applies(cfg: DictConfig, name: str) -> bool:
@@ -110,22 +110,22 @@ def applies(cfg: DictConfig, name: str) -> bool:
     roles = set(string_of(cfg).names)
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
-    oracle = name.endswith("oracle") and roles != {AUTOMATED}
-    return AUTOMATED in roles and not oracle
+    return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
 def baseline(cfg: DictConfig, name: str) -> Strategy:
     """Build a baseline in the scenario under study; its own settings where it is the one studied.
 
     Raises:
-        ConfigError: if there is none of that name.
+        ConfigError: if there is none of that name, or no filter for constants tuned behind it.
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
-    if name in TUNED and cfg.scenario.filters.get(AUTOMATED) is not None:
-        filtered = baseline_controller(name, FILTERED)
-        return Strategy(name, driven_by(cfg, filtered))
-    controller = baseline_controller(name)
+    behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
+    require(behind or not named, f"{name} drives behind the safety filter: say +filter=cbf")
+    controller = baseline_controller(name, suffix := FILTERED * (behind and name in TUNED))
+    if named or suffix:
+        return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)
     return Strategy(name, without_filter(driven_by(cfg, controller)))

@@ -30,7 +30,7 @@ from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.search import resume_search
+from lcc_rl.runs.search import register as register_search
 from lcc_rl.runs.states import Busy, busy, is_claimed, one_line, record, survey
 
 log = logging.getLogger("lcc_rl")
@@ -128,10 +128,9 @@ class SweepCallback(Callback):
             temporary.write_text(json.dumps(asdict(plan)))
         words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
-        running = any(state.state == "running" for state in survey(folder))
-        if not running:
+        if not any(state.state == "running" for state in survey(folder)):
             remove_leftovers(folder)
-        resume_search(config, alone=not running)
+        register_search()
         if sys.stdout.isatty():
             self._draw(config, plan.runs)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import gzip
 from pathlib import Path
 
-import lcc_rl.conf
 import pytest
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from ngsim_text import START_MS, cells, csv_text, pair
 
+import lcc_rl.conf
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource, NgsimSource, find_files
 from lcc_rl.errors import DataError

@@ -4,7 +4,6 @@ import io
 from functools import partial
 from pathlib import Path
 
-import lcc_rl.conf
 import pandas as pd
 import pytest
 import torch
@@ -12,6 +11,7 @@ from commands import run_command
 from omegaconf import OmegaConf
 from rich.console import Console
 
+import lcc_rl.conf
 from lcc_rl.commands import calibration
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError

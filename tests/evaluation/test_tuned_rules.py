@@ -29,6 +29,14 @@ def test_a_tuned_baseline_keeps_the_filter_and_has_constants_for_it(name) -> Non
     assert human.filters.get(AUTOMATED) is None
 
 
+@pytest.mark.parametrize("name", TUNED.values())
+def test_constants_tuned_behind_the_filter_are_driven_behind_it(name) -> None:
+    scenario = baseline(compose("alcc", "+filter=cbf"), f"{name}_filtered").cfg.scenario
+    assert scenario.filters[AUTOMATED].time_gap == 2.45
+    with pytest.raises(ConfigError, match=f"{name}_filtered drives behind the safety filter"):
+        baseline(compose("alcc"), f"{name}_filtered")
+
+
 @pytest.mark.parametrize(
     ("piece", "rule", "law"), [(IDMACC, IDMRule, idm_acc), (LinearACC, ACCRule, linear_acc)]
 )

@@ -25,7 +25,6 @@ import pandas as pd
 import pyarrow.parquet as pq
 import torch
 from helpers import POPULATION, VARIANTS, wavy_profiles
-from lcc_rl.results.files import read_parquet
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -35,6 +34,7 @@ from lcc_rl import evaluate, train
 from lcc_rl.config import load
 from lcc_rl.envs.factory import build_agent, build_env, build_policy
 from lcc_rl.policies import ConstantPolicy
+from lcc_rl.results.files import read_parquet
 from lcc_rl.results.policies import load_policy
 
 REFERENCE = Path(__file__).resolve().parent / "reference"

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
+from typing import Any
 
 import pytest
-from omegaconf import DictConfig, OmegaConf
+import yaml
+from commands import TINY, run_command
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from lcc_rl.runs.search import resume_search
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.runs.search import SearchSweeper, distribution, resumed
 
 optuna = pytest.importorskip("optuna", reason="extra sweeps")
-SPACE = {"agent.gamma": optuna.distributions.UniformDistribution(0.0, 1.0)}
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:sqlalchemy.*")
+SPACE = {"agent.gamma": optuna.distributions.FloatDistribution(0.0, 1.0)}
 
 
-def search(folder: Path, trials: int) -> DictConfig:
-    sweeper = {
-        "_target_": "hydra_plugins.hydra_optuna_sweeper.optuna_sweeper.OptunaSweeper",
-        "storage": f"sqlite:///{folder}/optuna.db",
-        "study_name": "lcc_rl",
-        "n_trials": trials,
-    }
-    return OmegaConf.create({"hydra": {"sweeper": sweeper, "sweep": {"dir": str(folder)}}})
+def sweeper(folder: Path, trials: int = 5, **other: Any) -> SearchSweeper:
+    settings = {"directions": ["minimize"], "n_jobs": 1, "seed": 0, "params": {}, **other}
+    address = f"sqlite:///{folder}/optuna.db"
+    return SearchSweeper(storage=address, study_name="lcc_rl", n_trials=trials, **settings)
 
 
 def begun(folder: Path) -> optuna.Study:
     """Two trials finished, one failed, one was cut off."""
-    sweeper = search(folder, 1).hydra.sweeper
-    study = optuna.create_study(storage=sweeper.storage, study_name=sweeper.study_name)
+    study = sweeper(folder).study(optuna)
     trials = [study.ask(SPACE) for _ in range(4)]
     for trial in trials[:2]:
         study.tell(trial, 1.0)
@@ -34,36 +35,91 @@ def begun(folder: Path) -> optuna.Study:
     return study
 
 
-@pytest.mark.parametrize(("wanted", "left"), [(5, 3), (2, 0), (1, 0)])
-def test_only_what_lacks_is_left(tmp_path, caplog, wanted, left) -> None:
-    begun(tmp_path)
-    cfg = search(tmp_path, wanted)
-    OmegaConf.set_readonly(cfg, True)
-    with caplog.at_level("INFO", "lcc_rl"):
-        resume_search(cfg, alone=True)
-    assert cfg.hydra.sweeper.n_trials == left
-    assert ("finished before" in caplog.text) == (left == 0)
+@pytest.mark.parametrize("wanted", [5, 2, 1])
+def test_finished_trials_count(tmp_path, caplog, wanted) -> None:
+    study = begun(tmp_path)
+    with caplog.at_level(logging.INFO, "lcc_rl"):
+        assert resumed(study, tmp_path, wanted) == 2
+    assert ("finished before" in caplog.text) == (wanted <= 2)
 
 
 def test_a_trial_that_was_cut_off_is_tried_first_and_queued_once(tmp_path) -> None:
     study = begun(tmp_path)
     lost = study.get_trials()[3].params
     for _ in range(2):
-        resume_search(search(tmp_path, 5), alone=True)
-    again = study.ask(SPACE)
-    assert again.params == lost
+        resumed(study, tmp_path, 5)
+    assert study.ask(SPACE).params == lost
     assert study.ask(SPACE).params != lost
 
 
-def test_the_trials_of_others_at_work_are_left_to_them(tmp_path) -> None:
+def test_the_trials_of_others_at_work_are_left_to_them(tmp_path, monkeypatch) -> None:
     study = begun(tmp_path)
-    resume_search(search(tmp_path, 5), alone=False)
+    at_work = type("State", (), {"state": "running"})
+    monkeypatch.setattr("lcc_rl.runs.search.survey", lambda folder: [at_work])
+    resumed(study, tmp_path, 5)
     assert [trial.state.name for trial in study.get_trials()].count("WAITING") == 0
 
 
-def test_a_search_that_has_not_begun_and_a_grid_are_left_alone(tmp_path) -> None:
-    cfg = search(tmp_path, 5)
-    resume_search(cfg, alone=True)
-    assert cfg.hydra.sweeper.n_trials == 5
-    grid = OmegaConf.create({"hydra": {"sweeper": {"_target_": "hydra…BasicSweeper"}}})
-    resume_search(grid, alone=True)
+def test_a_resumed_search_draws_what_it_would_have_drawn(tmp_path) -> None:
+    drawn = []
+    for folder, again in ((tmp_path / "one", False), (tmp_path / "two", True)):
+        folder.mkdir()
+        search = sweeper(folder)
+        study = search.study(optuna)
+        values = []
+        for _ in range(13):  # the first ten are random
+            study = search.study(optuna) if again else study
+            trial = search.ask(study, SPACE)
+            values.append(trial.params["agent.gamma"])
+            study.tell(trial, (values[-1] - 0.3) ** 2)
+        drawn.append(values)
+    assert drawn[0] == drawn[1]
+    assert len(set(drawn[0])) == 13
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("interval(0.1, 2)", optuna.distributions.FloatDistribution(0.1, 2.0)),
+        ("tag(log, interval(1, 10))", optuna.distributions.FloatDistribution(1.0, 10.0, log=True)),
+        ("tag(int, interval(1, 9))", optuna.distributions.IntDistribution(1, 9)),
+        ("range(1, 4)", optuna.distributions.CategoricalDistribution(["1", "2", "3"])),
+        ("[64,64],[16]", optuna.distributions.CategoricalDistribution(["[64,64]", "[16]"])),
+    ],
+)
+def test_sweeps_in_hydras_words(typed, expected) -> None:
+    (sweep,) = OverridesParser.create().parse_overrides([f"key={typed}"])
+    assert distribution(optuna, sweep) == expected
+
+
+@pytest.mark.parametrize("typed", ["interval(2, 1)", "tag(log, interval(0, 1))"])
+def test_an_impossible_interval_is_named(typed) -> None:
+    (sweep,) = OverridesParser.create().parse_overrides([f"agent.gamma={typed}"])
+    with pytest.raises(ConfigError, match=r"agent\.gamma: expected two numbers"):
+        distribution(optuna, sweep)
+
+
+def test_wrong_settings_are_named(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="minimize or maximize, found 'down'"):
+        sweeper(tmp_path, directions=["down"])
+    with pytest.raises(ConfigError, match="n_trials"):
+        sweeper(tmp_path, trials=0)
+    sweeper(tmp_path).study(optuna)
+    with pytest.raises(ResultsError, match="1 objectives"):
+        sweeper(tmp_path, directions=["minimize", "minimize"]).study(optuna)
+
+
+@pytest.mark.slow
+def test_a_search_from_the_command_line_and_its_resumption(tmp_path) -> None:
+    words = ["-m", "variant=reference", *TINY, "hydra/sweeper=lcc_optuna", "sweep=search"]
+    words = [*words, "~hydra.sweeper.params", "+hydra.sweeper.params={}"]
+    words = [*words, "agent.gamma=interval(0.8,0.99)", "objective=total_path_energy_kj"]
+    words = [*words, "hydra.sweeper.directions=[minimize]"]
+    run_command("lcc_rl.train", *words, "hydra.sweeper.n_trials=1", cwd=tmp_path, check=True)
+    done = run_command("lcc_rl.train", *words, "hydra.sweeper.n_trials=2", cwd=tmp_path, check=True)
+    folder = tmp_path / "outputs" / "train" / "search"
+    best = yaml.safe_load((folder / "optimization_results.yaml").read_text())["best"]
+    assert len(list(folder.glob("*/episodes.parquet"))) == 2
+    assert len(best) == 1
+    assert 0.8 < best[0]["params"]["agent.gamma"] < 0.99
+    assert "1 of 2 trials done before" in done.stdout + done.stderr
