@@ -9,6 +9,7 @@ import shlex
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -22,7 +23,7 @@ from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 
 ENTRIES = {"run": "pipeline"}  # entry points that are not called as their command
-SHELL = {"source", "export"}
+SHELL = {"source", "export", "ls"}
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 ALWAYS = {"tools/compare_agents.py": ("agent=analytic",)}  # settings that a tool gives itself
@@ -51,14 +52,14 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
     elif program.endswith("python"):
         assert (ROOT / rest[0]).is_file(), rest[0]
         settings = parsed(rest[0], rest[1:])
-        assert not settings or load("train", [*ALWAYS.get(rest[0], ()), *settings])
+        once("train", (*ALWAYS.get(rest[0], ()), *settings))
     elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:
         composed(ENTRIES.get(rest[0], rest[0]), rest[1:], own, fails)
     elif program == "lcc-rl":
         assert rest[0] in {*console.COMMANDS, "-h"}
         if len(rest) > 1 and "--help" not in rest:
             settings = parsed(None, rest)
-            assert not settings or load("train", settings)
+            once("train", tuple(settings))
     else:
         assert program in SHELL, f"what is {program}?"
 
@@ -69,7 +70,13 @@ def composed(entry: str, words: Sequence[str], own: Path | None, fails: bool) ->
     ends = ([one_run(item, choice) for item in settings] for choice in (0, -1))
     with suppress(ConfigError) if fails else nullcontext():
         for run in dict.fromkeys(map(tuple, ends)):
-            load(entry, run)
+            once(entry, run)
+
+
+@cache
+def once(entry: str, settings: tuple[str, ...]) -> None:
+    """Compose settings; what several pages say, once."""
+    load(entry, settings)
 
 
 def settings_of(words: Sequence[str], own: Path | None) -> list[str]:

@@ -27,6 +27,7 @@ NOT_RUN = {
     "pip": "needs a package index",
     "source": "of the shell",
     "export": "of the shell",
+    "ls": "of the shell",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
     "lcc-rl benchmark": "tests/tools/test_benchmark.py runs it",
     "python tools/compare_agents.py": "tests/tools/test_compare_agents.py runs it",
