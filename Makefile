@@ -11,7 +11,7 @@ ARGS ?=
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test test-all coverage lint docs clean
+.PHONY: run test test-all extras coverage lint docs clean
 
 run: $(STAMP)
 	$(BIN)/python -m lcc_rl.pipeline experiment=main $(ARGS)
@@ -21,6 +21,10 @@ test: lint
 
 test-all: lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+
+# Without them, test-all skips their tests: interfaces, the site, SUMO …
+extras: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[test,interfaces,docs,bench,sumo,sweeps]"
 
 coverage: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --cov $(ARGS)
@@ -33,7 +37,7 @@ lint: $(STAMP)
 # Strict: a broken link or name is an error. Needs no network once the extra is installed.
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
-	$(BIN)/python -m mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "lcc_rl needs Python 3.11 or newer, %s is %d.%d; say make PYTHON=python3.12" % (sys.executable, v[0], v[1]))'

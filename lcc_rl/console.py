@@ -80,3 +80,7 @@ def _run(name: str, words: list[str]) -> None:
 
         with interrupts.interruptible():
             sys.exit(main_guard(module.main)(words))
+
+
+if __name__ == "__main__":
+    main()

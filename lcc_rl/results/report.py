@@ -33,7 +33,7 @@ STYLE = """
 @media (prefers-color-scheme: dark) { :root { --ink: #e8e8ea; --paper: #17181a; --soft: #a0a0a6;
   --line: #3a3b40; --band: #212226; --accent: #7db8e8; } }
 body { font: 16px/1.55 system-ui, sans-serif; color: var(--ink); background: var(--paper);
-  max-width: 62rem; margin: 0 auto; padding: 2rem 1.25rem 5rem; }
+  max-width: 74rem; margin: 0 auto; padding: 2rem 1.25rem 5rem; }
 h1 { font-size: 1.8rem; line-height: 1.2; margin: 0 0 .5rem; }
 h2 { font-size: 1.3rem; margin: 3rem 0 .5rem; padding-top: .6rem;
   border-top: 1px solid var(--line); }

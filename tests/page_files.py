@@ -1,0 +1,131 @@
+"""Small files that stand for those which the pages' commands name."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+from ngsim_text import csv_text, native_text, portal_text
+from table_text import long_table, openacc_text
+
+from lcc_rl.data.episodes import write_episodes
+from lcc_rl.data.sources import NgsimSource
+from lcc_rl.drivers.tables import load_drivers
+from lcc_rl.io.files import write_parquet
+from lcc_rl.synthetic.stream import StreamSource
+
+
+@cache
+def recordings() -> list[list[list[str]]]:
+    """Rows of two recordings, in the order of the official columns."""
+    stream = StreamSource(recordings=2, platoons=3, vehicles=3, duration_s=(45.0, 60.0))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "stream.csv"
+        stream.write(path)
+        rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    half = len(stream.drive("one", np.random.default_rng([stream.seed, 0])).samples)
+    return [rows[:half], rows[half:]]
+
+
+def official(path: Path) -> None:
+    """Both recordings as the official CSV."""
+    text = csv_text([row for part in recordings() for row in part])
+    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
+
+
+def native(path: Path) -> None:
+    """One native file for each recording."""
+    for number, rows in enumerate(recordings()):
+        path.with_name(path.name.replace("*", str(number))).write_text(native_text(rows))
+
+
+def portal(path: Path) -> None:
+    """Both recordings as the portal exports them."""
+    path.write_text(portal_text([row for part in recordings() for row in part]))
+
+
+def pairs(path: Path) -> None:
+    """The pairs of both recordings."""
+    official(path.with_suffix(".csv"))
+    write_episodes(NgsimSource(str(path.with_suffix(".csv"))).load().episodes, path)
+
+
+def table(path: Path) -> None:
+    """A table with names and units of its own."""
+    frame = long_table(cars=6, rows=600).rename(columns={"gap": "distance"})
+    frame.assign(v=3.6 * frame["v"]).to_csv(path, sep=";", index=False)
+
+
+def openacc(path: Path) -> None:
+    """Three native files of OpenACC."""
+    for number in range(3):
+        name = path.name.replace("*", f"drive{number}")
+        path.with_name(name).write_bytes(gzip.compress(openacc_text(rows=1200).encode()))
+
+
+def drives(path: Path) -> None:
+    """Twelve wavy drives of twelve days."""
+    time = np.arange(0.0, 150.0, 0.1)
+    parts = [
+        pd.DataFrame(
+            {
+                "drive": f"2021-03-{day:02}-22-35-14_{day}",
+                "time_s": time,
+                "speed_mps": 18.0 + 5.0 * np.sin(time / (4.0 + day)),
+            }
+        )
+        for day in range(1, 13)
+    ]
+    pd.concat(parts, ignore_index=True).to_parquet(path)
+
+
+def record(path: Path) -> None:
+    """One record in km/h."""
+    time = np.arange(0.0, 300.0, 0.1)
+    frame = pd.DataFrame({"t": time, "v": 3.6 * (12.0 + 4.0 * np.sin(time / 5.0))})
+    frame.to_csv(path, index=False)
+
+
+def drivers(path: Path) -> None:
+    """Six of the shipped drivers."""
+    write_parquet(load_drivers().head(6), path)
+
+
+# By the name that the pages use; a star stands for several files.
+FILES: dict[str, Callable[[Path], None]] = {
+    "trajectories.csv.gz": official,
+    "raw/trajectories-*.txt": native,
+    "portal.csv": portal,
+    "other.csv": official,
+    "my.csv": table,
+    "pairs.parquet": pairs,
+    "outputs/pipeline/<run>/trajectories.parquet": pairs,
+    "astazero/*.csv.gz": openacc,
+    "drives.parquet": drives,
+    "other.parquet": drives,
+    "i24_leaders.parquet": drives,
+    "record.csv": record,
+    "drivers.parquet": drivers,
+}
+# What stands where a page leaves a path out, by the setting or the group that it belongs to.
+LEFT_OUT = {
+    "data=ngsim": ("data.path", "trajectories.csv.gz"),
+    "leader=drives": ("leader.path", "drives.parquet"),
+    "leader=i24": ("leader.path", "i24_leaders.parquet"),
+    "leader=openacc": ("leader.path", "astazero/drive0.csv.gz"),
+}
+
+
+def write_named(text: str, folder: Path) -> None:
+    """Write the files that a page names, into a folder."""
+    left_out = {name for _, name in LEFT_OUT.values()}
+    for name, make in FILES.items():
+        if name in text or (name in left_out and ".path=…" in text):
+            path = folder / name.replace("<run>", "run")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            make(path)
