@@ -146,7 +146,9 @@ class Bridge:
         own = (cars.getSpeed(car), gap, cars.getAcceleration(car))
         lead = (cars.getSpeed(ahead), cars.getAcceleration(ahead))
         behind, free = cars.getFollower(car, self.sight) or ("", 0.0)
-        other = (0.0, 0.0, 0.0) if self.tells else (own[0], gap, 0.0)
+        other: tuple[float, float, float] = (own[0], gap, 0.0)
+        if self.tells:
+            other = (0.0, 0.0, 0.0)
         if behind:
             room = free + cars.getMinGap(behind)
             other = (cars.getSpeed(behind), room, cars.getAcceleration(behind))

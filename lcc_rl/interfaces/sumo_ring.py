@@ -26,7 +26,7 @@ from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
 
 HUMAN, AUTOMATED = "human", "car0"
-LAST_S = 60.0  # what the table is of
+LAST_S, CALM = 60.0, 0.5  # final speeds are of [s]; spread of the speeds without a wave [m/s]
 SPEED_LIMIT, CORNERS, AROUND = 40.0, 32, 10_000  # of the road [m/s]; of a half; rounds of a route
 HALVES = {"east": ("south", "north", -0.5), "west": ("north", "south", 0.5)}
 
@@ -145,17 +145,22 @@ def _row(sumo: Any, automated: bool) -> dict[str, float]:
 
 
 def measured(rows: pd.DataFrame, from_s: float) -> dict[str, float]:
-    """Return speeds of the last minute, and of the first vehicle the smallest gap from ``from_s``.
+    """Return what happens from ``from_s`` [s] on.
 
-    The spread is the deviation over the vehicles, a mean over time.
+    The damping time is how long after it the spread of the speeds over the vehicles last exceeds
+    0.5 m/s, NaN where it still does at the end; final speeds are those of the last minute, the
+    smallest gap is that of the first vehicle.
     """
     rows = rows.dropna(axis=1, how="all")
-    speeds = rows.filter(regex="_speed$")[rows["time_s"] >= rows["time_s"].max() - LAST_S]
-    gaps = rows.loc[rows["time_s"] >= from_s, "cav_gap" if "cav_gap" in rows else "hdv1_gap"]
+    rows = rows[rows["time_s"] >= from_s]
+    speeds, time = rows.filter(regex="_speed$"), rows["time_s"]
+    spread, final = speeds.std(axis=1, ddof=0), time >= time.max() - LAST_S
+    lasting = spread.iloc[-1] > CALM
     return {
-        "mean_speed_mps": speeds.mean(axis=None),
-        "speed_spread_mps": speeds.std(axis=1, ddof=0).mean(),
-        "min_gap_m": gaps.min(),
+        "damping_s": math.nan if lasting else time[spread > CALM].max() - from_s,
+        "final_speed_mps": speeds[final].mean(axis=None),
+        "final_spread_mps": spread[final].mean(),
+        "min_gap_m": rows["cav_gap" if "cav_gap" in rows else "hdv1_gap"].min(),
         "collisions": rows["collisions"].sum(),
     }
 
@@ -182,7 +187,7 @@ def main(words: Sequence[str] | None = None) -> int:
     figure = space_time(steps, [HUMAN, options.driver], cfg)
     assert figure is not None
     figure.axes[1].axvline(options.from_s, color="black", linestyle=":", linewidth=1.0)
-    save(figure, options.folder / "space_time.png")
+    save(figure, options.folder / "space_time.png", dpi=100)
     table = pd.DataFrame(
         [measured(part, options.from_s) for part in parts], [HUMAN, options.driver]
     )
