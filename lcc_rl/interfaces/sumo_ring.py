@@ -17,15 +17,17 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from lcc_rl.config import load
-from lcc_rl.errors import require_in, require_whole
-from lcc_rl.functional.pattern import parse_string
+from lcc_rl.errors import ConfigError, require_in, require_whole
+from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
+from lcc_rl.targets import TARGET
 
-HUMAN, AUTOMATED = "human", "car0"
+HUMAN, FIRST = "human", "car0"
+FIXED = "lcc_rl.drivers.population.fixed"
 LAST_S, CALM = 60.0, 0.5  # final speeds are of [s]; spread of the speeds without a wave [m/s]
 SPEED_LIMIT, CORNERS, AROUND = 40.0, 32, 10_000  # of the road [m/s]; of a half; rounds of a route
 HALVES = {"east": ("south", "north", -0.5), "west": ("north", "south", 0.5)}
@@ -72,6 +74,7 @@ def write_vehicles(path: Path, cfg: DictConfig) -> None:
         edges = ("east", "west") if place < 0.5 * around else ("west", "east")
         start = {"departPos": f"{place % (0.5 * around):.6f}", "depart": "0"}
         start |= {"id": f"car{number}", "type": HUMAN, "departSpeed": str(scenario.initial_speed)}
+        start["insertionChecks"] = "none"  # they are where the task puts them, however near
         vehicle = ElementTree.SubElement(root, "vehicle", start)
         ElementTree.SubElement(vehicle, "route", edges=" ".join(edges), repeat=str(AROUND))
     _write(root, path)
@@ -107,7 +110,7 @@ def simulate(
     sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
     try:
         sumo.simulationStep()
-        bridge = None if driver is None else Bridge(driver, [AUTOMATED], seed=seed)
+        bridge = None if driver is None else Bridge(driver, FIRST, seed=seed)
         noise = np.random.default_rng(seed)
         rows = []
         for number in range(round(seconds / step)):
@@ -165,6 +168,21 @@ def measured(rows: pd.DataFrame, from_s: float) -> dict[str, float]:
     }
 
 
+def _check(cfg: DictConfig) -> None:
+    """Check that a configuration is of a ring that this module can write."""
+    roles = parse_string(cfg.scenario.string, cfg.scenario.road).roles
+    first = isinstance(cfg.scenario.string, str) and roles[0] == AUTOMATED
+    if cfg.scenario.road != RING or not first or roles.count(AUTOMATED) != 1:
+        raise ConfigError(
+            "lcc-rl sumo needs a ring whose first vehicle alone is automated, got scenario.road="
+            f"{cfg.scenario.road} and scenario.string={cfg.scenario.string}"
+        )
+    least = len(roles) * cfg.scenario.vehicle_length
+    require_in("scenario", f"({least}, 100000]", circumference=cfg.scenario.circumference)
+    if cfg.drivers[TARGET] != FIXED:
+        raise ConfigError(f"lcc-rl sumo needs drivers=fixed, got {cfg.drivers[TARGET]}")
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Simulate the ring without and with a policy; write trajectories and figure."""
     parser = argparse.ArgumentParser(description="The ring road of task=ring-22 in SUMO.")
@@ -174,11 +192,12 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=600.0, help="how long in all")
     parser.add_argument("--seed", type=int, default=0, help="of the humans' noise")
     parser.add_argument("--folder", type=Path, default=Path("outputs/sumo"))
-    options = parser.parse_args(words)
+    options = parser.parse_intermixed_args(words)
     require_in("lcc-rl sumo", "[0, inf)", from_s=options.from_s)
     require_in("lcc-rl sumo", f"({options.from_s}, 36000]", seconds=options.seconds)
     require_whole("", 0, seed=options.seed)
     cfg = load("evaluate", ["variant=alcc", "task=ring-22", *options.overrides])
+    _check(cfg)
     options.folder.mkdir(parents=True, exist_ok=True)
     fixed = (options.folder, options.seconds, options.from_s, options.seed)
     parts = [simulate(cfg, driver, *fixed) for driver in (None, options.driver)]

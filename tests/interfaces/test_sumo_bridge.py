@@ -207,6 +207,20 @@ def test_bad_input_is_one_clear_error(driver, step, expected, tmp_path) -> None:
         Bridge(driver, ["own"])
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["scenario.string=human*22"], "first vehicle alone is automated"),
+        (["drivers=i80"], "drivers=fixed"),
+        (["scenario.circumference=100"], "circumference must lie in"),
+        (["--seconds", "200"], "seconds must lie in"),
+    ],
+)
+def test_a_ring_that_cannot_be_simulated_is_one_clear_error(words, expected, tmp_path) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        sumo_ring.main(["acc", *words, "--folder", str(tmp_path)])
+
+
 def test_without_simulation_or_libsumo_the_error_says_what_to_do(monkeypatch) -> None:
     with pytest.raises(ConfigError, match=r"libsumo\.start"):
         Bridge("idm", ["own"])
