@@ -134,6 +134,14 @@ def test_with_nobody_ahead_in_sight_sumo_drives(tmp_path) -> None:
     assert not bridge.command()
 
 
+def test_with_nobody_behind_a_policy_believes_in_one_at_its_own_speed_and_gap(tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
+    seen = Bridge("pretrained/alcc", "own")._measured("own")
+    assert seen is not None
+    assert seen.present == 0.0
+    assert (seen.speed_behind, seen.gap_behind) == (seen.speed, seen.gap) == (10.0, 15.0)
+
+
 def test_who_only_watches_remembers_and_sets_nothing(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
     bridge = Bridge("follower_stopper", "own")
