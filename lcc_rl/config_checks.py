@@ -76,9 +76,11 @@ def check_ignored(cfg: DictConfig, overrides: Sequence[str], sweep: bool = False
     Raises:
         ConfigError: naming the option and why it has no effect.
     """
-    if "variant" not in cfg or "scenario" not in cfg:
-        return
-    reasons = dict(_without_effect(cfg, sweep))
+    reasons: dict[str, str] = {}
+    if not sweep and any(item.lstrip("+~").startswith("calibration.") for item in overrides):
+        reasons |= _unused_by_calibration(cfg.calibration)
+    if "variant" in cfg and "scenario" in cfg:
+        reasons |= _without_effect(cfg, sweep)
     for item in overrides:
         key = item.lstrip("+~").partition("=")[0].partition("@")[0]
         if item in NO_AGENT:
@@ -125,6 +127,31 @@ def _without_effect(cfg: DictConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     }
     for name in unused.get(cfg.evaluation.rows, ()):
         yield name, f"it is unused with evaluation.rows={cfg.evaluation.rows}"
+
+
+def _unused_by_calibration(node: Any) -> Iterator[tuple[str, str]]:
+    """Yield bounds of parameters that a calibration does not fit, and constants where it fits all.
+
+    A model or mode that does not exist is said where the calibrator is built.
+    """
+    # Here: the other commands need no driver model to read their options.
+    from lcc_rl.drivers.parameters import MODES, fitted
+    from lcc_rl.functional.laws import LAWS
+
+    if not OmegaConf.is_dict(node) or "modes" not in node or node.get("model") not in LAWS:
+        return
+    model, modes = node.model, list(node.modes)
+    if not set(modes) <= set(MODES):
+        return
+    if "local" not in modes:
+        for name in ("constants", "choose_constants"):
+            yield f"calibration.{name}", "calibration=global fits all parameters to each driver"
+    whole = modes if not node.choose_constants else ["global"]
+    used = {name for mode in whole for name in fitted(mode, model)}
+    for name in map(str, node.bounds or ()):
+        if name not in used:
+            reason = f"calibration.model={model} with modes {', '.join(modes)} does not fit it"
+            yield f"calibration.bounds.{name}", reason
 
 
 def _plays_data(leader: Any) -> bool:

@@ -15,6 +15,8 @@ from omegaconf.errors import OmegaConfBaseException
 from lcc_rl.errors import ConfigError, unknown_name
 
 REFUSED = re.compile(r"Could not (?:override|delete from config\.|append to config\.?) '([^']+)'")
+MERGED = re.compile(r"^Error merging override \+*([^=]+)=(.*)", re.DOTALL)
+INNER = re.compile(r"Key '([^']+)' is not in struct")
 # Launchers and sweepers that come with other packages: which extra brings them.
 EXTRAS = {
     "joblib": "sweeps",
@@ -54,10 +56,7 @@ def explain(error: Exception, valid: Any) -> Exception:
         return _missing_choice(error)
     key = refused_key(error)
     if key is None:
-        cause = error.__cause__
-        if cause is not None and str(error).startswith("Error merging override"):
-            return ConfigError(f"{error}: {str(cause).splitlines()[0]}")
-        return error
+        return _not_merged(error)
     parent, _, name = key.rpartition(".")
     try:
         node = OmegaConf.select(valid, parent) if parent else valid
@@ -69,6 +68,11 @@ def explain(error: Exception, valid: Any) -> Exception:
     if parent == "agent" and node is None:
         variant = OmegaConf.select(valid, "variant")
         return ConfigError(f"{key}: variant {variant} learns nothing, it has no agent")
+    inner = INNER.search(str(error.__cause__))
+    if OmegaConf.is_dict(node) and OmegaConf.is_dict(node.get(name)) and inner is not None:
+        return unknown_name(_what(key), inner.group(1), map(str, node[name]))
+    if parent in valid and node is None:
+        return ConfigError(f"{key}: there is no {parent}; choose one with {parent}=…")
     if not OmegaConf.is_dict(node):
         return unknown_at(parent, valid) or error
     if not parent and name in node:  # other variants have it
@@ -76,6 +80,17 @@ def explain(error: Exception, valid: Any) -> Exception:
         return ConfigError(f"variant {variant} has no {name} to choose; leave {name}=… out")
     names = {*map(str, node), *(() if parent else ("experiment",))}
     return unknown_name(_what(parent), name, names)
+
+
+def _not_merged(error: Exception) -> Exception:
+    """Return the error for a value of the wrong kind."""
+    found, cause = MERGED.search(str(error)), error.__cause__
+    if cause is None or found is None:
+        return error
+    if "ListConfig" in str(cause):
+        key, value = found.groups()
+        return ConfigError(f"{key}={value}: expected a list; say '{key}=[{value}]'")
+    return ConfigError(f"{error}: {str(cause).splitlines()[0]}")
 
 
 def _reference(valid: Any, key: str) -> ConfigError | None:

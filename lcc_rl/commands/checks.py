@@ -133,8 +133,11 @@ def check_variant(cfg: DictConfig) -> None:
             "driver say variant=idm"
         )
     if learns(cfg) and not learns(own):
+        rules = (
+            "'compare=[idm,acc,…]' without variant=…" if cfg.get("task") else "a learned variant"
+        )
         raise ConfigError(
-            f"variant={cfg.variant} learns nothing: remove agent=…, or choose a learned variant"
+            f"variant={cfg.variant} learns nothing: remove agent=…, or choose {rules}"
         )
 
 

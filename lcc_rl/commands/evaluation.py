@@ -211,7 +211,7 @@ def evaluate_and_write(
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
-    for line in leader_too_fast(rows):
+    for line in leader_too_fast(rows, cfg.get("task") is not None):
         log.warning(line)
     if not quiet:
         _show(rows, cfg, inputs)

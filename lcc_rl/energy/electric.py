@@ -51,7 +51,8 @@ class ElectricCar(EnergyModel):
         fade_speed: float = 5.0,
         grade: float = 0.0,
     ) -> None:
-        require_positive("energy", mass=mass, drag=drag, area=area, rotating_mass=rotating_mass)
+        require_in("energy", "[100, 100000]", mass=mass)  # kilograms, not tonnes
+        require_positive("energy", drag=drag, area=area, rotating_mass=rotating_mass)
         require_in("energy", "[0, inf)", rolling=rolling, auxiliary=auxiliary)
         require_in("energy", "[0, inf)", regeneration_limit=regeneration_limit)
         require_positive("energy", fade_speed=fade_speed)

@@ -163,5 +163,5 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
                 )
             raise ConfigError(
                 f"{type(piece).__name__} reads {'.'.join(key)}, which no piece of the "
-                "scenario writes; was a piece removed?"
+                "scenario writes; was a piece removed, or does it belong to another scenario=…?"
             )

@@ -64,7 +64,7 @@ def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
     """
     if own.scenario.name != cfg.scenario.name:
         raise ConfigError(
-            f"policy={path} was trained as variant {own.variant}, in the scenario "
+            f"compare: {path} was trained as variant {own.variant}, in the scenario "
             f"{own.scenario.name}, not in {cfg.scenario.name}"
         )
 

@@ -44,8 +44,8 @@ def pretrained_path(variant: str) -> Path:
     if not path.is_file():
         names = sorted(file.stem for file in shipped.glob("*.pt"))
         raise ConfigError(
-            f"no pretrained policy ships for variant {variant}, only for {', '.join(names)}; "
-            f"python -m lcc_rl.train variant={variant} makes one"
+            f"no pretrained policy ships for {variant}, only for {', '.join(names)}; train one "
+            "(python -m lcc_rl.train) and give its folder"
         )
     return path
 

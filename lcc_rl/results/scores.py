@@ -24,6 +24,12 @@ PLAIN = ("final_speed_spread_mps", "speed_std_mps", "string_ratio")
 SCORE, DISTANCE = "score", "distance_m"
 MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", "flow_vph", "string_ratio")
 LARGEST, LEAST, SHARE = "max_", "min_", "share_"
+# Columns that a limit may be of, named before anything is played.
+LIMITED = (
+    *("max_gap_m", "max_time_gap_s", "min_gap_m", "min_time_gap_s", "min_ttc_s"),
+    *("share_leader_faster", "share_time_gap_long", "share_time_gap_long_moving"),
+    *("share_ttc_unsafe", "share_ttc_unpromised"),
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class Task:
             ``min_…``, and for ``share_…`` at most so much of the time of all episodes.
 
     Raises:
-        ConfigError: if the score is unknown, or a limit has another name or is no number.
+        ConfigError: if the score is unknown, or a limit is of another column or no number.
     """
 
     name: str
@@ -53,11 +59,8 @@ class Task:
         if self.score not in (*PER_DISTANCE, *PLAIN):
             raise unknown_name("score (task.score)", self.score, (*PER_DISTANCE, *PLAIN))
         for column, bound in self.limits.items():
-            if not column.startswith((LARGEST, LEAST, SHARE)):
-                raise ConfigError(
-                    f"task.limits.{column}: a limit is of a column that begins with {LARGEST}, "
-                    f"{LEAST} or {SHARE}"
-                )
+            if column not in LIMITED:
+                raise unknown_name("column of task.limits", column, LIMITED)
             require_in("task.limits", "[0, inf)", **{column: bound})
 
     def among(self, strategies: Iterable[str]) -> Task:

@@ -120,7 +120,7 @@ ROWS = (
 )
 
 
-def leader_too_fast(episodes: Rows) -> list[str]:
+def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
     """Return a warning for every human baseline whose desired speed the leaders mostly exceed.
 
     A driver who would not keep up with the leader by choice drops back, whoever drives ahead:
@@ -128,11 +128,14 @@ def leader_too_fast(episodes: Rows) -> list[str]:
 
     Args:
         episodes: rows of an evaluation.
+        of_task: whether a task is evaluated, which chooses whom it compares.
     """
     remedies = {
         "direct": "drivers=highway, or drivers calibrated on such traffic",
         "idm": "variant=idm scenario.controllers.automated.desired_speed=45 'compare=[<run>]'",
     }
+    if of_task:
+        remedies["idm"] = "compare with human, whose v0 is that of drivers=…"
     parts = [
         frame.groupby("strategy")[FASTER].agg(["sum", "count"])
         for frame in frames(episodes, ["strategy", FASTER])

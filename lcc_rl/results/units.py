@@ -48,11 +48,11 @@ def check_unit(unit: str, energy: Fleet) -> None:
         ConfigError: see :func:`per_distance`.
     """
     if unit not in UNITS:
-        raise unknown_name("unit (evaluation.unit)", unit, UNITS)
+        raise unknown_name("unit (task.unit)", unit, UNITS)
     if unit in FUEL and len(_fuels(energy.models)) != 1:
         raise ConfigError(
-            f"evaluation.unit={unit} needs vehicles of one fuel; these have "
-            f"{len(_fuels(energy.models))} kinds or none: say kJ/km or Wh/km"
+            f"task.unit={unit} needs vehicles that all burn one fuel; these burn several, or some "
+            "none (energy=…): say kJ/km or Wh/km"
         )
 
 

@@ -239,3 +239,27 @@ def test_a_closed_pipe_ends_nothing_and_says_nothing(finished, tmp_path, module,
     assert errors == ""
     if module == "lcc_rl.train":
         assert inspect_run(tmp_path / "new").state == "finished"
+
+
+@pytest.mark.parametrize(
+    ("entry", "overrides", "words"),
+    [
+        ("evaluate", ["compare=acc"], r"compare=acc: expected a list; say 'compare=\[acc\]'"),
+        ("evaluate", ["task.unit=mpg"], "task.unit: there is no task; choose one with task="),
+        ("evaluate", ["data=table", "data.units={sped: km/h}"], "data.units 'sped'.*'speed'"),
+        ("calibrate", ["data=table", "data.columns={vehicl: id}"], "data.columns 'vehicl'"),
+        ("calibrate", ["calibration.bounds.sensitivity=[0.1,1]"], "has no effect: .*model=idm"),
+        ("calibrate", ["calibration.bounds.min_gap=[1,2]"], "no effect: .* modes local"),
+        ("calibrate", ["calibration=global", "calibration.constants.min_gap=2"], "no effect"),
+        ("calibrate", ["calibration=global", "calibration.choose_constants=true"], "no effect"),
+    ],
+)
+def test_an_option_that_means_nothing_here_says_what_would(entry, overrides, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load(entry, overrides)
+
+
+def test_bounds_of_what_is_fitted_are_taken() -> None:
+    bounds = "calibration.bounds.min_gap=[1,2]"
+    for other in ("calibration=both", "calibration=global", "calibration.choose_constants=true"):
+        assert list(load("calibrate", [other, bounds]).calibration.bounds.min_gap) == [1, 2]

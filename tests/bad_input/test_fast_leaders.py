@@ -55,6 +55,9 @@ def test_the_warning_stands_in_table_and_page(tmp_path: Path, share: float, said
     assert [line.partition(" for ")[0] for line in found] == [
         "the leaders drive faster than the desired speed of idm"
     ] * said
+    assert [line.partition("Raise v0: ")[2] for line in leader_too_fast(frame, True)] == [
+        "compare with human, whose v0 is that of drivers=…"
+    ] * said
     table = summary(frame).set_index("strategy")
     assert table.loc["idm", FASTER] == pytest.approx(share)
     write_parquet(frame, tmp_path / "evaluation" / "episodes.parquet")

@@ -5,6 +5,7 @@ import torch
 
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
 from lcc_rl.functional.safety import NEVER
+from lcc_rl.results.scores import LARGEST, LEAST, LIMITED, SHARE
 
 ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
 
@@ -51,6 +52,8 @@ def test_safety() -> None:
         "duration_s": [0.2, 0.1],
     }
     assert set(measures) == set(expected)
+    named = {name for name in expected if name.startswith((LARGEST, LEAST, SHARE))}
+    assert named | {"share_leader_faster", "share_ttc_unpromised"} == set(LIMITED)
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 

@@ -72,9 +72,9 @@ def test_limits_are_kept_by_the_worst_episode(change, kept) -> None:
 
 def test_a_share_is_limited_in_the_mean() -> None:
     table = pd.concat([rows("human", [1.0, 1.0]), rows("own", [1.0, 1.0])])
-    table["share_late"] = [0.0, 0.0, 0.0, 0.03]
+    table["share_ttc_unsafe"] = [0.0, 0.0, 0.0, 0.03]
     for bound, kept in ((0.02, True), (0.01, False)):
-        task = Task("mine", limits={"share_late": bound})
+        task = Task("mine", limits={"share_ttc_unsafe": bound})
         assert scores(table, task, MOTOR)["kept"].tolist() == [True, kept]
 
 
@@ -109,16 +109,20 @@ def test_units() -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: per_distance(1.0, "g/km", MOTOR), "unit=g/km needs vehicles of one fuel"),
+        (
+            lambda: per_distance(1.0, "g/km", MOTOR),
+            "task.unit=g/km needs vehicles that all burn one fuel",
+        ),
         (lambda: per_distance(1.0, "mpg", Fleet({"a": CirclesFuel(), "b": LORRY})), "one fuel"),
-        (lambda: per_distance(1.0, "miles", CAR), "evaluation.unit.*'miles'.*Wh/km"),
+        (lambda: per_distance(1.0, "miles", CAR), "task.unit.*'miles'.*Wh/km"),
         (lambda: Task("x", "fuel"), "task.score.*'fuel'.*net_energy"),
-        (lambda: Task("x", limits={"gap": 1.0}), "task.limits.gap.*max_"),
+        (lambda: Task("x", limits={"gap": 1.0}), "task.limits.*'gap'; valid: max_gap_m, "),
+        (lambda: Task("x", limits={"max_gap": 1.0}), "'max_gap'.*Did you mean 'max_gap_m'"),
         (lambda: Task("x", limits={"max_gap_m": float("nan")}), "task.limits.max_gap_m"),
         (lambda: scores(rows("own", [1.0]), TASK, MOTOR), "task.against=human"),
         (
-            lambda: scores(rows("human", [1.0]), Task("x", limits={"max_x": 1.0}), MOTOR),
-            "task.limits.max_x",
+            lambda: scores(rows("human", [1.0]), Task("x", limits={"min_ttc_s": 1.0}), MOTOR),
+            "task.limits.min_ttc_s: episodes.parquet has no such column",
         ),
     ],
 )
