@@ -31,7 +31,7 @@ CONF = "lcc_rl.conf"
 CALLED = ("__call__",)  # what a node that is used as a function makes
 # Settings that do not change any row of a result.
 NOT_IDENTITY = (
-    *("resume", "jobs", "sweep", "objective", "logger", "trust"),
+    *("resume", "jobs", "sweep", "objective", "logger", "trust", "figure_formats"),
     "training.keep_every",
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config_types import check_numbers
-from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
+from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole, unknown_name
 from lcc_rl.targets import TARGET, settings_at
 
 
@@ -97,6 +98,7 @@ class StudyConfig:
     # Here, not in TrainConfig, so that one recipe serves every entry point.
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    figure_formats: list[str] = MISSING
     trust: list[str] = field(default_factory=list)
 
 
@@ -152,6 +154,24 @@ WHOLE: dict[str, tuple[int, ...]] = {
 }
 
 
+FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
+
+
+def check_formats(formats: Sequence[str]) -> None:
+    """Check the formats in which figures are written.
+
+    Raises:
+        ConfigError: if one is unknown, or the one that pages show is missing.
+    """
+    for name in formats:
+        if name not in FORMATS:
+            raise unknown_name("format (figure_formats)", str(name), FORMATS)
+    if FORMATS[0] not in formats:
+        raise ConfigError(
+            f"figure_formats must name {FORMATS[0]}, which pages show, got {list(formats)}"
+        )
+
+
 def check_ranges(cfg: Any) -> None:
     """Check that a configuration is whole, its numbers finite, and the schema's in their range.
 
@@ -182,6 +202,8 @@ def check_ranges(cfg: Any) -> None:
             require_in(where, RANGES[key], **{name: value})
         else:
             require_whole(where, *WHOLE[key], **{name: value})
+    if "figure_formats" in cfg:
+        check_formats(cfg.figure_formats)
     check_numbers(everything, "")
 
 

@@ -12,6 +12,7 @@ import torch
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
+from matplotlib.figure import Figure
 
 # Several test processes share a machine's cores; more threads each would only slow them down.
 torch.set_num_threads(1)
@@ -36,6 +37,19 @@ def configurations_are_parsed_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(source, "load_config", load_config)
         yield
+
+
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let figures be made and saved, but not drawn: half of the time of an evaluation's test.
+
+    Tests of results, and of a pipeline and a platoon as a whole, draw them.
+    """
+
+    def savefig(self: Figure, path: str | Path, **how: object) -> None:
+        Path(path).write_bytes(b"")
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
 
 
 @pytest.fixture(scope="session")

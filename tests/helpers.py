@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from typing import Any
 
 import pandas as pd
+import pytest
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -114,3 +116,14 @@ def steady(value: float, env: TransformedEnv) -> Callable[[TensorDictBase], Tens
     """Return the policy that always takes one action."""
     shape = env.full_action_spec[ACTION].shape
     return lambda td: td.set(ACTION, torch.full(shape, value))
+
+
+def slow_but(quick: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
+    """Mark the cases of a test as slow but for the quick ones, which ``make test`` runs."""
+    quick = list(quick)
+    return [
+        case
+        if case in quick
+        else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
+        for case in cases
+    ]

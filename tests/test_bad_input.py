@@ -301,6 +301,7 @@ def test_two_policies_that_rows_cannot_tell_apart(tmp_path) -> None:
         evaluation.run(cfg, tmp_path / "b")
 
 
+@pytest.mark.slow
 def test_policies_of_two_agents_stand_side_by_side(tmp_path) -> None:
     for agent in ("ddpg", "analytic"):
         cfg = tiny("train", "variant=alcc", f"agent={agent}", agent=False)

@@ -136,6 +136,7 @@ def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_pat
     assert (held.loc[held["strategy"] == "alcc", "share_ttc_unsafe"] == 0).all()
 
 
+@pytest.mark.slow
 def test_compared_policies_get_the_filter_under_study(trained, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "+filter=cbf")
     OmegaConf.update(cfg, "compare", ["pretrained/reference"])
@@ -236,6 +237,7 @@ def test_a_policy_for_those_that_learn_nothing_is_refused(trained, tmp_path) -> 
         evaluation.run(tiny("evaluate", "variant=idm", f"policy={trained}", agent=False), tmp_path)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
     jobs_in_threads(monkeypatch)
     overrides = [*TINY, QUICK, "variants=[reference,alcc]"]
@@ -283,6 +285,7 @@ def test_sigkill_and_resume_equal_an_uninterrupted_run(tmp_path) -> None:
     assert_same_tables(tmp_path / "whole", tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
     words = (*TINY, "training.episodes=80000", "hydra.run.dir=run")
     with start("lcc_rl.train", *words, cwd=tmp_path) as process:

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import AGENT, HORIZON, run_command
-from helpers import POPULATION
+from helpers import POPULATION, slow_but
 
 from lcc_rl import results
 from lcc_rl.agents.factory import build_agent
@@ -74,6 +74,7 @@ def test_a_leader_too_fast_for_the_headway_is_refused_before_the_training(tmp_pa
     assert len(evaluation.run(rows, tmp_path / "cacc", quiet=True))
 
 
+@pytest.mark.slow
 def test_hcfs_builds_on_a_given_policy(trained, tmp_path) -> None:
     rows = training.run(tiny("train", "hcfs", f"policy={trained}"), tmp_path, quiet=True)
     assert not (tmp_path / "training.parquet").exists()
@@ -133,7 +134,7 @@ def test_other_gains_stand_beside_the_named_ones(tmp_path) -> None:
     assert {"cacc", "cacc tuned"} <= set(rows["strategy"])
 
 
-@pytest.mark.parametrize("variant", ["cacc", "ddpg", "hcfs"])
+@pytest.mark.parametrize("variant", slow_but(["hcfs"], ["cacc", "ddpg", "hcfs"]))
 def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
     cfg = load("evaluate", [*TINY, f"variant={variant}", "policy=pretrained"])
     rows = evaluation.run(cfg, tmp_path, quiet=True)

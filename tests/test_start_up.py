@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from helpers import slow_but
 
 from lcc_rl.io.files import write_parquet
 
@@ -34,7 +35,9 @@ def loaded(program: str, *words: str, cwd: Path) -> tuple[set[str], str, str]:
     return set(names.split()), done.stdout, said
 
 
-@pytest.mark.parametrize("entry", ["train", "evaluate", "calibrate", "pipeline"])
+@pytest.mark.parametrize(
+    "entry", slow_but(["train"], ["train", "evaluate", "calibrate", "pipeline"])
+)
 def test_help_needs_no_torch(entry, tmp_path) -> None:
     names, out, _ = loaded(PROGRAM, f"lcc_rl.{entry}", "--help", cwd=tmp_path)
     assert not names.intersection((*HEAVY, *TABLES))

@@ -11,14 +11,13 @@ from lcc_rl import results
 from lcc_rl.config import short_name
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.drawing import new_figure
+from lcc_rl.results.drawing import INK, in_words, legend_above, new_figure
 from lcc_rl.results.figures import style
 
 PREVIEWS = (1.0, 2.0, 5.0, 10.0)  # [s]
 KNOWN = ("none", "memory", *(f"preview_{seconds:g}s" for seconds in PREVIEWS))
 EPISODES, KEPT, FILTERED = "episodes.parquet", "kept.parquet", "filtered.parquet"
 HUES = {"analytic": "#0072b2", "ddpg": "#d55e00", "td3": "#009e73", "sac": "#cc79a7"}
-INK = "#222222"
 ENERGY, UNSAFE, LONG = "total_energy_kj", "share_ttc_unsafe", "share_time_gap_long"
 LOST = "total_acceleration_loss_kj"
 MEANS = (ENERGY, LOST, UNSAFE, LONG)
@@ -86,10 +85,11 @@ def figure_of_agents(folder: Path) -> Figure:
     style(axes[0, 1], "", "")
     style(axes[1, 0], "training time [min]", "reward per training episode\n(mean of 10 batches)")
     for agent in dict.fromkeys(learned["agent"]):
-        axes[1, 0].plot([], [], color=HUES.get(agent, INK), label=agent)
-    axes[1, 0].legend(frameon=False, loc="lower right")
-    note = "a line per training; solid: alcc, dotted: reference; dashed: a human in the car's place"
-    figure.supxlabel(note, fontsize=8)
+        axes[0, 0].plot([], [], color=HUES.get(agent, INK), label=agent)
+    legend_above(axes[0, 0], 4)
+    note = "; solid: alcc, dotted: others" if learned["variant"].nunique() > 1 else ""
+    note += "; dashed: a human in the car's place" if len(human) else ""
+    figure.supxlabel(f"a line per training{note}", fontsize=8)
     return figure
 
 
@@ -136,31 +136,47 @@ def runs_by_knowledge(folder: Path) -> pd.DataFrame:
 
 
 def figure_of_knowledge(folder: Path) -> Figure:
-    """Energy, losses and limits against knowledge; a point per training, lines of means."""
-    table = table_of_knowledge(folder).set_index("knowledge")
+    """Energy, losses and limits against knowledge."""
+    return drawn_knowledge(table_of_knowledge(folder), runs_by_knowledge(folder))
+
+
+def drawn_knowledge(table: pd.DataFrame, runs: pd.DataFrame) -> Figure:
+    """Draw the means of :func:`table_of_knowledge`, and a dot per training.
+
+    Args:
+        table: a row per kind of knowledge, shares of the time from 0 to 1.
+        runs: a row per training; none where only the means are kept.
+    """
+    table = table.set_index("knowledge")
     learned = table.loc[[kind for kind in KNOWN if kind in table.index]]
-    runs = runs_by_knowledge(folder)
+    places = pd.Series(range(len(learned)), learned.index)
     runs = runs[runs["knowledge"].isin(learned.index)]
     human = table.loc["idm"] if "idm" in table.index else None
     words = {ENERGY: "total energy\n[kJ per episode]", LOST: "lost to accelerating\n[kJ]"}
-    figure = new_figure(7.0, 6.2)
+    figure = new_figure(8.0, 6.6)
     axes = figure.subplots(3, 1, sharex=True)
-    looks = {"": ("#0072b2", "as trained"), "filtered_": ("#d55e00", "behind the filter")}
-    for prefix, (hue, label) in looks.items():
-        look = {"color": hue, "marker": "o", "lw": 1.2}
+    looks = {
+        "": ("#0072b2", "as trained", -0.08),
+        "filtered_": ("#d55e00", "behind the filter", 0.08),
+    }
+    for prefix, (hue, label, shift) in looks.items():
+        look = {"color": hue, "marker": "o", "ls": ""}
         for axis, name in zip(axes, words, strict=False):
-            axis.plot(learned.index, learned[prefix + name], label=label, **look)
-        axes[-1].plot(learned.index, 100.0 * learned[prefix + LONG], **look)
-    dots = {"color": "#0072b2", "marker": ".", "alpha": 0.5, "ls": ""}
+            axis.plot(places + shift, learned[prefix + name], label=label, **look)
+        gap = f"time gap > 2.5 s, {label}"
+        axes[-1].plot(places + shift, 100.0 * learned[prefix + LONG], label=gap, **look)
     for axis, (name, label) in zip(axes, words.items(), strict=False):
-        axis.plot(runs["knowledge"], runs[name], **dots)
+        axis.plot(
+            places[runs["knowledge"]].to_numpy() - 0.16, runs[name], ".", color="#0072b2", alpha=0.5
+        )
         if human is not None:
             axis.axhline(human[name], color=INK, lw=0.8, ls="--", label="human driver")
         style(axis, "", label)
-    axes[-1].plot(learned.index, 100.0 * learned[UNSAFE], "o:", color="#0072b2", lw=1.2)
-    axes[0].legend(frameon=False, fontsize=8)
+    unsafe = {"marker": "^", "ls": "", "color": "#0072b2", "mfc": "none"}
+    axes[-1].plot(places, 100.0 * learned[UNSAFE], label="TTC < 4 s, as trained", **unsafe)
     axes[-1].set_ylim(bottom=0.0)
+    axes[-1].set_xticks(places, [in_words(kind) for kind in learned.index])
     style(axes[-1], "what the car knows besides the present", "share of time [%]")
-    note = "bottom: solid, time gap > 2.5 s; dotted, TTC < 4 s as trained"
-    figure.supxlabel(note, fontsize=8)
+    legend_above(axes[0])
+    legend_above(axes[-1], 2)
     return figure

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lcc_rl import results
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.drawing import new_figure
+from lcc_rl.results.drawing import in_words, legend_above, new_figure
 from lcc_rl.results.figures import style
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, energy_at, front, points, saving_at
 
@@ -33,6 +33,12 @@ HUES = {
     "preview": "#009e73",
     "idm": "#d55e00",
     "idm_gradient": "#cc79a7",
+}
+NAMES = {
+    "memory": "network with memory",
+    "preview": "network with preview",
+    "idm": "IDM, by search",
+    "idm_gradient": "IDM, by gradient",
 }
 LINES = {"alcc": "-", "own_energy": "--", "reference": ":"}
 
@@ -92,10 +98,10 @@ def figure_of_limits(folder: Path) -> Figure:
         variant, policy = map(str, kind)
         hue, style_of = HUES.get(policy, "#222222"), LINES.get(variant, "-.")
         line = points(rows).sort_values(SHARE)
-        name = f"{variant}, {policy}"
+        name = f"{in_words(variant)}, {NAMES.get(policy, policy)}"
         axes.plot(100.0 * line[SHARE], line[ENERGY], ls=style_of, color=hue, label=name)
         each = rows.groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
         axes.plot(100.0 * each[SHARE], each[ENERGY], ".", color=hue, alpha=0.6)
-    axes.legend(frameon=False, fontsize=8)
+    legend_above(axes, 2)
     style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy\n[kJ per episode]")
     return figure

@@ -12,8 +12,9 @@ from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
+from lcc_rl.commands.maps import write_responses
 from lcc_rl.commands.tasks import check_named, only_named, task_of
-from lcc_rl.config import identity
+from lcc_rl.config import identity, is_sweep
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
@@ -116,6 +117,8 @@ def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
+    if isinstance(rows, pd.DataFrame) and cfg.evaluation.shards == 1 and not is_sweep():
+        write_responses(strategies, cfg, inputs.population, folder, {IDENTITY: identity(cfg)})
     if not quiet and isinstance(rows, pd.DataFrame):
         draw(folder, cfg.evaluation.rows)
     elif not quiet:
@@ -127,9 +130,11 @@ def draw(folder: Path, rows: str = "episodes") -> None:
     """Draw the figures of an evaluation, whose rows are ``episodes`` or ``vehicles``."""
     # Here: a training, which draws nothing, need not load matplotlib.
     from lcc_rl.results.figures import write_study_figures
+    from lcc_rl.results.policy_maps import write_maps
     from lcc_rl.results.string_figures import write_platoon_figures
 
     (write_study_figures if rows == "episodes" else write_platoon_figures)(folder)
+    write_maps(folder)
 
 
 def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:

@@ -104,7 +104,8 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     rows = evaluation.run(final, folder / "evaluation", own=False, quiet=paged)
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
-        save(curve, folder / "evaluation" / "figures" / "learning_curve.png")
+        place = folder / "evaluation" / "figures" / "learning_curve.png"
+        save(curve, place, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
         _conclude(folder, overrides)
     return rows

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lcc_rl.schemas import FORMATS, check_formats
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.alcc.settings import ABLATIONS, chooses_agent
@@ -30,6 +31,7 @@ from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, read_notes
 
 log = logging.getLogger("lcc_rl")
 
+OTHERS = "further formats of figures: " + ",".join(FORMATS[1:])
 REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 
@@ -42,13 +44,14 @@ def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
         profiles=arguments.profiles,
         followers=tuple(arguments.followers),
     )
-    return concluded(alcc.run(study, arguments.parts, command), study.folder, "alcc")
+    outcomes = alcc.run(study, arguments.parts, command)
+    return concluded(outcomes, study.folder, "alcc", arguments.formats)
 
 
 def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
     """Run the HCFS study and write its page; 1 if a training failed."""
     study = hcfs.Study(**common(arguments, "paper_hcfs"))
-    return concluded(hcfs.run(study, command), study.folder, "hcfs")
+    return concluded(hcfs.run(study, command), study.folder, "hcfs", arguments.formats)
 
 
 def common(arguments: argparse.Namespace, recipe: str | None) -> dict[str, Any]:
@@ -63,12 +66,14 @@ def common(arguments: argparse.Namespace, recipe: str | None) -> dict[str, Any]:
     }
 
 
-def concluded(outcomes: Sequence[Outcome], folder: Path, study: str) -> int:
+def concluded(
+    outcomes: Sequence[Outcome], folder: Path, study: str, formats: Sequence[str] = ()
+) -> int:
     """Log the trainings that failed and write the page; 1 if one failed."""
     wrong = [outcome for outcome in outcomes if outcome.status != FINISHED]
     for outcome in wrong:
         log.error("%s: %s: %s", outcome.run.folder, outcome.status, outcome.note)
-    page = REPORTS[study](folder)
+    page = REPORTS[study](folder, formats)
     log.info("%d of %d trainings in %s", len(outcomes) - len(wrong), len(outcomes), page)
     return 1 if wrong else 0
 
@@ -76,7 +81,7 @@ def concluded(outcomes: Sequence[Outcome], folder: Path, study: str) -> int:
 def rewrite(arguments: argparse.Namespace, command: str) -> int:
     """Rewrite tables, figures and page of a study's folder."""
     study = read_notes(arguments.folder).get("study", "alcc")
-    log.info("wrote %s", REPORTS[study](arguments.folder))
+    log.info("wrote %s", REPORTS[study](arguments.folder, arguments.formats))
     return 0
 
 
@@ -97,6 +102,7 @@ def parser() -> argparse.ArgumentParser:
     again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
     again.set_defaults(run=rewrite, overrides=[])
     again.add_argument("folder", type=Path)
+    listing(again, "--formats", (), OTHERS)
     return top
 
 
@@ -109,6 +115,7 @@ def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser
     one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
     text = f"experiment: paper_{name}, quickstart …; in alcc with agent=… that agent's own length"
     one.add_argument("--recipe", help=text)
+    listing(one, "--formats", (), OTHERS)
     listing(one, "--accept", (), "settings in which runs found in the folder may differ: data,…")
     return one
 
@@ -133,6 +140,7 @@ def main(words: list[str]) -> int:
     if wrong or (overrides and "folder" in arguments):
         top.error(f"unknown: {' '.join(wrong or overrides)}")
     check_overrides(overrides)
+    check_formats((*arguments.formats, FORMATS[0]))
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     return int(arguments.run(arguments, shlex.join(["lcc-rl", "reproduce", *words])))

@@ -76,6 +76,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
             taken = (place == index.unsqueeze(-1)).any(-2)
             order = taken.int().argsort(stable=True, dim=-1)
             rest = order[..., : len(others)].sort(-1).values
+            groups["cav"]["place"] = record[INDEX]  # no other entry tells it
             for group, chosen in (("cav", index), ("hdv", rest)):
                 at = chosen.expand(entry.shape[0], *chosen.shape)
                 groups[group][name] = gather(entry, at)

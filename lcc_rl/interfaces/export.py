@@ -36,6 +36,7 @@ DERIVED = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
+PRESENT = "behind.present"
 FILTERED = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 
 
@@ -73,12 +74,16 @@ class ExportedPolicy(nn.Module):
         self.columns = [[self._places(name) for name in column] for column in seen]
 
     def _places(self, name: str) -> tuple[int, ...]:
-        return tuple(self.names.index(base) for base in DERIVED.get(name, (name,)))
+        bases = DERIVED.get(name, (name,))
+        if name == "behind.relative_speed" and PRESENT in self.names:
+            bases = (*bases, PRESENT)
+        return tuple(self.names.index(base) for base in bases)
 
     def _value(self, state: Tensor, places: tuple[int, ...]) -> Tensor:
-        """Return a measurement, or the difference of two, ``[batch, 1]``."""
-        first = state[:, places[0] : places[0] + 1]
-        return first if len(places) == 1 else first - state[:, places[1] : places[1] + 1]
+        """Return a measurement, or the difference of two where it exists, ``[batch, 1]``."""
+        first, *others = (state[:, place : place + 1] for place in places)
+        difference = first - others[0] if others else first
+        return difference * others[1] if len(others) > 1 else difference
 
     def forward(self, state: Tensor) -> Tensor:
         """Return the acceleration to command."""

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from omegaconf import DictConfig
 
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.drawing import new_figure, save, unbox
+from lcc_rl.results.drawing import INK, in_file, in_words, legend_above, new_figure, save, unbox
 from lcc_rl.results.intervals import Estimate, share_saved
-from lcc_rl.results.runs import load_config
+from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, paired, savings, worse_off
 from lcc_rl.results.space_time import space_time
 
@@ -60,10 +63,10 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     style(axes[0], "", "speed [m/s]")
     style(axes[1], "", "acceleration [m/s²]")
     style(axes[2], "time [s]", "gap ahead [m]")
-    axes[0].legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.3))
+    legend_above(axes[0])
     figure.suptitle(
-        f"{strategy}: profile {first['profile']}, driver v0 {first['desired_speed_mps']:.1f} m/s, "
-        f"T {first['time_gap_s']:.2f} s",
+        f"{in_words(strategy)}: profile {first['profile']}, driver "
+        f"v0 {first['desired_speed_mps']:.1f} m/s, T {first['time_gap_s']:.2f} s",
         fontsize=10,
     )
     return figure
@@ -78,34 +81,36 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figu
         if f"{vehicle}_speed" in rows:
             left.plot(rows["time_s"], rows[f"{vehicle}_speed"], color=hue, label=name, lw=1.3)
     style(left, "time [s]", "speed [m/s]")
-    left.set_title(f"One held-out episode of {strategy}", fontsize=10)
-    left.legend(frameon=False, fontsize=9)
-    cars = episodes[episodes["strategy"] != "direct"]
+    left.set_title(f"One held-out episode of {in_words(strategy)}", fontsize=10, pad=22)
+    legend_above(left)
+    _mean_energies(right, episodes[episodes["strategy"] != "direct"])
+    return figure
+
+
+def _mean_energies(axis: Axes, cars: pd.DataFrame) -> None:
+    """Draw a bar per strategy: the mean energies of car and human driver, one after the other."""
     present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_path_energy_kj" in cars]
     means = cars.groupby("strategy", sort=False)[[f"{x}_path_energy_kj" for x in present]].mean()
-    totals = pd.Series(0.0, means.index)
+    totals, places = pd.Series(0.0, means.index), np.arange(len(means))
     for vehicle in present:
         name, hue = VEHICLES[vehicle]
         value = means[f"{vehicle}_path_energy_kj"]
-        right.bar(value.index, value, bottom=totals, color=hue, label=name)
+        axis.barh(places, value, left=totals, color=hue, label=name)
         totals = totals + value
     for place, (label, total) in enumerate(totals.items()):
         known = label != "idm" and "idm" in totals
-        saving = f"\n({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
-        words = f"{total:.0f}{saving}"
-        right.annotate(words, (place, total), ha="center", va="bottom", fontsize=8)
-    # As written on the axis, names of two words would run into each other.
-    labels = [str(name).replace(" ", "\n") for name in totals.index]
-    right.set_xticks(range(len(labels)), labels, fontsize=8)
-    right.set_ylim(0.0, 1.3 * totals.max())
-    style(right, "", "path energy [kJ per episode]")
-    right.legend(frameon=False, ncols=2, fontsize=9, loc="upper center")
-    right.set_title(
-        f"Mean over {cars['profile_id'].nunique()} held-out profiles × "
-        f"{cars['driver_id'].nunique()} drivers",
-        fontsize=10,
+        change = f" ({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
+        axis.annotate(f" {total:.0f}{change}", (total, place), va="center", fontsize=8)
+    axis.set_yticks(places, [in_words(str(name)) for name in totals.index], fontsize=9)
+    axis.set_ylim(len(places) - 0.4, -0.6)
+    axis.set_xlim(0.0, 1.4 * totals.max())
+    against = "\nin brackets: against idm" if "idm" in totals else ""
+    style(axis, f"path energy [kJ per episode]{against}", "")
+    legend_above(axis)
+    title = (
+        f"{cars['profile_id'].nunique()} held-out profiles × {cars['driver_id'].nunique()} drivers"
     )
-    return figure
+    axis.set_title(f"Mean over {title}", fontsize=10, pad=22)
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
@@ -125,7 +130,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
 def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
     figure = new_figure(9.0, 3.8)
-    names = {"direct": "B: direct", strategy: f"A: behind {strategy}"}
+    names = {"direct": "B: direct", strategy: f"A: behind {in_words(strategy)}"}
     saving = _by_driver(figure, episodes, "hdv_path_energy_kj", names, "the human driver")
     found = savings(episodes, "hdv_path_energy_kj", strategy, "direct")
     figure.suptitle(
@@ -138,16 +143,16 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
 
 
 def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
-    """Path energy of both vehicles by driver and its saving against a baseline (Fig. 10)."""
+    """Path energy of all vehicles by driver and its saving against a baseline (Fig. 10)."""
     figure = new_figure(9.0, 3.8)
-    names = {baseline: baseline, strategy: strategy}
+    names = {name: in_words(name) for name in (baseline, strategy)}
     column = "total_path_energy_kj"
-    saving = _by_driver(figure, episodes, column, names, "both vehicles")
+    saving = _by_driver(figure, episodes, column, names, "all vehicles")
     found = savings(episodes, column, strategy, baseline)
     pairs = worse_off(paired(episodes, column), strategy, baseline)["pairs"]
     share = _with_interval(found, episodes, strategy)
     figure.suptitle(
-        f"{strategy} against {baseline}: saving of path energy {share}\n"
+        f"{names[strategy]} against {names[baseline]}: saving of path energy {share}\n"
         f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %; worse off: "
         f"{int((saving < 0).sum())} of {len(saving)} drivers, "
         f"{100 * pairs:.0f} % of (window, driver) pairs",
@@ -178,8 +183,9 @@ def _by_driver(
         mean = f"{label}, mean {energy[name].mean():.1f}"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
     style(left, f"path energy of {whose} [kJ per episode]", "drivers")
-    left.set_ylim(top=1.3 * left.get_ylim()[1])
-    left.legend(frameon=False, loc="upper left", fontsize=9)
+    left.xaxis.set_major_locator(MaxNLocator(5))
+    left.yaxis.set_major_locator(MaxNLocator(integer=True))
+    legend_above(left)
     baseline, strategy = names
     saving = share_saved(energy[strategy], energy[baseline])
     against = " against ".join(label.split(":")[0] for label in (names[strategy], names[baseline]))
@@ -201,17 +207,12 @@ def _paired_bars(axis: Axes, saving: pd.Series, label: str, hue: str) -> None:
     """Draw one bar per driver, sorted; below zero means worse off."""
     ordered = 100 * np.sort(saving.to_numpy())
     axis.bar(np.arange(len(ordered)), ordered, width=1.0, color=hue, alpha=0.8)
-    axis.axhline(0.0, color="#222222", lw=0.8)
-    axis.axhline(ordered.mean(), color="#222222", lw=0.8, ls="--")
-    axis.annotate(
-        f"mean of drivers {ordered.mean():+.1f} %",
-        (0.02, ordered.mean()),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
-    )
+    axis.axhline(0.0, color=INK, lw=0.8)
+    mean = ordered.mean()
+    axis.axhline(mean, color=INK, lw=0.8, ls="--", label=f"mean of drivers {mean:+.1f} %")
+    axis.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
     style(axis, "drivers, sorted", label)
+    legend_above(axis)
 
 
 def write_study_figures(folder: str | Path) -> list[Path]:
@@ -227,30 +228,39 @@ def write_study_figures(folder: str | Path) -> list[Path]:
         ResultsError: if a table is missing or a figure cannot be written.
     """
     folder = Path(folder)
-    episodes, steps = (
-        read_parquet(folder / "episodes.parquet"),
-        read_parquet(folder / "steps.parquet"),
-    )
-    target, names = folder / "figures", list(dict.fromkeys(episodes["strategy"]))
+    episodes, steps = (read_parquet(folder / f"{x}.parquet") for x in ("episodes", "steps"))
+    cfg = stored_config(folder)
+    drawn = study_figures(episodes, steps, cfg)
+    formats = cfg.get("figure_formats", ())
+    return [
+        save(figure, folder / "figures" / f"{in_file(stem)}.png", formats=formats)
+        for stem, figure in drawn
+    ]
+
+
+def study_figures(
+    episodes: pd.DataFrame, steps: pd.DataFrame, cfg: DictConfig
+) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of all that an evaluation with a row per episode shows.
+
+    Args:
+        episodes: rows of episodes.parquet.
+        steps: rows of steps.parquet; it may have none.
+        cfg: the evaluation's configuration.
+    """
+    names = list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
-    paths = []
-    diagram = (
-        space_time(steps, [*names[:1], *names[-2:]], load_config(folder)) if len(steps) else None
-    )
+    diagram = space_time(steps, [*names[:1], *names[-2:]], cfg) if len(steps) else None
     if diagram is not None:
-        paths.append(save(diagram, target / "space_time.png"))
+        yield "space_time", diagram
     if len(steps) and "idm" in names and cars[-1] not in UNTRAINED:
-        paths.append(save(overview(episodes, steps, cars[-1]), target / "overview.png"))
+        yield "overview", overview(episodes, steps, cars[-1])
     for name in cars:
-        stem = name.replace(" ", "_")
         if len(steps) and (steps["strategy"] == name).any():
-            paths.append(save(sample_episode(steps, name), target / f"episode_{stem}.png"))
+            yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
-            figure = human_energy(episodes, name)
-            paths.append(save(figure, target / f"human_energy_{stem}.png"))
+            yield f"human_energy {name}", human_energy(episodes, name)
         for baseline in BASELINES:
             if baseline in names and baseline != name and name not in UNTRAINED:
                 figure = paired_improvement(episodes, name, baseline)
-                path = target / f"improvement_{stem}_vs_{baseline.replace(' ', '_')}.png"
-                paths.append(save(figure, path))
-    return paths
+                yield f"improvement {name} vs {baseline}", figure

@@ -126,6 +126,7 @@ def write_page(folder: str | Path, commands: Sequence[str]) -> tuple[Path, pd.Da
 
 FIRST = {
     "evaluation/figures/overview.png": "A held-out episode, and the path energy of both cars",
+    "evaluation/figures/policy_map.png": "What the networks and a tuned rule do",
     "evaluation/figures/learning_curve.png": "The trainings: what they minimise, and their limit",
 }
 DRIVERS = {

@@ -88,6 +88,15 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:
     return cfg
 
 
+def stored_config(folder: Path) -> DictConfig:
+    """Read the configuration of a run to draw by, not to build from: it may name any module.
+
+    Raises:
+        ResultsError: if it is missing or damaged.
+    """
+    return DictConfig(read_settings(folder / CONFIG))
+
+
 def read_settings(path: Path) -> dict[str, Any]:
     """Read a stored configuration as plain containers.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,12 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.drawing import new_figure, save, unbox
-from lcc_rl.results.runs import load_config
+from lcc_rl.results.drawing import INK, in_file, in_words, legend_above, new_figure, save, unbox
+from lcc_rl.results.runs import stored_config
 
 SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
 NEAR, FAR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
-LEADER, BOUND = "#222222", "#b00020"
+BOUND = "#b00020"
 PARENTS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
 
 
@@ -36,7 +37,7 @@ def _panels(steps: pd.DataFrame, names: list[str], title: str) -> tuple[Figure, 
     figure = new_figure(8.0, 1.2 + 2.0 * len(names))
     axes = list(np.atleast_1d(figure.subplots(len(names), 1, sharex=True, sharey=True)))
     for axis, name in zip(axes, names, strict=True):
-        axis.set_title(name, fontsize=10, loc="left")
+        axis.set_title(in_words(name), fontsize=10, loc="right")
         unbox(axis)
     axes[-1].set_xlabel("time [s]")
     figure.suptitle(title, fontsize=11)
@@ -60,20 +61,29 @@ def velocities(steps: pd.DataFrame, case: str) -> Figure:
         own = rows[rows["strategy"] == name]
         leader = own[own["follower"] == 0]
         _lines(axis, own, "speed_mps")
-        axis.plot(leader["time_s"], leader["speed_mps"], color=LEADER, ls="--", label="leader")
-    axes[0].legend(frameon=False, fontsize=8, ncols=3)
+        axis.plot(leader["time_s"], leader["speed_mps"], color=INK, ls="--", label="leader")
+    legend_above(axes[0])
     return figure
 
 
 def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
-    """Jerk of the followers with its bound, a panel per strategy (Figs. 5, 8, 11)."""
+    """Jerk of the followers, a panel per strategy, and its bound where they come near it.
+
+    The scale is that of the data (Figs. 5, 8, 11).
+    """
     rows = steps[steps["case"] == case]
-    figure, axes = _panels(rows, shown(rows), f"{case}: jerk [m/s³], bound ±{bound:g}")
+    own = rows[rows["strategy"].isin(shown(rows)) & (rows["follower"] > 0)]
+    top = 1.1 * max(float(own["jerk_mps3"].abs().max()), 0.1)
+    near = top > 0.5 * bound
+    where = f"dotted: bound ±{bound:g}" if near else f"bound ±{bound:g}, beyond the scale"
+    figure, axes = _panels(rows, shown(rows), f"{case}: jerk [m/s³]; {where}")
     for axis, name in zip(axes, shown(rows), strict=True):
         _lines(axis, rows[rows["strategy"] == name], "jerk_mps3")
-        for side in (-bound, bound):
+        for side in (-bound, bound) if near else ():
             axis.axhline(side, color=BOUND, lw=0.8, ls=":")
-    axes[0].legend(frameon=False, fontsize=8, ncols=2)
+    scale = max(top, 1.1 * bound) if near else top
+    axes[0].set_ylim(-scale, scale)
+    legend_above(axes[0])
     return figure
 
 
@@ -102,8 +112,9 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     axis.set_ylabel("follower")
     unbox(axis)
     share = float(np.nanmean(raster.to_numpy()))
-    axis.set_title(f"{case}: who drives in {strategy} (DDPG {share:.0%})", fontsize=10)
-    axis.legend(frameon=False, fontsize=8, ncols=2, loc="upper left", bbox_to_anchor=(0.7, 1.2))
+    title = f"{case}: who drives in {in_words(strategy)} (DDPG {100 * share:.0f} %)"
+    axis.set_title(title, fontsize=10, loc="right")
+    legend_above(axis)
     return figure
 
 
@@ -124,15 +135,25 @@ def write_platoon_figures(folder: str | Path, target: Path | None = None) -> lis
     steps, target = read_parquet(folder / "steps.parquet"), target or folder / "figures"
     if steps.empty:
         return []
-    controller = load_config(folder).get("controller")
-    bound = float(controller.jerk_bound) if controller is not None else 30.0
-    paths = []
+    cfg = stored_config(folder)
+    bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
+    found = platoon_figures(steps, bound)
+    return [
+        save(figure, target / f"{in_file(stem)}.png", formats=cfg.get("figure_formats", ()))
+        for stem, figure in found
+    ]
+
+
+def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of every case.
+
+    Args:
+        steps: rows of steps.parquet.
+        bound: of the jerk [m/s³].
+    """
     for case in dict.fromkeys(steps["case"]):
-        stem = str(case).replace(" ", "_")
-        paths.append(save(velocities(steps, case), target / f"{stem}_velocities.png"))
-        paths.append(save(jerks(steps, case, bound), target / f"{stem}_jerk.png"))
+        yield f"{case} velocities", velocities(steps, case)
+        yield f"{case} jerk", jerks(steps, case, bound)
         for strategy in ("hcfs", "hcfs oracle"):
             if (steps["strategy"] == strategy).any():
-                path = target / f"{stem}_switching_{strategy.replace(' ', '_')}.png"
-                paths.append(save(switching(steps, case, strategy), path))
-    return paths
+                yield f"{case} switching {strategy}", switching(steps, case, strategy)

@@ -6,7 +6,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.results.drawing import new_figure
+from lcc_rl.results.drawing import in_words, legend_above, new_figure
 from lcc_rl.results.figures import colour, style
 from lcc_rl.results.intervals import band
 
@@ -40,7 +40,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
         for axis, name in zip(axes[1:], limits, strict=True):
             draw_curve(axis, rows.assign(percent=100.0 * rows[name]), "percent", str(variant))
     style(axes[0], "training episodes", "objective, less is better")
-    axes[0].legend(frameon=False, fontsize=9)
+    legend_above(axes[0], 1)
     for axis, name in zip(axes[1:], limits, strict=True):
         what = name.removeprefix(SHARE)
         _limit(axis, training.get(f"agent.limits.{what}"))
@@ -55,7 +55,7 @@ def _limit(axis: Axes, limits: pd.Series | None) -> None:
     percent = 100.0 * float(limits.iloc[0])
     axis.axhline(percent, color="#222222", lw=0.8, ls="--", label=f"limit {percent:g} %")
     axis.set_ylim(0.0, max(4.0 * percent, 1e-3))  # the first batches would set the scale
-    axis.legend(frameon=False, fontsize=9)
+    legend_above(axis)
 
 
 def learning_curve(training: pd.DataFrame) -> Figure:
@@ -74,9 +74,9 @@ def learning_curve(training: pd.DataFrame) -> Figure:
     # The first, random episodes would set the scale.
     axis.set_ylim(bottom=1.6 * floor - 1.0)
     style(axis, "training episodes", "mean reward per episode")
-    axis.legend(frameon=False)
-    axis.set_title(f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included")
-    axis.title.set_fontsize(10)
+    title = f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included"
+    figure.suptitle(title, fontsize=10)
+    legend_above(axis, 2)
     return figure
 
 
@@ -94,10 +94,10 @@ def draw_curve(axis: Axes, rows: pd.DataFrame, column: str, variant: str) -> tup
     line = smooth.mean().mean(axis=1)
     if curves.shape[1] > 1:
         low, high = band(smooth.mean().to_numpy(float))
-        label = f"{variant} (n = {curves.shape[1]} seeds, 95 % band)"
+        label = f"{in_words(variant)} (n = {curves.shape[1]} seeds, 95 % band)"
     else:
         low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
-        label = f"{variant} (1 seed; band: 5–95 % of {WINDOW} batches)"
+        label = f"{in_words(variant)} (1 seed; band: 5–95 % of {WINDOW} batches)"
     axis.fill_between(line.index, low, high, color=colour(variant), alpha=0.2, lw=0)
     axis.plot(line.index, line, color=colour(variant))
     return line, label

@@ -19,10 +19,11 @@ class Page:
 
     Args:
         folder: the study's folder.
+        formats: further formats of the figures, as files only.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | Path, formats: Iterable[str] = ()) -> None:
+        self.folder, self.formats = Path(folder), tuple(formats)
         self.sections: list[Section] = []
 
     def add(
@@ -48,7 +49,8 @@ class Page:
             write_parquet(frame, self.folder / "tables" / f"{name}.parquet")
             shown.append((caption, frame))
         for name, caption, figure in figures:
-            drawn.append((caption, save(figure, self.folder / "figures" / f"{name}.png", dpi=130)))
+            place = self.folder / "figures" / f"{name}.png"
+            drawn.append((caption, save(figure, place, dpi=130, formats=self.formats)))
         self.sections.append(Section(heading, text, shown, drawn))
 
     def write(self, title: str, details: Sequence[tuple[str, str]], more: str = "") -> Path:

@@ -183,6 +183,7 @@ def test_a_mixture_is_trained_and_evaluated_by_source(tmp_path, capsys) -> None:
     assert "cycles: 2 held-out" in " ".join(printed.split())
 
 
+@pytest.mark.slow
 def test_savings_by_source(tmp_path) -> None:
     cfg = tiny("evaluate", "variant=idm", "leader=mixture", "evaluation.profiles=6", agent=False)
     rows = evaluation.run(cfg, tmp_path, quiet=True)

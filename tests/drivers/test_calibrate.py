@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import run_command
+from helpers import slow_but
 from omegaconf import OmegaConf
 from rich.console import Console
 
@@ -66,7 +67,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
         assert text in out.getvalue()
 
 
-@pytest.mark.parametrize("model", list(LAWS))
+@pytest.mark.parametrize("model", slow_but(["idm", "gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     cfg.calibration.model, cfg.calibration.objective = model, "both"
     cfg.calibration.holdout = 0.3

@@ -161,6 +161,7 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
     assert not (folder / BLOCKS).exists()
 
 
+@pytest.mark.slow
 def test_a_damaged_block_and_one_of_other_weights_are_played_again(
     whole, tmp_path, monkeypatch
 ) -> None:

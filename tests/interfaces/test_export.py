@@ -12,7 +12,9 @@ from helpers import small_env
 import lcc_rl
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.rollout import play
+from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy, main
+from lcc_rl.pieces import Action, Observation
 from lcc_rl.results.policies import load_policy
 
 KEYS = [("vehicles", name) for name in ("speed", "gap", "acceleration")]
@@ -71,6 +73,17 @@ def test_the_filter_is_inside(module) -> None:
     state = torch.tensor([[near.get(name, 15.0) for name in module.names]])
     assert module(state).item() == -3.0
     assert torch.isfinite(module(torch.full_like(state, torch.nan))).all()
+
+
+def test_with_nobody_behind_the_relative_speed_is_zero_as_in_the_environment() -> None:
+    string = VehicleString(("automated", "human"), drawn=True)
+    scales = {"self": {"speed": 1.0}, "behind": {"speed": 1.0, "relative_speed": 0.1}}
+    network = torch.nn.Linear(4, 1, bias=False)
+    network.weight.data = torch.tensor([[0.0, 0.0, 1.0, 0.0]])
+    exported = ExportedPolicy(network, Observation(scales, string=string), Action(1.0), None)
+    assert exported.names == ["self.speed", "behind.speed", "behind.present"]
+    state = torch.tensor([[10.0, 0.0, 0.0], [10.0, 8.0, 1.0]])
+    torch.testing.assert_close(exported(state), torch.tensor([[0.0], [0.2]]))
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from helpers import slow_but
 from renames import renamed
 from tensordict import TensorDict
 
@@ -178,7 +179,7 @@ def compare_tables(found: pd.DataFrame, reference: pd.DataFrame, tolerance: floa
             assert new.astype(str).tolist() == old.astype(str).tolist(), column
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS["evaluation"]))
+@pytest.mark.parametrize("name", slow_but(["alcc", "hcfs"], sorted(COMMANDS["evaluation"])))
 def test_evaluations(name, tmp_path) -> None:
     cfg = load("evaluate", renamed(COMMANDS["evaluation"][name]["overrides"]))
     evaluation.run(cfg, tmp_path, quiet=True)
@@ -191,7 +192,11 @@ def test_evaluations(name, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["alcc_ddpg", "alcc_td3", "alcc_sac", "alcc_analytic", "own_energy", "ddpg"]
+    "name",
+    slow_but(
+        ["alcc_ddpg", "alcc_analytic", "ddpg"],
+        ["alcc_ddpg", "alcc_td3", "alcc_sac", "alcc_analytic", "own_energy", "ddpg"],
+    ),
 )
 def test_trainings(name, tmp_path) -> None:
     # Recorded when the value was learned at every moment.

@@ -60,11 +60,21 @@ def test_the_image_has_the_colours_of_many_speeds(tmp_path) -> None:
     with Image.open(save(figure, tmp_path / "x.png", dpi=60)) as image:
         pixels = np.asarray(image.convert("RGB"))[:, : int(0.75 * image.width)].reshape(-1, 3)
     reddish = (pixels[:, 0] > 150) & (pixels[:, 1] < 80)
-    greenish = (pixels[:, 1] > 90) & (pixels[:, 0] < 60)
+    blueish = (pixels[:, 2] > 120) & (pixels[:, 0] < 60)
     assert reddish.sum() > 20
-    assert greenish.sum() > 100
+    assert blueish.sum() > 100
+    assert len(np.unique(pixels, axis=0)) > 200
 
 
-@pytest.mark.parametrize("string", ["automated human", {"size": 20, "penetration": 0.1}])
-def test_short_strings_and_drawn_places_have_none(string) -> None:
-    assert space_time(ROWS, ["human"], config(string)) is None
+def test_places_drawn_in_the_episode_are_where_the_rows_say() -> None:
+    drawn = config({"size": 3, "penetration": 0.3})
+    assert space_time(ROWS, ["human"], drawn) is None  # the rows do not say
+    figure = space_time(ROWS.assign(cav_place=2), ["human"], drawn)
+    assert figure is not None
+    framed = [lines.get_array() is None for lines in figure.axes[0].collections]
+    assert framed == [False, False, True, False]
+
+
+def test_short_strings_have_none() -> None:
+    short = ROWS.drop(columns=[name for name in ROWS if name.startswith("hdv2")])
+    assert space_time(short, ["human"], config("automated human")) is None

@@ -53,6 +53,9 @@ def benchmark() -> ModuleType:
     return module
 
 
+LONG = ("sweep", "calibrate", "read")  # longer than all others together
+
+
 def check_rows(rows: pd.DataFrame, name: str) -> None:
     assert list(rows.columns) == COLUMNS
     assert (rows["benchmark"] == name).all()
@@ -77,8 +80,7 @@ def check_rows(rows: pd.DataFrame, name: str) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    # A sweep starts processes of its own, which takes longer than all others together.
-    [pytest.param(name, marks=pytest.mark.slow if name == "sweep" else ()) for name in NAMES],
+    [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in NAMES],
 )
 def test_quick_run_writes_sane_rows(benchmark, tmp_path, capsys, name) -> None:
     out = tmp_path / "rows.parquet"

@@ -16,6 +16,7 @@ from lcc_rl.runs.cli import main_guard
         (["alcc", "data"], "expected overrides"),
         (["alcc", "seed=3"], "say --seeds"),
         (["report", "nowhere"], "no evaluation/episodes.parquet"),
+        (["report", "nowhere", "--formats", "pdf,emf"], "'emf'; valid: pdf, png, svg"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, words, expected) -> None:

@@ -9,12 +9,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.results.drawing import new_figure
+from lcc_rl.results.drawing import INK, in_words, legend_above, new_figure
 from lcc_rl.results.figures import colour, style
 from lcc_rl.results.savings import UNTRAINED, per_seed
 from lcc_rl.studies.alcc.tables import comparison
 
-INK, SOFT = "#222222", "#8a8a8a"
+SOFT = "#8a8a8a"
 PANELS = {
     "path_saving_against_idm_pct": ("path energy saved\nagainst idm [%]", 0.0),
     "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
@@ -62,14 +62,16 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
             part = table[table["strategy"] == strategy]
             rows = [names.index(name) + offset for name in part[by]]
             whiskers(axis, rows, part, column, colour(strategy))
-            axis.plot(part[column], rows, "o", color=colour(strategy), ms=5, label=strategy)
+            axis.plot(
+                part[column], rows, "o", color=colour(strategy), ms=5, label=in_words(strategy)
+            )
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
         axis.axhline(0.5, color=SOFT, lw=0.6)
         axis.grid(visible=True, axis="x", color="#e6e6e6", linewidth=0.8)
         axis.set_axisbelow(True)
         style(axis, label, "")
         axis.tick_params(axis="y", length=0)
-    axes[0].set_yticks(range(len(names)), [str(name).replace("_", " ") for name in names])
+    axes[0].set_yticks(range(len(names)), [in_words(str(name)) for name in names])
     axes[0].set_ylim(len(names) - 0.4, -0.6)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
@@ -104,12 +106,12 @@ def followers_figure(episodes: pd.DataFrame) -> Figure:
     names = list(dict.fromkeys(table["strategy"]))
     for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
         part = table[table["strategy"] == name]
-        label = f"{name}, {_how_many(part['seeds'])}"
+        label = f"{in_words(name)}, {_how_many(part['seeds'])}"
         places = part["followers"].to_numpy(float) + offset
         axis.plot(places, part[column], "o-", color=colour(name), label=label)
         whiskers(axis, places, part, column, colour(name), upright=True)
     axis.axhline(0.0, color=INK, lw=0.8)
-    axis.legend(frameon=False, loc="lower left")
+    legend_above(axis)
     words = "path energy saved\nagainst reference [%]"
     style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
     return figure
@@ -137,7 +139,7 @@ def single_profile_figure(episodes: pd.DataFrame) -> Figure:
             jitter = centre + _abreast(len(values), 0.1)
             axis.plot(jitter, values, "o", color=colour(strategy), ms=5, alpha=0.6, mew=0)
             axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=colour(strategy), lw=2)
-            _once(axis, seen, strategy, f"{strategy}: seeds and mean", "o")
+            _once(axis, seen, strategy, f"{in_words(strategy)}: seeds and mean", "o")
     labels = [f"profile {name!s}\n{_gain(part)}" for name, part in groups.items()]
     axis.set_xticks(range(len(groups)), labels, fontsize=9)
     axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))

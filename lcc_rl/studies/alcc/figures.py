@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcc_rl.functional.power import motor_power
-from lcc_rl.results.drawing import new_figure
+from lcc_rl.results.drawing import in_words, legend_above, new_figure
 from lcc_rl.results.figures import colour, style
 from lcc_rl.results.savings import by_driver, savings
 from lcc_rl.results.training_figures import draw_curve
@@ -92,7 +92,8 @@ def distributions(episodes: pd.DataFrame) -> Figure:
         for place, name in enumerate(names):
             if name in energy:
                 _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
-        axis.set_yticks(range(len(names)), names if vehicle == "cav" else [""] * len(names))
+        labels = [in_words(name) if vehicle == "cav" else "" for name in names]
+        axis.set_yticks(range(len(names)), labels)
         axis.set_ylim(len(names) - 0.4, -0.6)
         axis.margins(x=0.12)
         style(axis, "path energy [kJ per episode]", "")
@@ -142,9 +143,9 @@ def generalization_figure(
     style(
         below,
         f"held-out profiles, sorted by the saving (n = {len(table)}); right: the paper's",
-        f"path energy saved by {strategy}\nagainst {baseline} [%]",
+        f"path energy saved by {in_words(strategy)}\nagainst {in_words(baseline)} [%]",
     )
-    below.legend(frameon=False, loc="upper left", fontsize=9)
+    legend_above(below)
     return figure
 
 
@@ -157,11 +158,10 @@ def _energies_by_profile(
         columns = [f"{vehicle}_path_energy_kj" for vehicle in ("cav", "hdv")]
         rows = episodes[episodes["strategy"] == name].groupby("profile_id")[columns].mean()
         car, human = (rows.loc[order, column].to_numpy(float) for column in columns)
-        axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{name}: car")
-        label = f"{name}: human driver"
+        axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{in_words(name)}: car")
+        label = f"{in_words(name)}: human driver"
         axis.bar(places + offset, human, 0.4, car, color=colour(name), alpha=0.45, label=label)
-    axis.set_ylim(top=1.3 * axis.get_ylim()[1])
-    axis.legend(frameon=False, loc="upper left", ncols=4, fontsize=9)
+    legend_above(axis, 4)
     style(axis, "", "path energy\n[kJ per episode]")
 
 

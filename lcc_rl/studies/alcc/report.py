@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -30,13 +30,14 @@ ITSELF = "none (the recipe itself)"
 NO_FILTER = "without"
 
 
-def write_results(folder: str | Path) -> Path:
+def write_results(folder: str | Path, formats: Iterable[str] = ()) -> Path:
     """Write tables/*.parquet, figures/*.png and report.html from a study's parquet files alone.
 
     Sections whose runs do not exist are left out.
 
     Args:
         folder: a study's folder, written by ``lcc-rl reproduce alcc``.
+        formats: further formats of the figures.
 
     Returns:
         The page's path.
@@ -44,7 +45,7 @@ def write_results(folder: str | Path) -> Path:
     Raises:
         ResultsError: if there is no evaluation in the folder, or a file cannot be read.
     """
-    page = Page(folder)
+    page = Page(folder, formats)
     if not any(page.folder.glob("**/evaluation/episodes.parquet")):
         raise ResultsError(
             f"{folder}: no evaluation/episodes.parquet; lcc-rl reproduce alcc makes it"

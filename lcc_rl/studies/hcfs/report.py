@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
@@ -22,11 +23,12 @@ PARENTS = ("cacc tuned", "cacc paper_like", "cacc path", LEARNED)
 BOUNDS = ("deadbeat", "hcfs oracle", "deadbeat oracle")
 
 
-def write_results(folder: str | Path) -> Path:
+def write_results(folder: str | Path, formats: Iterable[str] = ()) -> Path:
     """Write tables/*.parquet, figures/*.png and report.html from a study's parquet files alone.
 
     Args:
         folder: a study's folder, written by ``lcc-rl reproduce hcfs``.
+        formats: further formats of the figures.
 
     Returns:
         The page's path.
@@ -34,7 +36,7 @@ def write_results(folder: str | Path) -> Path:
     Raises:
         ResultsError: if there is no evaluation in the folder, or a file cannot be read.
     """
-    page = Page(folder)
+    page = Page(folder, formats)
     episodes = read_evaluations(page.folder, "episodes")
     _headline(page, episodes)
     for case in (name for name in dict.fromkeys(episodes["case"]) if name in CASES):

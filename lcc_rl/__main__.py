@@ -1,0 +1,5 @@
+"""``python -m lcc_rl`` is the console command ``lcc-rl``."""
+
+from lcc_rl.console import main
+
+main()

@@ -1,0 +1,109 @@
+"""Animate a sample episode of an evaluation: lcc-rl animate outputs/evaluate/<run>.
+
+lcc-rl animate RUN                                  # the last strategy, into RUN/figures
+lcc-rl animate RUN --strategy "idm tuned" --episode 1 --out idm.gif
+lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from lcc_rl.config import require
+from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.animation import FORMS, animate, check_ending
+from lcc_rl.results.drawing import in_file, in_words
+from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.runs import CONFIG, stored_config
+
+STEPS = "steps.parquet"
+
+
+def run(
+    folder: str | Path,
+    strategy: str | None = None,
+    episode: int = 0,
+    out: str | Path | None = None,
+    start: float = 0.0,
+    duration: float | None = None,
+) -> Path:
+    """Write an animation of one sample episode.
+
+    Args:
+        folder: of an evaluation, a training or a main job.
+        strategy: whose episode; None for the last one of the table.
+        episode: which of its sample episodes, from 0.
+        out: the file, see :func:`lcc_rl.results.animation.animate`; by default a page in the
+            run's folder ``figures``.
+        start: when the animation begins [s].
+        duration: how long it is [s]; None for to the end.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ConfigError: if there is no such run, strategy, episode, ending or time.
+        ResultsError: if no sample episode is stored, or the file cannot be written.
+    """
+    folder = _with_steps(Path(folder))
+    if out is not None:
+        check_ending(Path(out))
+    steps = read_parquet(folder / STEPS)
+    require(bool(len(steps)), f"{folder}: holds no sample episode; evaluate with {KEPT}")
+    names = list(dict.fromkeys(map(str, steps["strategy"])))
+    strategy = names[-1] if strategy is None else strategy
+    if strategy not in names:
+        raise unknown_name("strategy", strategy, names)
+    found = sample_episodes(steps, strategy)
+    if not 0 <= episode < len(found):
+        raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
+    label, rows = list(found.items())[episode]
+    motion = _cut(motion_of(rows, stored_config(folder).scenario), start, duration)
+    title = f"{in_words(strategy)}: {label}"
+    default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
+    return animate(motion, title, out or default)
+
+
+def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
+    """Return the part of an episode that is shown."""
+    end = float("inf") if duration is None else start + duration
+    inside = ((motion.time >= start) & (motion.time <= end)).nonzero()[0]
+    if len(inside) < 2:
+        first, last = motion.time[0], motion.time[-1]
+        raise ConfigError(
+            f"--start {start:g} and --duration leave no two moments: the episode has those from "
+            f"{first:g} to {last:g} s"
+        )
+    return motion.at(slice(inside[0], inside[-1] + 1))
+
+
+KEPT = "evaluation.sample_episodes=4"
+
+
+def _with_steps(folder: Path) -> Path:
+    """Return the folder that holds a run's sample episodes; of a main job its evaluation."""
+    for place in (folder, folder / "evaluation"):
+        if (place / STEPS).is_file():
+            return place
+    if not (folder / CONFIG).is_file():
+        raise ConfigError(f"{folder}: not a run folder: it has no {CONFIG}")
+    raise ResultsError(f"{folder}: holds no {STEPS}: not evaluated yet?")
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Animate what is named on the command line; print the file's name."""
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser.add_argument("run", type=Path, help="folder of an evaluation, training or main job")
+    parser.add_argument("--strategy", help="by default the last one of the evaluation")
+    parser.add_argument("--episode", type=int, default=0, help="which sample episode, from 0")
+    parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(FORMS)}")
+    parser.add_argument("--start", type=float, default=0.0, help="first moment [s]")
+    parser.add_argument("--duration", type=float, help="by default to the end [s]")
+    given = parser.parse_args(words)
+    file = run(given.run, given.strategy, given.episode, given.out, given.start, given.duration)
+    print(file)
+    return 0

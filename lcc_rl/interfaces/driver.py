@@ -1,0 +1,193 @@
+"""A policy or rule that drives vehicles of another simulator by what they measure.
+
+It is made of the pieces of the environment: the network with its filter (:mod:`.export`), the
+memory that it observes, or the controller. The other simulator takes the place of the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from lcc_rl.config import build_as
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.evaluation.strategies import DIRECT, FILTERED, baseline_controller, rules
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
+from lcc_rl.functional.string import entries_ahead
+from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
+from lcc_rl.pieces import Controller, ObservationMemory
+from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
+from lcc_rl.results.policies import PRETRAINED, load_policy
+
+# Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
+STRING = VehicleString((AUTOMATED, HUMAN))
+COMMAND = ("command", AUTOMATED)
+PRESENT = ("behind", "present")
+MEASURED: tuple[Key, ...] = (
+    *(("leader", name) for name in ("speed", "acceleration")),
+    *(("vehicles", name) for name in ("speed", "gap", "relative_speed", "acceleration")),
+    *(PRESENT, SEED, STEP),
+)
+
+
+class Measured(NamedTuple):
+    """What one vehicle measures: of itself, the vehicle ahead and the one behind.
+
+    Speeds [m/s], gaps bumper to bumper [m], accelerations executed during the last step [m/s²];
+    ``present`` is 1 where there is a vehicle behind, else 0.
+    """
+
+    speed: float
+    gap: float
+    acceleration: float
+    speed_ahead: float
+    acceleration_ahead: float
+    speed_behind: float
+    gap_behind: float
+    acceleration_behind: float
+    present: float
+
+
+def entries(rows: Sequence[Measured]) -> State:
+    """Return the same as entries of an environment, one row per vehicle."""
+    table = torch.tensor(rows, dtype=torch.float32)
+    seen = dict(zip(Measured._fields, table.split(1, -1), strict=True))
+    state: State = {PRESENT: seen["present"]}
+    for name in ("speed", "acceleration"):
+        state["leader", name] = seen[f"{name}_ahead"]
+    for name in ("speed", "gap", "acceleration"):
+        own, behind = seen[name], seen[f"{name}_behind"]
+        state["vehicles", name] = torch.stack([own, behind], 1)
+    speed = state["vehicles", "speed"]
+    state["vehicles", "relative_speed"] = entries_ahead(state["leader", "speed"], speed) - speed
+    return state
+
+
+class Driver:
+    """Computes accelerations of any number of vehicles, and what each remembers.
+
+    Args:
+        name: a run folder, a policy file, ``pretrained/<name>``, a rule (``"idm_acc"``), or the
+            node of a controller as in ``conf/controller``.
+        time_step: duration of a step of the other simulator [s].
+        trust: modules outside this package that a policy may name.
+
+    Attributes:
+        kept: keys of what is remembered from step to step.
+
+    Raises:
+        ConfigError: if there is no such policy or rule, it reads what is not measured, or it was
+            trained with another step.
+        ResultsError: if the policy's file is missing or damaged.
+    """
+
+    def __init__(
+        self, name: str | Path | Mapping[str, Any], time_step: float, trust: Sequence[str] = ()
+    ) -> None:
+        self.name, self.time_step = str(name), time_step
+        self.module: ExportedPolicy | None = None
+        pieces: list[StepTransform] = []
+        if isinstance(name, Mapping) or name in known_rules():
+            node = name if isinstance(name, Mapping) else baseline_controller(str(name))
+            pieces.append(self._build(Controller, node))
+        elif Path(name).exists() or Path(name).parts[:1] == (PRETRAINED,):
+            pieces += self._policy(name, trust)
+        else:
+            raise unknown_name("policy, file or rule", str(name), known_rules())
+        self.pieces = pieces
+        self.kept = [key for piece in pieces for key in (*piece.targets, *piece.constants)]
+        self.kept = [key for key in self.kept if key != COMMAND]
+        self._check()
+
+    def _policy(self, name: str | Path, trust: Sequence[str]) -> list[StepTransform]:
+        self.module, (_, cfg) = exported_policy(name, trust), load_policy(name, trust=trust)
+        trained = float(cfg.scenario.time_step)
+        if abs(trained - self.time_step) > 1e-9:
+            raise ConfigError(
+                f"{name} was trained with steps of {trained:g} s, the simulation has "
+                f"{self.time_step:g} s; start it with --step-length {trained:g}"
+            )
+        memory = cfg.scenario.pieces.get("memory")
+        wanted = any(column.startswith("memory.") for column in self.module.names)
+        return [self._build(ObservationMemory, memory)] if wanted else []
+
+    def _build(self, kind: type[StepTransform], node: Any) -> Any:
+        resources = {"time_step": self.time_step, "population": bootstrap(), "string": STRING}
+        return build_as(f"a {kind.__name__}", kind, node, self.name, role=AUTOMATED, **resources)
+
+    def _check(self) -> None:
+        """Check that all that is read is measured or remembered."""
+        for key in self.reads():
+            if key not in (*MEASURED, *self.kept):
+                known = ", ".join(".".join(key) for key in MEASURED)
+                raise ConfigError(
+                    f"{self.name} reads {'.'.join(key)}, which is not measured here, only {known}"
+                )
+
+    def reads(self) -> list[Key]:
+        """Return the keys of all that is read."""
+        names = [] if self.module is None else self.module.names
+        sources = [key for piece in self.pieces for _, key in piece.sources]
+        return [*sources, *(place(name)[0] for name in names)]
+
+    def begin(self, measured: State) -> State:
+        """Return what vehicles remember that are driven for the first time.
+
+        Args:
+            measured: the entries :data:`MEASURED`, one row per vehicle.
+        """
+        start = TensorDict(batch_size=measured[STEP].shape[:1])
+        for key, value in measured.items():
+            start.set(key, value)
+        for piece in self.pieces:
+            piece.begin(TensorDict(batch_size=start.batch_size), start)
+        return {key: start.get(key) for key in self.kept}
+
+    @torch.no_grad()
+    def __call__(self, measured: State, kept: State) -> tuple[Tensor, State]:
+        """Return accelerations ``[vehicles]`` [m/s²] and what is remembered from now on.
+
+        Args:
+            measured: the entries :data:`MEASURED`, one row per vehicle; see :func:`entries`.
+            kept: what the step before returned, or :meth:`begin`.
+        """
+        reached = dict(measured)
+        for piece in self.pieces:
+            piece.apply({**measured, **kept}, reached)
+        after = {key: reached[key] for key in self.kept}
+        if self.module is None:
+            return reached[COMMAND].flatten(), after
+        columns = [value(reached, name) for name in self.module.names]
+        return self.module(torch.stack(columns, -1)).flatten(), after
+
+
+def place(name: str) -> tuple[Key, int]:
+    """Return key and row, or column, at which a vehicle finds what an exported policy reads."""
+    view, entry, *column = name.split(".")
+    if (view, entry) == PRESENT:
+        return PRESENT, int(*column)
+    if view == "memory":
+        return (view, entry), int(*column)
+    key = {"self": "vehicles", "ahead": "leader", "behind": "vehicles"}.get(view, view)
+    return (key, ".".join([entry, *column])), int(view == "behind")
+
+
+def value(state: State, name: str) -> Tensor:
+    """Return what an exported policy reads under a name, ``[vehicles]``."""
+    key, index = place(name)
+    return state[key].flatten(1)[:, index]
+
+
+def known_rules() -> list[str]:
+    """Return the names of the rules that drive by what is measured, without filter or messages."""
+    return [
+        name
+        for name in rules()
+        if not name.startswith((DIRECT, "cacc", "deadbeat")) and not name.endswith(FILTERED)
+    ]

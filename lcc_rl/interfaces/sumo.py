@@ -1,0 +1,155 @@
+"""Vehicles of a SUMO simulation, driven by a policy or a rule of this package.
+
+::
+
+    libsumo.start(["sumo", "-c", "my.sumocfg", "--step-length", "0.1"])
+    bridge = Bridge("pretrained/i24-follow5", ["car7"])
+    while libsumo.simulation.getMinExpectedNumber():
+        bridge.command()
+        libsumo.simulationStep()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.interfaces.driver import PRESENT, Driver, Measured, entries
+from lcc_rl.pieces.base import SEED, STEP, State
+
+EXACT, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
+
+
+def load_sumo() -> Any:
+    """Return the module ``libsumo``.
+
+    Raises:
+        ConfigError: if it is not installed.
+    """
+    try:
+        import libsumo
+    except ImportError as error:
+        raise ConfigError("libsumo is not installed; pip install 'lcc_rl[sumo]'") from error
+    return libsumo
+
+
+class Bridge:
+    """Lets a policy or a rule drive vehicles of the SUMO simulation that runs in libsumo.
+
+    The commands are executed exactly: SUMO's checks of speeds are off for the vehicles driven
+    (speed mode 0), those of right of way and traffic lights, too. A vehicle with nobody ahead
+    within ``sight`` is driven by SUMO's own model, and remembers nothing of before. One with
+    nobody behind, whose policy does not observe that, believes in one at its own speed and gap.
+    Lanes are SUMO's matter.
+
+    Args:
+        driver: a run folder, a policy file, ``pretrained/<name>``, a rule (``"idm_acc"``), or the
+            node of a controller as in ``conf/controller``.
+        vehicles: ids of those driven, or a function that says of an id whether it is one; they may
+            enter later.
+        sight: how far ahead a vehicle is seen, bumper to bumper [m].
+        trust: modules outside this package that a policy may name.
+        seed: of the noise of drivers that have some.
+
+    Raises:
+        ConfigError: if libsumo is not installed or runs no simulation, or the driver is unknown,
+            of another step or reads what SUMO does not tell.
+        ResultsError: if the policy's file is missing or damaged.
+    """
+
+    def __init__(
+        self,
+        driver: str | Path | Mapping[str, Any],
+        vehicles: str | Sequence[str] | Callable[[str], bool],
+        sight: float = 150.0,
+        trust: Sequence[str] = (),
+        seed: int = 0,
+    ) -> None:
+        require_positive("Bridge", sight=sight)
+        self.sumo = load_sumo()
+        if not self.sumo.isLoaded():
+            raise ConfigError("SUMO runs no simulation: say libsumo.start([…]) first")
+        self.driver = Driver(driver, self.sumo.simulation.getDeltaT(), trust)
+        names = {vehicles} if isinstance(vehicles, str) else vehicles
+        self.chosen = names if callable(names) else set(names).__contains__
+        self.sight, self.seed, self.begun = sight, seed, 0
+        self.tells = PRESENT in self.driver.reads()
+        self.keys = [*self.driver.kept, SEED, STEP]
+        self.driven: dict[str, State] = {}  # what each vehicle remembers: the keys
+        self.modes: dict[str, int] = {}  # of those commanded, their speed modes before
+
+    def command(self, execute: bool = True) -> dict[str, float]:
+        """Set the speeds that the driven vehicles have after SUMO's next step.
+
+        Args:
+            execute: False: only measure and remember, while SUMO's own model drives.
+
+        Returns:
+            The accelerations commanded, by vehicle [m/s²].
+        """
+        cars = self.sumo.vehicle
+        present = cars.getIDList()
+        seen = {car: self._measured(car) for car in present if self.chosen(car)}
+        measured = {car: row for car, row in seen.items() if row is not None}
+        for car in [car for car in self.driven if car not in measured]:
+            self._release(car, car in present)
+        if not measured:
+            return {}
+        for car, row in measured.items():
+            if car not in self.driven:
+                self._take(car, entries([row]))
+        before = {key: torch.cat([self.driven[car][key] for car in measured]) for key in self.keys}
+        wanted, after = self.driver(entries(list(measured.values())) | before, before)
+        after |= {SEED: before[SEED], STEP: before[STEP] + 1}
+        commands = dict(zip(measured, wanted.tolist(), strict=True))
+        for place, (car, acceleration) in enumerate(commands.items()):
+            if execute:
+                self._set(car, cars.getSpeed(car) + acceleration * self.driver.time_step)
+            self.driven[car] = {key: entry[place : place + 1] for key, entry in after.items()}
+        return commands
+
+    def release(self) -> None:
+        """Let SUMO's own model drive all vehicles again."""
+        present = self.sumo.vehicle.getIDList()
+        for car in list(self.driven):
+            self._release(car, car in present)
+
+    def _take(self, car: str, state: State) -> None:
+        own = {SEED: torch.tensor([[self.seed + self.begun]]), STEP: torch.zeros(1, 1).long()}
+        self.driven[car] = own | self.driver.begin(state | own)
+        self.begun += 1
+
+    def _set(self, car: str, speed: float) -> None:
+        if car not in self.modes:
+            self.modes[car] = self.sumo.vehicle.getSpeedMode(car)
+            self.sumo.vehicle.setSpeedMode(car, EXACT)
+        self.sumo.vehicle.setSpeed(car, max(speed, 0.0))
+
+    def _release(self, car: str, present: bool) -> None:
+        del self.driven[car]
+        mode = self.modes.pop(car, None)
+        if present and mode is not None:
+            self.sumo.vehicle.setSpeedMode(car, mode)
+            self.sumo.vehicle.setSpeed(car, RELEASED)
+
+    def _measured(self, car: str) -> Measured | None:
+        """Return what a vehicle measures; None with nobody ahead in sight."""
+        cars = self.sumo.vehicle
+        ahead, free = cars.getLeader(car, self.sight) or ("", 0.0)
+        gap = free + cars.getMinGap(car)  # SUMO's gaps are without the least one desired
+        if not ahead or gap > self.sight:
+            return None
+        own = (cars.getSpeed(car), gap, cars.getAcceleration(car))
+        lead = (cars.getSpeed(ahead), cars.getAcceleration(ahead))
+        behind, free = cars.getFollower(car, self.sight) or ("", 0.0)
+        other: tuple[float, float, float] = (own[0], gap, 0.0)
+        if self.tells:
+            other = (0.0, 0.0, 0.0)
+        if behind:
+            room = free + cars.getMinGap(behind)
+            other = (cars.getSpeed(behind), room, cars.getAcceleration(behind))
+        return Measured(*own, *lead, *other, float(bool(behind)))

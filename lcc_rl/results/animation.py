@@ -1,0 +1,203 @@
+"""Animations of one sample episode: a page that needs no network, a GIF or an MP4."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.animation import FFMpegWriter
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image  # comes with matplotlib
+
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.results.drawing import INK, new_figure, unbox
+from lcc_rl.results.motion import Motion, Series
+
+COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}
+NAMES = ("human driver", "controlled car")  # a human may drive it, too, as a baseline
+LARGEST = 50_000  # moments of vehicles in a page, each a speed and a gap
+FEW = 6  # vehicles whose lines are all thick
+RATE, LONGEST = 10, 150  # frames per second, and at most
+DPI = 80
+
+
+def animate(motion: Motion, title: str, path: str | Path) -> Path:
+    """Write an animation; the ending, ``.html``, ``.gif`` or ``.mp4``, chooses the form.
+
+    A page plays in any browser, with a slider. A longer episode plays faster in a GIF or MP4,
+    which says how much.
+
+    Args:
+        motion: of one episode, at two moments or more.
+        title: what it is, for the reader.
+        path: the file; one that exists is replaced.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: if the ending is another one, or ffmpeg is needed and missing.
+        ResultsError: if the file cannot be written.
+    """
+    path = Path(path)
+    check_ending(path)
+    with atomic_path(path) as temporary:
+        FORMS[path.suffix](motion, title, temporary)
+    return path
+
+
+def check_ending(path: Path) -> None:
+    """Check that an animation can be written in the form that its file's ending means.
+
+    Raises:
+        ConfigError: if there is no such form, or ffmpeg is needed and missing.
+    """
+    if path.suffix not in FORMS:
+        raise unknown_name("ending of an animation", path.suffix, FORMS)
+    if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
+        raise ConfigError("an .mp4 needs ffmpeg, which is not installed; write a .html or .gif")
+
+
+def page(motion: Motion, title: str) -> str:
+    """Return the page, all data inside."""
+    # The fewest steps between moments that keep it small.
+    every = -(-motion.speed.size // LARGEST)
+    short = motion.at(slice(None, None, every))
+    data = {
+        "title": title,
+        "time": _numbers(short.time),
+        "roles": [role if role == AUTOMATED else HUMAN for role in motion.roles],
+        "speed": [_numbers(column) for column in short.speed.T],
+        "gap": [_numbers(column) for column in short.gap.T],
+        "front": _numbers(short.front),
+        "leader": None if short.leader is None else _numbers(short.leader),
+        "length": motion.length,
+        "circumference": motion.circumference,
+        "colours": COLOURS,
+        "names": {"leader": "leader", AUTOMATED: NAMES[1], HUMAN: NAMES[0]},
+    }
+    # Within a script no tag may begin.
+    text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
+    template = files("lcc_rl.assets").joinpath("animation.html").read_text(encoding="utf-8")
+    return template.replace("DATA", text, 1)
+
+
+def _numbers(values: Series) -> list[float]:
+    return [round(float(value), 2) for value in values]
+
+
+def frames(motion: Motion, title: str) -> Iterator[Figure]:
+    """Yield the one figure of an animation at every frame, drawn anew each time."""
+    count = min(max(round(RATE * float(motion.time[-1] - motion.time[0])), 2), LONGEST)
+    moments = np.linspace(0, len(motion.time) - 1, count).round().astype(int)
+    faster = (motion.time[-1] - motion.time[0]) * RATE / count
+    figure = new_figure(8.0, 7.4 if motion.circumference else 5.6)
+    road, speeds, gaps = figure.subplots(
+        3, 1, height_ratios=(3 if motion.circumference else 1, 2, 2)
+    )
+    figure.suptitle(f"{title}\n{faster:.1f} × as fast" if faster > 1.05 else title, fontsize=10)
+    _lines(speeds, motion, motion.speed, "speed [m/s]", motion.leader)
+    _lines(gaps, motion, motion.gap, "gap ahead [m]", None)
+    cursors = [axis.axvline(motion.time[0], color="#b00020", lw=0.8) for axis in (speeds, gaps)]
+    cars = LineCollection([], linewidths=9.0, capstyle="butt")
+    road.add_collection(cars)
+    cars.set_color([*_hues(motion), *([] if motion.leader is None else [INK])])
+    place = _around if motion.circumference else _along
+    place(road, cars, motion, 0)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # found once: what moves needs no other room
+    for moment in moments:
+        place(road, cars, motion, int(moment))
+        for cursor in cursors:
+            cursor.set_xdata([motion.time[moment]] * 2)
+        speeds.set_title(f"{motion.time[moment]:.1f} s", loc="right", fontsize=9)
+        yield figure
+
+
+def _hues(motion: Motion) -> list[str]:
+    return [COLOURS.get(role, COLOURS[HUMAN]) for role in motion.roles]
+
+
+def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Series | None) -> None:
+    """Draw an entry of all vehicles over time, automated ones above all others."""
+    named = set()
+    for vehicle, (role, hue) in enumerate(zip(motion.roles, _hues(motion), strict=True)):
+        bold = role == AUTOMATED or len(motion.roles) <= FEW
+        look: dict[str, Any] = {"lw": 1.4, "zorder": 3} if bold else {"lw": 0.6, "alpha": 0.3}
+        name = None if hue in named else NAMES[role == AUTOMATED]
+        named.add(hue)
+        axis.plot(motion.time, values[:, vehicle], color=hue, label=name, **look)
+    if leader is not None:
+        axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
+        axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+    axis.set_ylim(0.0, 1.05 * max(float(values.max()), 1.0))
+    axis.set_xlabel("time [s]")
+    axis.set_ylabel(label)
+    unbox(axis)
+
+
+def _along(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:
+    """Place the cars on an open road, in a view that moves with the leader."""
+    front = float(motion.front[moment])
+    fronts = [*motion.position[moment], front]
+    cars.set_segments([[(x - motion.length, 0.0), (x, 0.0)] for x in fronts])
+    longest = float((motion.gap + motion.length).sum(axis=1).max())
+    axis.set_xlim(front - longest - 2 * motion.length, front + motion.length)
+    axis.set_ylim(-1.0, 1.0)
+    axis.set_yticks([])
+    axis.set_xlabel("position [m]", fontsize=9)
+
+
+def _around(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:
+    """Place the cars on a circle."""
+    turn = 2.0 * np.pi / float(motion.circumference or 1.0)
+    reach = np.linspace(-motion.length, 0.0, 5)
+    angles = turn * (motion.position[moment][:, None] + reach)
+    cars.set_segments(list(np.stack([np.cos(angles), np.sin(angles)], -1)))
+    axis.set_aspect("equal")
+    axis.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
+    axis.axis("off")
+
+
+def _write_page(motion: Motion, title: str, path: Path) -> None:
+    path.write_text(page(motion, title), encoding="utf-8")
+
+
+def _write_gif(motion: Motion, title: str, path: Path) -> None:
+    images = []
+    for figure in frames(motion, title):
+        figure.set_dpi(DPI)
+        canvas = figure.canvas
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]
+        images.append(
+            Image.fromarray(pixels).convert("RGB").quantize(64, Image.Quantize.FASTOCTREE)
+        )
+    settings = {"duration": 1000 // RATE, "loop": 0, "optimize": True}
+    images[0].save(path, "GIF", save_all=True, append_images=images[1:], **settings)
+
+
+def _write_mp4(motion: Motion, title: str, path: Path) -> None:
+    writer = FFMpegWriter(fps=RATE, extra_args=["-f", "mp4", "-pix_fmt", "yuv420p"])
+    begun = False
+    for figure in frames(motion, title):
+        if not begun:
+            writer.setup(figure, str(path), dpi=DPI)
+            begun = True
+        writer.grab_frame()
+    writer.finish()
+
+
+FORMS: dict[str, Callable[[Motion, str, Path], None]] = {
+    ".html": _write_page,
+    ".gif": _write_gif,
+    ".mp4": _write_mp4,
+}

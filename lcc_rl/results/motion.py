@@ -1,0 +1,184 @@
+"""Where every vehicle of a sample episode is: what diagrams and animations draw."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from lcc_rl.errors import ResultsError
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
+
+Series = NDArray[np.float64]
+RESPONSES = "responses.parquet"  # what strategies do over gap and relative speed
+EPISODE = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One sample episode of one strategy.
+
+    Args:
+        time: ``[T]`` [s].
+        roles: of the N vehicles, front to back.
+        speed: ``[T, N]`` [m/s].
+        gap: to the vehicle ahead, bumper to bumper, ``[T, N]`` [m].
+        front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, who
+            begins at 0; on a ring of the last vehicle, a round further on.
+        leader: the leader's speed, ``[T]`` [m/s]; None on a ring.
+        length: of every vehicle [m].
+        circumference: of a ring [m]; None on an open road.
+    """
+
+    time: Series
+    roles: tuple[str, ...]
+    speed: Series
+    gap: Series
+    front: Series
+    leader: Series | None
+    length: float
+    circumference: float | None
+
+    @property
+    def position(self) -> Series:
+        """Front bumper of every vehicle, ``[T, N]`` [m]."""
+        found: Series = self.front[:, None] - np.cumsum(self.gap + self.length, axis=1)
+        return found
+
+    @property
+    def ahead(self) -> Series:
+        """Speed of the vehicle ahead of each, ``[T, N]`` [m/s]."""
+        first = self.speed[:, -1] if self.leader is None else self.leader
+        return np.column_stack([first, self.speed[:, :-1]])
+
+    def at(self, moments: slice) -> Motion:
+        """Return the motion at some moments only."""
+        return replace(
+            self,
+            time=self.time[moments],
+            speed=self.speed[moments],
+            gap=self.gap[moments],
+            front=self.front[moments],
+            leader=None if self.leader is None else self.leader[moments],
+        )
+
+
+def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFrame]:
+    """Return the sample episodes of a strategy by a name for readers.
+
+    Args:
+        steps: rows of steps.parquet; of several training seeds the first is taken.
+        strategy: its name.
+
+    Raises:
+        ResultsError: if it has none.
+    """
+    if "strategy" not in steps:
+        raise ResultsError("no sample episode is stored")
+    rows = steps[steps["strategy"] == strategy]
+    if "case" in rows:
+        found = {str(case): part for case, part in rows.groupby("case", sort=False)}
+    else:
+        if rows["training_seed"].notna().any():
+            rows = rows[rows["training_seed"] == rows["training_seed"].min()]
+        keys = [name for name in EPISODE if name in rows]
+        found = {
+            f"{keys[0]} {key[0]}, driver {key[1]}": part
+            for key, part in rows.groupby(keys, sort=False)
+        }
+    if not found:
+        raise ResultsError(f"no sample episode of {strategy} is stored")
+    return found
+
+
+def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Motion:
+    """Return the motion of one sample episode.
+
+    Positions follow from the gaps behind the leader; on a ring from those behind the first
+    vehicle, whose own follows from its speed.
+
+    Args:
+        rows: of :func:`sample_episodes`.
+        scenario: the node of the evaluation's configuration.
+
+    Raises:
+        ResultsError: if the rows lack the place of a vehicle.
+    """
+    long = "follower" in rows
+    time, leader, speed, gap, roles = (_of_platoon if long else _of_string)(rows, scenario)
+    length = float(scenario["vehicle_length"])
+    step = np.diff(time, prepend=time[0])
+    if scenario["road"] == RING:
+        front = np.cumsum(speed[:, 0] * step) + gap[:, 0] + length
+        around = float(scenario["circumference"])
+        return Motion(time, roles, speed, gap, front, None, length, around)
+    if leader is None:
+        raise ResultsError("the sample episode has no leader")
+    front = np.cumsum(leader * step)
+    return Motion(time, roles, speed, gap, front, leader, length, None)
+
+
+def visited(motion: Motion) -> Series:
+    """Return speed, gap and relative speed of automated vehicles at every moment, ``[n, 3]``."""
+    own = [place for place, role in enumerate(motion.roles) if role == AUTOMATED]
+    entries = (motion.speed, motion.gap, motion.ahead - motion.speed)
+    return np.stack([entry[:, own].ravel() for entry in entries], -1)
+
+
+Found = tuple[Series, Series | None, Series, Series, tuple[str, ...]]
+
+
+def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
+    """Read rows with one vehicle each; the leader is follower 0."""
+    speed, gap = (
+        rows.pivot_table(index="time_s", columns="follower", values=name)
+        for name in ("speed_mps", "gap_m")
+    )
+    roles = parse_string(scenario["string"], scenario["road"]).roles
+    count = speed.shape[1] - 1
+    # A case of a platoon has its own number of vehicles, all automated.
+    roles = roles if len(roles) == count else (AUTOMATED,) * count
+    leader, own = speed[0].to_numpy(float), speed.drop(columns=0).to_numpy(float)
+    return speed.index.to_numpy(float), leader, own, gap.to_numpy(float), roles
+
+
+def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
+    """Read rows with all vehicles each."""
+    cars, others = _vehicles(rows, "cav"), _vehicles(rows, "hdv")
+    count = len(cars) + len(others)
+    places = _places(rows, cars, scenario)
+    if len(places) != len(cars) or max(places, default=0) >= count:
+        raise ResultsError("the sample episode lacks vehicles of the string")
+    own, rest = iter(cars), iter(others)
+    names = [next(own) if place in places else next(rest) for place in range(count)]
+    roles = tuple(AUTOMATED if place in places else HUMAN for place in range(count))
+    time = rows["time_s"].to_numpy(float)
+    speed, gap = (rows[[f"{x}_{entry}" for x in names]] for entry in ("speed", "gap"))
+    leader = rows.get("leader_speed")
+    ahead = None if leader is None or leader.isna().any() else leader.to_numpy(float)
+    return time, ahead, speed.to_numpy(float), gap.to_numpy(float), roles
+
+
+def _vehicles(rows: pd.DataFrame, group: str) -> list[str]:
+    """Return the names of a group's vehicles that drive in an episode, from front to back."""
+    found = {str(name): re.fullmatch(rf"{group}(\d*)_speed", str(name)) for name in rows}
+    numbers = [int(x.group(1) or 0) for name, x in found.items() if x and rows[name].notna().all()]
+    return [f"{group}{number or ''}" for number in sorted(numbers)]
+
+
+def _places(rows: pd.DataFrame, cars: list[str], scenario: Mapping[str, Any]) -> list[int]:
+    """Return the places of the automated vehicles, 0 at the front."""
+    if not cars:  # a baseline without them
+        return []
+    string = parse_string(scenario["string"], scenario["road"])
+    if not string.drawn:
+        return list(string.places(AUTOMATED))
+    names = [f"{car}_place" for car in cars]
+    if not set(names) <= set(rows):
+        raise ResultsError("places drawn in the episode are not stored; evaluate again")
+    return [int(place) for place in rows[names].iloc[0]]

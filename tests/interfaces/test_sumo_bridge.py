@@ -1,0 +1,237 @@
+"""Vehicles of SUMO driven by this package move as those of its own environment."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from lcc_rl.config import load
+from lcc_rl.data.profiles import from_records
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs import build_env
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.evaluation.strategies import baseline_controller, with_weights
+from lcc_rl.interfaces import sumo_ring
+from lcc_rl.interfaces.sumo import Bridge
+from lcc_rl.results.policies import load_policy
+
+libsumo = pytest.importorskip("libsumo", reason="extra sumo")
+STEP, STEPS, LENGTH = 0.1, 600, 5.0
+POLICY = "pretrained/i24-follow5"  # a memory, a filter, the acceleration ahead, the vehicle behind
+HUMAN = {"_target_": "lcc_rl.pieces.IDM", "noise": 0.0, "desired_speed": 25.0, "time_gap": 1.2}
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    libsumo.close()
+
+
+def leader_speed() -> Tensor:
+    """Return a leader that slows down to a crawl and drives off again, ``[time + 1]`` [m/s]."""
+    return 7.0 + 5.0 * torch.cos(torch.arange(STEPS + 1) * STEP / 6.0)
+
+
+def own_motion(driver: str) -> tuple[Tensor, Tensor]:
+    """Return speeds and gaps, ``[time + 1, 2]``, in this package's environment."""
+    cfg = load("evaluate", ["variant=alcc", "task=i24-follow5", f"scenario.horizon={STEPS}"])
+    OmegaConf.set_struct(cfg, False)
+    cfg.scenario.string = "automated human"
+    cfg.scenario.controllers.human = HUMAN
+    policy: Any = None
+    if driver.startswith("pretrained"):
+        weights, own = load_policy(driver)
+        policy = with_weights(own, weights, own.seed, driver, bootstrap()).policy
+        cfg.observation = own.observation
+    else:
+        cfg.scenario.controllers.automated = baseline_controller(driver)
+        cfg.scenario.filters = {}
+    profiles = from_records([leader_speed()], ["wave"], ["wave"], STEP)
+    env = build_env(cfg, profiles, bootstrap(), 1, nominal=True)
+    keys = [("vehicles", "speed"), ("vehicles", "gap")]
+    first = env.reset()["vehicles", "gap"].flatten()
+    speed, gap = (play(env, policy, None, keys)[0][key].flatten(1) for key in keys)
+    return speed, torch.cat([first.unsqueeze(0), gap])
+
+
+def start(folder: Path, cars: dict[str, tuple[float, float]], step: float = STEP) -> None:
+    """Start SUMO on a ring of 10 km with vehicles at given places and speeds."""
+    sumo_ring.write_network(folder / "net.xml", 10_000.0)
+    rows = [
+        f'<vehicle id="{car}" type="t" depart="0" departPos="{place}" departSpeed="{speed}">'
+        '<route edges="east west"/></vehicle>'
+        for car, (place, speed) in cars.items()
+    ]
+    kind = f'<vType id="t" length="{LENGTH}" minGap="1.5" maxSpeed="40" speedDev="0"/>'
+    (folder / "cars.xml").write_text(f"<routes>{kind}{''.join(rows)}</routes>")
+    words = ["sumo", "-n", f"{folder}/net.xml", "-r", f"{folder}/cars.xml", "--no-step-log"]
+    words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-warnings"]
+    libsumo.start(words)
+    libsumo.simulationStep()
+
+
+# Rounding errors grow for a while where FollowerStopper switches between its regions.
+@pytest.mark.parametrize(
+    ("driver", "share"),
+    [
+        ("idm", 1.0),
+        ("acc", 1.0),
+        ("follower_stopper", 0.75),
+        pytest.param(POLICY, 1.0, marks=pytest.mark.slow),
+    ],
+)
+def test_it_moves_as_in_the_own_environment(driver, share, tmp_path) -> None:
+    speeds, gaps = own_motion(driver)
+    leader = leader_speed().tolist()
+    front = 500.0 - LENGTH - gaps[0, 0].item()
+    places = {"lead": 500.0, "own": front, "behind": front - LENGTH - gaps[0, 1].item()}
+    first = [leader[0], *speeds[0].tolist()]
+    start(tmp_path, dict(zip(places, zip(places.values(), first, strict=True), strict=True)))
+    cars = libsumo.vehicle
+    cars.setSpeedMode("lead", 0)
+    bridges = [Bridge(driver, ["own"]), Bridge(HUMAN, ["behind"])]
+    found = []
+    for reached in [*leader[1:], leader[-1]]:
+        found.append([cars.getSpeed("own"), cars.getSpeed("behind")])
+        for bridge in bridges:
+            bridge.command()
+        cars.setSpeed("lead", reached)
+        libsumo.simulationStep()
+    difference = (torch.tensor(found) - speeds).abs()
+    assert difference.flatten().quantile(share) < 1e-5
+    assert speeds.amax() - speeds.amin() > 5.0
+
+
+def test_with_nobody_ahead_in_sight_sumo_drives(tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (400.0, 10.0)})
+    bridge = Bridge(POLICY, lambda car: car == "own", sight=100.0)
+    assert set(bridge.command()) == {"own"}
+    assert libsumo.vehicle.getSpeedMode("own") == 0
+    libsumo.vehicle.setSpeedMode("lead", 0)
+    libsumo.vehicle.setSpeed("lead", 30.0)
+    for _ in range(100):
+        libsumo.simulationStep()
+        commanded = bridge.command()
+    assert not commanded
+    assert not bridge.driven
+    assert libsumo.vehicle.getSpeedMode("own") == 31
+    libsumo.vehicle.setSpeed("lead", 0.0)
+    while not bridge.command():
+        libsumo.simulationStep()
+    assert bridge.driven["own"]["episode", "step"].item() == 1
+    libsumo.vehicle.remove("own")
+    libsumo.simulationStep()
+    assert not bridge.command()
+
+
+def test_with_nobody_behind_a_policy_believes_in_one_at_its_own_speed_and_gap(tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
+    seen = Bridge("pretrained/alcc", "own")._measured("own")
+    assert seen is not None
+    assert seen.present == 0.0
+    assert (seen.speed_behind, seen.gap_behind) == (seen.speed, seen.gap) == (10.0, 15.0)
+
+
+def test_who_only_watches_remembers_and_sets_nothing(tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
+    bridge = Bridge("follower_stopper", "own")
+    for _ in range(3):
+        bridge.command(execute=False)
+        libsumo.simulationStep()
+    history = bridge.driven["own"]["automated", "speed_history"].flatten()
+    assert (history > 0.0).sum() == 3
+    assert libsumo.vehicle.getSpeedMode("own") == 31
+
+
+def test_a_command_is_executed_beyond_what_sumo_thinks_safe(tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
+    hard = {"_target_": "lcc_rl.pieces.ConstantAcceleration", "acceleration": 3.0}
+    bridge = Bridge(hard, ["own"])
+    for _ in range(20):
+        assert bridge.command() == {"own": 3.0}
+        libsumo.simulationStep()
+        assert libsumo.vehicle.getAcceleration("own") == pytest.approx(3.0)
+    bridge.release()
+    libsumo.simulationStep()
+    assert libsumo.vehicle.getAcceleration("own") < 0.0
+
+
+def test_the_command_writes_trajectories_and_a_figure(tmp_path, capsys) -> None:
+    words = ["pretrained/ring-22", "--seconds", "20", "--from-s", "10"]
+    assert sumo_ring.main([*words, "--folder", str(tmp_path)]) == 0
+    rows = pd.read_parquet(tmp_path / "steps.parquet")
+    assert list(rows.groupby("strategy").size()) == [200, 200]
+    driven = rows[rows["strategy"] == "pretrained/ring-22"]
+    assert rows["collisions"].sum() == 0
+    assert driven["cav_gap"].min() > 2.0
+    before, after = (driven[driven["time_s"] < 10.0], driven[driven["time_s"] >= 11.0])
+    human = rows[rows["strategy"] == "human"]
+    same = human["hdv1_speed"].to_numpy()[: len(before)]
+    assert before["cav_speed"].to_numpy() == pytest.approx(same)
+    assert (after["cav_speed"].to_numpy() != human["hdv1_speed"].to_numpy()[-len(after) :]).all()
+    assert (tmp_path / "space_time.png").stat().st_size > 10_000
+    said = capsys.readouterr().out
+    assert "final_spread_mps" in said
+    assert "steps.parquet" in said
+
+
+@pytest.mark.slow
+def test_a_policy_keeps_a_wave_from_growing(tmp_path) -> None:
+    cfg = load("evaluate", ["variant=alcc", "task=ring-22"])
+    fixed = (tmp_path, 600.0, 0.0, 0)
+    found = {
+        driver: sumo_ring.measured(sumo_ring.simulate(cfg, driver, *fixed), 0.0)
+        for driver in (None, "pretrained/ring-22")
+    }
+    assert found[None]["final_spread_mps"] > 3.0
+    assert found["pretrained/ring-22"]["final_spread_mps"] < 0.3
+    assert found["pretrained/ring-22"]["min_gap_m"] > 2.0
+    assert math.isnan(found[None]["damping_s"])
+    assert found["pretrained/ring-22"]["collisions"] == 0
+
+
+@pytest.mark.parametrize(
+    ("driver", "step", "expected"),
+    [
+        ("pretrained/nobody", STEP, "no pretrained policy"),
+        ("follow_stopper", STEP, "Did you mean 'follower_stopper'"),
+        ("pretrained/ring-22", 0.5, "--step-length 0.1"),
+        ({"_target_": "lcc_rl.pieces.CACC"}, STEP, "vehicles.gap_error, which is not measured"),
+    ],
+)
+def test_bad_input_is_one_clear_error(driver, step, expected, tmp_path) -> None:
+    start(tmp_path, {"own": (400.0, 10.0)}, step)
+    with pytest.raises(ConfigError, match=expected):
+        Bridge(driver, ["own"])
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["scenario.string=human*22"], "first vehicle alone is automated"),
+        (["drivers=i80"], "drivers=fixed"),
+        (["scenario.circumference=100"], "circumference must lie in"),
+        (["--seconds", "200"], "seconds must lie in"),
+    ],
+)
+def test_a_ring_that_cannot_be_simulated_is_one_clear_error(words, expected, tmp_path) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        sumo_ring.main(["acc", *words, "--folder", str(tmp_path)])
+
+
+def test_without_simulation_or_libsumo_the_error_says_what_to_do(monkeypatch) -> None:
+    with pytest.raises(ConfigError, match=r"libsumo\.start"):
+        Bridge("idm", ["own"])
+    monkeypatch.setitem(sys.modules, "libsumo", None)
+    with pytest.raises(ConfigError, match=r"pip install 'lcc_rl\[sumo\]'"):
+        Bridge("idm", ["own"])

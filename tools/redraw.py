@@ -1,0 +1,73 @@
+"""Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
+
+The tables of docs/tasks.md, and of docs/figures: fleets.png, fleets_ring.png, ring.png and
+limits.png. The other figures are drawn from runs that were not kept, or from recorded data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import fleets
+import leaderboard
+from limit_results import figure_of_limits
+
+from lcc_rl.config import load, require
+from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.drawing import save
+from lcc_rl.results.space_time import space_time
+from lcc_rl.runs.cli import main_guard
+
+REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
+RING = "tasks/ring_steps.parquet"
+SHOWN = ("human", "pi_saturation", "alcc")
+EVERY = 10  # steps between the rows kept
+COLUMNS = ("strategy", "training_seed", "profile", "driver_id", "time_s")
+
+
+def keep_ring(run: Path, path: Path) -> None:
+    """Keep of an evaluation of ring-22 what its diagram needs: speeds and gaps of one episode."""
+    steps = read_parquet(run / "steps.parquet")
+    steps = steps[steps["strategy"].isin(SHOWN) & (steps["profile"] == steps["profile"].iloc[0])]
+    steps = steps[steps["training_seed"].isna() | (steps["training_seed"] == 0)]
+    entries = [name for name in steps if str(name).endswith(("_speed", "_gap"))]
+    kept = steps[[*COLUMNS, *entries]].groupby("strategy", sort=False).nth(slice(0, None, EVERY))
+    kept[entries] = kept[entries].astype("float32").round(2)  # [m/s], [m]: what can be seen
+    write_parquet(kept.reset_index(drop=True), path)
+
+
+def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
+    """Write the tables into the page and the figures; return the files written."""
+    code = leaderboard.main(["--reference", str(reference / "tasks"), "--page", str(page)])
+    require(code == 0, "the tables of the tasks could not be written")
+    for task in fleets.SHOWN:
+        where = ["--reference", str(reference / "tasks"), "--figures", str(figures)]
+        fleets.main([task, *where])
+    cfg = load("evaluate", ["task=ring-22"])
+    ring = space_time(read_parquet(reference / RING), SHOWN, cfg, every=1)
+    assert ring is not None
+    save(ring, figures / "ring.png")
+    save(figure_of_limits(reference / "limits"), figures / "limits.png")
+    names = [*(f"{name}.png" for name in fleets.NAMES.values()), "ring.png", "limits.png"]
+    return [page, *(figures / name for name in names)]
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Draw again."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--reference", type=Path, default=REFERENCE, help="folder of the results")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder of the images")
+    parser.add_argument("--page", type=Path, default="docs/tasks.md", help="page of the tables")
+    parser.add_argument("--ring", type=Path, help="first keep this evaluation of ring-22")
+    options = parser.parse_args(words)
+    if options.ring is not None:
+        keep_ring(options.ring, options.reference / RING)
+    print(*redraw(options.reference, options.figures, Path(options.page)), sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_guard(main)())
