@@ -29,6 +29,8 @@ NOT_RUN = {
     "export": "of the shell",
     "ls": "of the shell",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
+    "lcc-rl sumo": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
+    "lcc-rl animate": "tests/results/test_animation.py runs it",
     "lcc-rl benchmark": "tests/tools/test_benchmark.py runs it",
     "python tools/compare_agents.py": "tests/tools/test_compare_agents.py runs it",
     "python tools/compare_launchers.py": "runs of every launcher, of extras",
@@ -129,7 +131,7 @@ class Reader:
             self.write(block.before.strip("`:"), block.text)
         elif block.language == "python" and file:
             self.write(file[1], block.text)
-        elif block.language == "python":
+        elif block.language == "python" and "my.sumocfg" not in block.text:  # of the reader's own
             self.note(block.line, "python", lambda: exec(self.filled(block.text), self.space))
         elif block.language in ("bash", "console"):
             for words in commands(block):
@@ -193,8 +195,8 @@ class Reader:
         entry = ENTRIES.get(name, name)
         typed = settings_of(words, self.folder)
         ends = [[one_run(word, choice) for word in typed] for choice in (0, -1)]
-        small = [*SMALL, *(OF_TRAINING if name != "evaluate" else ())]
-        sweep = ends[0] != ends[1]
+        sweep = ends[0] != ends[1]  # some of its runs may learn nothing
+        small = [*SMALL, *(OF_TRAINING if name != "evaluate" and not sweep else ())]
         fits = (item for item in small if all(composes(entry, [*e, item], sweep) for e in ends))
         return [*place, *fits]
 
