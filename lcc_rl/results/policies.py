@@ -45,7 +45,7 @@ def pretrained_path(variant: str) -> Path:
         names = sorted(file.stem for file in shipped.glob("*.pt"))
         raise ConfigError(
             f"no pretrained policy ships for variant {variant}, only for {', '.join(names)}; "
-            f"python -m lcc_rl.train variant={variant} makes one"
+            f"lcc-rl train variant={variant} makes one"
         )
     return path
 
