@@ -105,7 +105,7 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
         place = folder / "evaluation" / "figures" / "learning_curve.png"
-        save(curve, place, formats=cfg.figure_formats)
+        save(curve, place, formats=cfg.get("figure_formats", ()))
     if paged and isinstance(rows, pd.DataFrame):
         _conclude(folder, overrides)
     return rows

@@ -68,7 +68,7 @@ def in_this_process(runs: Sequence[Run], jobs: int) -> list[Outcome]:
     return outcomes
 
 
-def sketch(figure: Figure, path: Path, dpi: int) -> Path:
+def sketch(figure: Figure, path: Path, dpi: int, formats: Sequence[str]) -> Path:
     """Write a tiny picture in the place of a figure."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (1, 1)).save(path)
