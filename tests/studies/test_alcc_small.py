@@ -142,7 +142,7 @@ def test_table_of_followers(study) -> None:
         [number, name] for number in (1, 2) for name in ("alcc", "own_energy", "reference")
     ]
     assert not (study.folder / "followers" / "2" / "reference").exists()  # that of 1 is taken
-    saved = more.set_index("strategy")["saving_against_own_energy_pct"]
+    saved = more.set_index("strategy")["path_saving_against_own_energy_pct"]
     assert saved["alcc"].notna().all()
     assert saved["own_energy"].isna().all()
 
