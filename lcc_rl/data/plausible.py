@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.data.gap_rates import gap_rate
 from lcc_rl.errors import ConfigError, DataError
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
@@ -45,9 +46,12 @@ class Plausible:
         max_gap: gap between bumpers [m].
         max_step: time between consecutive samples [s].
         max_share: share of the records that may be left out, 0…1; beyond, the data are refused.
+        max_mismatch: factor, either way, between what gaps change by and what the speeds say
+            (:func:`lcc_rl.data.gap_rates.gap_rate`); beyond, the data are refused.
 
     Raises:
-        ConfigError: if a threshold is not positive, or the share is not in 0…1.
+        ConfigError: if a threshold is not positive, the share is not in 0…1 or the factor is
+            below 1.
     """
 
     max_speed: float = 70.0
@@ -57,6 +61,7 @@ class Plausible:
     max_gap: float = 500.0
     max_step: float = 10.0
     max_share: float = 0.1
+    max_mismatch: float = 1.6
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -64,6 +69,8 @@ class Plausible:
                 raise ConfigError(f"plausible.{name} must be positive, got {value}")
         if not self.max_share <= 1:
             raise ConfigError(f"plausible.max_share must be 0 to 1, got {self.max_share}")
+        if not self.max_mismatch >= 1:
+            raise ConfigError(f"plausible.max_mismatch must be at least 1, got {self.max_mismatch}")
 
     def select(
         self,
@@ -87,7 +94,8 @@ class Plausible:
             The other records, and a line for each kind of fault, counted by its first reason.
 
         Raises:
-            DataError: if more than ``max_share`` of the records, or all, would be left out.
+            DataError: if more than ``max_share`` of the records, or all, would be left out, or
+                gaps and speeds contradict each other.
         """
         first = table["episode"].ne(table["episode"].shift()).to_numpy()
         starts = np.flatnonzero(first)
@@ -106,7 +114,19 @@ class Plausible:
             keep &= ~bad
         self._check_share(keep, f"{setting}.max_share={self.max_share:g}", source, told)
         kept = table if keep.all() else table[np.repeat(keep, lengths)].reset_index(drop=True)
+        self._check_gaps(kept, f"{setting}.max_mismatch={self.max_mismatch:g}", source)
         return kept, lines
+
+    def _check_gaps(self, table: pd.DataFrame, limit: str, source: str) -> None:
+        """Refuse data whose gaps do not change as the speeds of leader and follower say."""
+        rate = gap_rate(table)
+        if rate is None or 1 / self.max_mismatch <= rate <= self.max_mismatch:
+            return
+        raise DataError(
+            f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower say "
+            f"1 m, {limit}; are speeds in km/h, mph or ft/s, gaps in feet, or leader and follower "
+            "exchanged?"
+        )
 
     def _check_share(self, keep: NDArray[np.bool_], limit: str, source: str, told: str) -> None:
         """Refuse data of which too many records are left out."""
