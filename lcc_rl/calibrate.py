@@ -1,4 +1,4 @@
-"""Entry point: calibrate drivers from trajectories, ``python -m lcc_rl.calibrate``."""
+"""Entry point: calibrate drivers from trajectories, ``lcc-rl calibrate``."""
 
 from __future__ import annotations
 

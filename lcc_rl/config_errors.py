@@ -78,6 +78,8 @@ def explain(error: Exception, valid: Any) -> Exception:
     if not parent and name in node:  # other variants have it
         variant = OmegaConf.select(valid, "variant")
         return ConfigError(f"variant {variant} has no {name} to choose; leave {name}=… out")
+    if name in node:  # composed without the values of a sweep
+        return ConfigError(f"{key}: not every run of this sweep has it; sweep those that do alone")
     names = {*map(str, node), *(() if parent else ("experiment",))}
     return unknown_name(_what(parent), name, names)
 

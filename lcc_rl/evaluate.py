@@ -1,4 +1,4 @@
-"""Entry point: evaluate a policy beside the baselines, ``python -m lcc_rl.evaluate``."""
+"""Entry point: evaluate a policy beside the baselines, ``lcc-rl evaluate``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entry point: the main job, data to results in one command, ``python -m lcc_rl.pipeline``."""
+"""Entry point: the main job, data to results in one command, ``lcc-rl run``."""
 
 from __future__ import annotations
 

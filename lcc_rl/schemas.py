@@ -104,7 +104,7 @@ class StudyConfig:
 
 @dataclass
 class TrainConfig(StudyConfig):
-    """``python -m lcc_rl.train``."""
+    """``lcc-rl train``."""
 
     resume: str | None = None
     sweep: str | None = None
@@ -115,7 +115,7 @@ class TrainConfig(StudyConfig):
 
 @dataclass
 class EvaluateConfig(StudyConfig):
-    """``python -m lcc_rl.evaluate``."""
+    """``lcc-rl evaluate``."""
 
     resume: str | None = None
     sweep: str | None = None
@@ -125,7 +125,7 @@ class EvaluateConfig(StudyConfig):
 
 @dataclass
 class PipelineConfig(TrainConfig):
-    """``python -m lcc_rl.pipeline``."""
+    """``lcc-rl run``."""
 
     calibration: Any = MISSING
     variants: list[str] = MISSING

@@ -1,4 +1,4 @@
-"""Entry point: show the state of the runs in a folder, ``python -m lcc_rl.status FOLDER``."""
+"""Entry point: show the state of the runs in a folder, ``lcc-rl status FOLDER``."""
 
 from __future__ import annotations
 

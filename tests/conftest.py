@@ -13,6 +13,7 @@ from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from matplotlib.figure import Figure
+from PIL import Image
 
 # Several test processes share a machine's cores; more threads each would only slow them down.
 torch.set_num_threads(1)
@@ -47,7 +48,7 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """
 
     def savefig(self: Figure, path: str | Path, **how: object) -> None:
-        Path(path).write_bytes(b"")
+        Image.new("RGB", (1, 1)).save(path, format="PNG")
 
     monkeypatch.setattr(Figure, "savefig", savefig)
 

@@ -26,7 +26,8 @@ ENTRIES = {"run": "pipeline"}  # entry points that are not called as their comma
 SHELL = {"source", "export", "ls"}
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-ALWAYS = {"tools/compare_agents.py": ("agent=analytic",)}  # settings that a tool gives itself
+# Settings that a tool or command gives itself.
+ALWAYS = {"tools/compare_agents.py": ("agent=analytic",), "sumo": ("task=ring-22",)}
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
 LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
 CHOICES = set((ROOT / "conf").rglob("*.yaml"))
@@ -59,7 +60,8 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
         assert rest[0] in {*console.COMMANDS, "-h"}
         if len(rest) > 1 and "--help" not in rest:
             settings = parsed(None, rest)
-            once("train", tuple(settings))
+            typed = (word for word in settings if "=" in word)
+            once("train", (*ALWAYS.get(rest[0], ()), *typed))
     else:
         assert program in SHELL, f"what is {program}?"
 

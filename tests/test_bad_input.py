@@ -293,6 +293,7 @@ def test_damaged_or_malicious_configurations(tmp_path, text) -> None:
         load_config(tmp_path)
 
 
+@pytest.mark.slow
 def test_two_policies_that_rows_cannot_tell_apart(tmp_path) -> None:
     folder = tmp_path / "one"
     training.run(tiny("train", "variant=alcc"), folder, quiet=True)

@@ -319,7 +319,11 @@ TYPED = {
 CHOICES = [name.removesuffix(".yaml") for name in files() if "/" in name]
 
 
-@pytest.mark.parametrize("name", [name for name in CHOICES if name.count("/") == 1])
+NAMES = [name for name in CHOICES if name.count("/") == 1]
+ELSEWHERE = ("variant/", "experiment/", "task/")  # composed by tests of their own
+
+
+@pytest.mark.parametrize("name", slow_but((n for n in NAMES if not n.startswith(ELSEWHERE)), NAMES))
 def test_every_file_is_composed(name) -> None:
     group, option = name.split("/")
     entry = "calibrate" if group == "calibration" else "train"

@@ -126,6 +126,7 @@ def test_evaluate_a_policy_beside_the_baselines(trained, tmp_path) -> None:
     assert {"episode_alcc.png", "human_energy_alcc.png", "improvement_alcc_vs_idm.png"} <= figures
 
 
+@pytest.mark.slow
 def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_path) -> None:
     words = ("variant=alcc", f"policy={trained}")
     free = evaluation.run(tiny("evaluate", *words), tmp_path / "a", quiet=True)
@@ -224,6 +225,7 @@ def test_what_would_fail_late_fails_before_anything_is_written(tmp_path, overrid
     assert not (tmp_path / "training.parquet").exists()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
     training.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct", quiet=True)
     cfg = tiny("evaluate", "variant=idm", "scenario.string='automated human*3'", agent=False)
@@ -366,6 +368,7 @@ def test_a_command_that_names_a_finished_run_by_mistake_leaves_it_finished(
     assert inspect_run(run).state == "finished"
 
 
+@pytest.mark.slow
 def test_a_policy_drives_before_more_drivers_than_it_was_trained_with(tmp_path) -> None:
     # What the reference learns does not depend on their number; nor may what it is measured with.
     runs = [tmp_path / str(followers) for followers in (1, 3)]

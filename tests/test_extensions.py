@@ -81,6 +81,7 @@ def test_a_power_model_measures_every_strategy(tmp_path) -> None:
     assert own["min_ttc_s"].equals(plain["min_ttc_s"])
 
 
+@pytest.mark.slow
 def test_a_driver_model_drives_behind_every_strategy(tmp_path) -> None:
     words = ("variant=alcc", "policy=pretrained")
     plain, own = rows(tmp_path / "a", *words), rows(tmp_path / "b", *words, HUMAN)

@@ -29,6 +29,8 @@ NOT_RUN = {
     "export": "of the shell",
     "ls": "of the shell",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
+    "lcc-rl sumo": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
+    "lcc-rl animate": "tests/results/test_animation.py runs it",
     "lcc-rl benchmark": "tests/tools/test_benchmark.py runs it",
     "python tools/compare_agents.py": "tests/tools/test_compare_agents.py runs it",
     "python tools/compare_launchers.py": "runs of every launcher, of extras",
@@ -85,6 +87,8 @@ NEEDS = {"docs/interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime"
 def test_everything_on_a_page_runs(page, run, tmp_path, monkeypatch) -> None:
     for extra in NEEDS.get(name_of(page), ()):
         pytest.importorskip(extra)
+        if extra == "gymnasium":
+            registered()
     jobs_in_threads(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -98,6 +102,17 @@ def test_everything_on_a_page_runs(page, run, tmp_path, monkeypatch) -> None:
         if (tmp_path / f"{name}.py").exists():
             del sys.modules[name]
     assert not reader.failures, "\n\n".join(f"{name_of(page)}:{said}" for said in reader.failures)
+
+
+def registered() -> None:
+    """Let Gymnasium find the environments, also where the package is not installed anew."""
+    import gymnasium
+
+    import lcc_rl.interfaces.gym
+
+    if "lcc_rl/alcc-v0" not in gymnasium.registry:
+        with gymnasium.envs.registration.namespace("lcc_rl"):
+            lcc_rl.interfaces.gym.register()
 
 
 class Reader:
@@ -116,7 +131,7 @@ class Reader:
             self.write(block.before.strip("`:"), block.text)
         elif block.language == "python" and file:
             self.write(file[1], block.text)
-        elif block.language == "python":
+        elif block.language == "python" and "my.sumocfg" not in block.text:  # of the reader's own
             self.note(block.line, "python", lambda: exec(self.filled(block.text), self.space))
         elif block.language in ("bash", "console"):
             for words in commands(block):
@@ -130,6 +145,7 @@ class Reader:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:
             file.write(text)
+        sys.modules.pop(path.stem, None)  # the next command imports it anew, as a process would
 
     def note(self, line: int, told: str, act: Callable[[], object]) -> None:
         """Do something; keep what goes wrong."""
@@ -179,9 +195,10 @@ class Reader:
         entry = ENTRIES.get(name, name)
         typed = settings_of(words, self.folder)
         ends = [[one_run(word, choice) for word in typed] for choice in (0, -1)]
-        small = [*SMALL, *(OF_TRAINING if name != "evaluate" else ())]
-        fitting = (item for item in small if any(composes(entry, [*end, item]) for end in ends))
-        return [*place, *fitting]
+        sweep = ends[0] != ends[1]  # some of its runs may learn nothing
+        small = [*SMALL, *(OF_TRAINING if name != "evaluate" and not sweep else ())]
+        fits = (item for item in small if all(composes(entry, [*e, item], sweep) for e in ends))
+        return [*place, *fits]
 
     def filled(self, text: str) -> str:
         """Put sizes of a try, and runs of this page, in place of what the page says."""
@@ -203,10 +220,10 @@ class Reader:
         return f"{folder}{file or ''}"
 
 
-def composes(entry: str, settings: Sequence[str]) -> bool:
-    """Whether settings compose."""
+def composes(entry: str, settings: Sequence[str], sweep: bool) -> bool:
+    """Whether settings compose; in a sweep, runs that learn nothing may be given how to."""
     try:
         load(entry, settings)
-    except ConfigError:
-        return False
+    except ConfigError as error:
+        return sweep and "learns nothing" in str(error)
     return True

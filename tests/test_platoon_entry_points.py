@@ -52,6 +52,7 @@ def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:
     assert episodes["learned_share"].between(0.0, 1.0).all()
 
 
+@pytest.mark.slow
 def test_a_leader_too_fast_for_the_headway_is_refused_before_the_training(tmp_path) -> None:
     cfg = tiny("train", "hcfs", "leader.cases.case_3.scale=1.5")
     words = (
@@ -105,6 +106,7 @@ def test_with_a_spacing_term_a_platoon_keeps_its_gaps(tmp_path) -> None:
     assert whole["energy_ratio"].max() < 1.0
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_evaluate_every_variant(trained, tmp_path) -> None:
     yardsticks = {"cacc path", "cacc paper_like", "cacc tuned", "deadbeat", "deadbeat oracle"}
     expected = {
@@ -209,6 +211,7 @@ def test_followers_explore_each_on_their_own(tmp_path) -> None:
     assert 0.2 < noise.std() < 0.4
 
 
+@pytest.mark.slow
 def test_resuming_equals_never_having_stopped(tmp_path) -> None:
     expected = trainer(tmp_path / "whole").run()
     first = trainer(tmp_path / "parts")

@@ -87,12 +87,9 @@ def figure_of_agents(folder: Path) -> Figure:
     for agent in dict.fromkeys(learned["agent"]):
         axes[0, 0].plot([], [], color=HUES.get(agent, INK), label=agent)
     legend_above(axes[0, 0], 4)
-    notes = ["a line per training"]
-    if learned["variant"].nunique() > 1:
-        notes.append("solid: alcc, dotted: others")
-    if len(human):
-        notes.append("dashed: a human in the car's place")
-    figure.supxlabel("; ".join(notes), fontsize=8)
+    note = "; solid: alcc, dotted: others" if learned["variant"].nunique() > 1 else ""
+    note += "; dashed: a human in the car's place" if len(human) else ""
+    figure.supxlabel(f"a line per training{note}", fontsize=8)
     return figure
 
 

@@ -3,7 +3,7 @@
     python tools/compare_drivers.py data=episodes data.path=pairs.parquet \\
         --save outputs/reference/driver_models.parquet
 
-Everything else is an option of ``python -m lcc_rl.calibrate``, such as ``calibration=local``.
+Everything else is an option of ``lcc-rl calibrate``, such as ``calibration=local``.
 """
 
 from __future__ import annotations

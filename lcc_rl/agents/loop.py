@@ -175,7 +175,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
                     self.save()
                     raise Interrupted(
                         f"stopped after iteration {self.iteration} of {self.iterations}; resume "
-                        f"with: python -m lcc_rl.train resume={self.folder}"
+                        f"with: lcc-rl train resume={self.folder}"
                     )
                 if self.iteration % self.settings.checkpoint_every == 0:
                     self.save()

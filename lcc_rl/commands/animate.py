@@ -16,7 +16,7 @@ from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.animation import FORMS, animate, check_ending
 from lcc_rl.results.drawing import in_file, in_words
-from lcc_rl.results.motion import motion_of, sample_episodes
+from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 from lcc_rl.results.runs import CONFIG, stored_config
 
 STEPS = "steps.parquet"
@@ -61,7 +61,14 @@ def run(
     if not 0 <= episode < len(found):
         raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
     label, rows = list(found.items())[episode]
-    motion = motion_of(rows, stored_config(folder).scenario)
+    motion = _cut(motion_of(rows, stored_config(folder).scenario), start, duration)
+    title = f"{in_words(strategy)}: {label}"
+    default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
+    return animate(motion, title, out or default)
+
+
+def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
+    """Return the part of an episode that is shown."""
     end = float("inf") if duration is None else start + duration
     inside = ((motion.time >= start) & (motion.time <= end)).nonzero()[0]
     if len(inside) < 2:
@@ -70,9 +77,7 @@ def run(
             f"--start {start:g} and --duration leave no two moments: the episode has those from "
             f"{first:g} to {last:g} s"
         )
-    title = f"{in_words(strategy)}: {label}"
-    default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
-    return animate(motion.at(slice(inside[0], inside[-1] + 1)), title, out or default)
+    return motion.at(slice(inside[0], inside[-1] + 1))
 
 
 KEPT = "evaluation.sample_episodes=4"

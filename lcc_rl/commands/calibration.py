@@ -103,7 +103,7 @@ def _write(result: Calibration, read: list[str], cfg: DictConfig, folder: Path) 
         "config_hash": config_hash(settings),
         "report": "\n".join([*read, *result.report]),
     }
-    formats = cfg.figure_formats
+    formats = cfg.get("figure_formats", ())
     save(calibration_figure(result.drivers), folder / "calibration.png", formats=formats)
     save(joint_figure(result.drivers), folder / "joint_distribution.png", formats=formats)
     # Last: who finds it finds a finished calibration.

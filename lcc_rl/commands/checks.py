@@ -61,7 +61,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     require(
         cfg.evaluation.shards == 1,
         f"evaluation.shards={cfg.evaluation.shards}: a training's evaluation is one table; divide "
-        "that of python -m lcc_rl.evaluate policy=<run>",
+        "that of lcc-rl evaluate policy=<run>",
     )
     check_installed(cfg)
     check_objective(cfg)

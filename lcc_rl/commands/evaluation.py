@@ -234,9 +234,7 @@ def _by_blocks(
     except KeyboardInterrupt as error:
         if len(plan.own) == 1:
             raise
-        raise Interrupted(
-            f"stopped; go on with: python -m lcc_rl.evaluate resume={folder}"
-        ) from error
+        raise Interrupted(f"stopped; go on with: lcc-rl evaluate resume={folder}") from error
     check_present(folder)
     write_parquet(store.steps(), folder / STEPS, metadata)
     write_parquet(store.rows(), folder / EPISODES, metadata)  # last, as above

@@ -105,7 +105,7 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
         place = folder / "evaluation" / "figures" / "learning_curve.png"
-        save(curve, place, formats=cfg.figure_formats)
+        save(curve, place, formats=cfg.get("figure_formats", ()))
     if paged and isinstance(rows, pd.DataFrame):
         _conclude(folder, overrides)
     return rows
@@ -114,7 +114,7 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
 def _conclude(folder: Path, overrides: list[str]) -> None:
     """Draw the figures, print the headline and write the page."""
     evaluation.draw(folder / "evaluation")
-    page, table = write_page(folder, [" ".join(["python -m lcc_rl.pipeline", *overrides])])
+    page, table = write_page(folder, [" ".join(["lcc-rl run", *overrides])])
     show(as_rich(table, "A leader, the car, and a human driver behind it: held-out windows"))
     tell(f"rows, figures and policies: {folder}")
     tell(f"page: {page}")
@@ -202,9 +202,7 @@ def _train_all(parts: dict[str, DictConfig], folder: Path, jobs: int) -> None:
                 future.result()
         except (KeyboardInterrupt, Interrupted):
             _stop_children(list(futures.values()))
-            raise Interrupted(
-                f"stopped; complete it with: python -m lcc_rl.pipeline resume={folder}"
-            ) from None
+            raise Interrupted(f"stopped; complete it with: lcc-rl run resume={folder}") from None
 
 
 def _stop_children(futures: list[Future[None]]) -> None:

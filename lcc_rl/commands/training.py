@@ -120,7 +120,7 @@ def _given(cfg: DictConfig, inputs: Inputs, folder: Path) -> Strategy:
     require(
         cfg.deployed is not None,
         f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
-        "or say python -m lcc_rl.evaluate to evaluate one",
+        "or say lcc-rl evaluate to evaluate one",
     )
     weights, own = load_policy(cfg.policy, cfg.variant, tuple(cfg.get("trust") or ()))
     check_policy(cfg, own)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import NamedTuple
 
 import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs import build_env
@@ -19,7 +20,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.pieces import StringMotion
-from lcc_rl.pieces.base import SEED, Piece
+from lcc_rl.pieces.base import SEED, Piece, State
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import HYBRID
 from lcc_rl.pieces.string import LEADER_SPEED
@@ -65,31 +66,44 @@ def responses(
         LccError: if the strategy cannot drive there.
     """
     pairs = torch.tensor([(v, x) for v in speeds for x in relative_speeds if v + x >= 0.0])
-    leaders = _leaders(pairs.sum(-1).tolist(), strategy)
     place = torch.cartesian_prod(torch.tensor(gaps), torch.arange(len(pairs)).float())
     gap, profile = place[:, :1], place[:, 1].long()
     speed, relative = pairs[profile].split(1, -1)
-    cfg = any_leader(strategy.cfg)
-    env = build_env(cfg, leaders, population, len(place), 0, "cpu", nominal=True)
-    people = len(population.time_gap)
-    given = reset_options(env, profile, torch.zeros_like(profile), cfg.seed, people)
+    leaders = _leaders(pairs.sum(-1).tolist(), strategy)
     situation = Situation(speed, speed + relative, gap)
-    before = _begin(pieces_of(env), given, cfg.scenario.horizon, situation)
-    with torch.no_grad():
-        if strategy.policy is not None:
-            before.set(ACTION, strategy.policy(before).get(ACTION))
-        reached = Step(pieces_of(env), cfg.scenario.horizon)(entries(before))
+    before, reached = _step(strategy, population, leaders, profile, situation)
     own = before.get(INDEX)[..., :1].unsqueeze(-1)
-    found = {
-        "strategy": strategy.name,
-        "speed_mps": speed.squeeze(-1).numpy(),
-        "gap_m": gap.squeeze(-1).numpy(),
-        "relative_speed_mps": relative.squeeze(-1).numpy(),
-        "acceleration_mps2": reached[ACCELERATION].gather(-2, own).flatten().numpy(),
+    entries_of = {
+        "speed_mps": speed,
+        "gap_m": gap,
+        "relative_speed_mps": relative,
+        "acceleration_mps2": reached[ACCELERATION].gather(-2, own),
     }
     if WINNER in reached:
-        found["winner"] = reached[WINNER][..., 0, 0].numpy()
-    return pd.DataFrame(found)
+        entries_of["winner"] = reached[WINNER][..., :1, :]
+    columns = {name: entry.flatten().numpy() for name, entry in entries_of.items()}
+    return pd.DataFrame({"strategy": strategy.name, **columns})
+
+
+def _step(
+    strategy: Strategy,
+    population: Population,
+    leaders: Profiles,
+    profile: Tensor,
+    situation: Situation,
+) -> tuple[TensorDictBase, State]:
+    """Return the first moment of episodes behind given leaders, and the one reached from it."""
+    cfg, people = any_leader(strategy.cfg), len(population.time_gap)
+    env = build_env(cfg, leaders, population, len(profile), 0, "cpu", nominal=True)
+    given = reset_options(env, profile, torch.zeros_like(profile), cfg.seed, people)
+    before = _begin(pieces_of(env), given, cfg.scenario.horizon, situation)
+    policy = strategy.policy
+    if isinstance(policy, nn.Module):  # it may be on a GPU, which so little does not need
+        policy = deepcopy(policy).to("cpu")
+    with torch.no_grad():
+        if policy is not None:
+            before.set(ACTION, policy(before).get(ACTION))
+        return before, Step(pieces_of(env), cfg.scenario.horizon)(entries(before))
 
 
 def _leaders(speeds: Sequence[float], strategy: Strategy) -> Profiles:

@@ -199,7 +199,7 @@ def no_policy(cfg: DictConfig) -> ConfigError:
     """Return the error for a learned variant without a policy."""
     return ConfigError(
         f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
-        f"(python -m lcc_rl.train variant={cfg.variant} makes one) or policy=pretrained"
+        f"(lcc-rl train variant={cfg.variant} makes one) or policy=pretrained"
     )
 
 

@@ -45,7 +45,7 @@ def pretrained_path(variant: str) -> Path:
         names = sorted(file.stem for file in shipped.glob("*.pt"))
         raise ConfigError(
             f"no pretrained policy ships for {variant}, only for {', '.join(names)}; train one "
-            "(python -m lcc_rl.train) and give its folder"
+            "(lcc-rl train) and give its folder"
         )
     return path
 

@@ -46,7 +46,7 @@ figcaption, caption { color: var(--soft); font-size: .9rem; text-align: left;
   padding: .3rem 0; caption-side: top; }
 .wide { overflow-x: auto; margin: 1.2rem 0; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .28rem .7rem; text-align: left; border-bottom: 1px solid var(--line);
+th, td { padding: .28rem .5rem; text-align: left; border-bottom: 1px solid var(--line);
   white-space: nowrap; }
 th { font-weight: 600; vertical-align: bottom; white-space: normal; background: var(--band); }
 th.number, td.number { text-align: right; }

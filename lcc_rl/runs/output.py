@@ -12,7 +12,7 @@ from typing import Any, cast
 class Unbroken:
     """A stream of text that drops what is written once nobody reads it.
 
-    ``python -m lcc_rl.train … | head -1`` trains to the end: its results are files.
+    ``lcc-rl train … | head -1`` trains to the end: its results are files.
 
     Args:
         stream: the stream itself.

@@ -126,7 +126,7 @@ class SweepCallback(Callback):
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
-        words = "sweep of %d runs in %s; watch it with: python -m lcc_rl.status %s"
+        words = "sweep of %d runs in %s; watch it with: lcc-rl status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
         if not any(state.state == "running" for state in survey(folder)):
             remove_leftovers(folder)

@@ -36,7 +36,7 @@ GIVEN = ("seed", "variant")  # set by the study for each of its runs
 
 @dataclass(frozen=True)
 class Run:
-    """A training: its folder and the overrides of ``python -m lcc_rl.train``."""
+    """A training: its folder and the overrides of ``lcc-rl train``."""
 
     folder: Path
     overrides: tuple[str, ...]

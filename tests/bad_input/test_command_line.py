@@ -138,6 +138,13 @@ def test_a_sweep_whose_flag_comes_last(tmp_path) -> None:
     assert len(list((tmp_path / "outputs/train/s").glob("*/episodes.parquet"))) == 2
 
 
+def test_a_setting_that_some_runs_of_a_sweep_lack_is_named(tmp_path) -> None:
+    words = (*NO_AGENT, "variant=cacc,ddpg", "agent.batch_size=64", "-m")
+    done = run_command("lcc_rl.train", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "agent.batch_size: not every run of this sweep has it" in done.stderr
+
+
 @pytest.mark.parametrize("entry", ["train", "evaluate", "calibrate", "pipeline"])
 def test_an_unknown_flag_is_one_line(tmp_path, entry) -> None:
     done = run_command(f"lcc_rl.{entry}", "variant=idm", "--seed", "3", cwd=tmp_path)

@@ -221,6 +221,7 @@ def test_the_second_process_in_a_folder_says_so_and_touches_nothing(
     assert done.stderr == f"lcc_rl: error: {folder}: another process is working on this run\n"
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("entry", "module"), [("evaluate", evaluation), ("calibrate", calibration)]
 )

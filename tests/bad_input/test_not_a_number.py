@@ -208,7 +208,10 @@ ITERATION = r" in iteration 1 of .*; nothing is saved$"
         ("inf", "string", DRIVER, DRIVER_LOST + f" {EPISODE}{ITERATION}"),
         ("nan", "string", POWER, POWER_LOST + f" {EPISODE}{ITERATION}"),
         ("nan", "string", ENTRY, ENTRY_LOST + f" {EPISODE}{ITERATION}"),
-        ("inf", "torchrl", TERM, REWARD_LOST + f" {EPISODE}{ITERATION}"),
+        pytest.param(
+            *("inf", "torchrl", TERM, REWARD_LOST + f" {EPISODE}{ITERATION}"),
+            marks=pytest.mark.slow,
+        ),
         ("nan", "torchrl", ENTRY, ENTRY_LOST + f" {EPISODE}{ITERATION}"),
         ("nan", "torchrl", POWER, POWER_LOST + f" {EPISODE}$"),  # when the settings are tried
     ],

@@ -173,6 +173,7 @@ def test_nothing_is_learned_from_what_is_all_for_evaluation(tmp_path) -> None:
     assert set(everything.evaluation.recordings) > set(usual.evaluation.recordings)
 
 
+@pytest.mark.slow
 def test_a_mixture_is_trained_and_evaluated_by_source(tmp_path, capsys) -> None:
     said = ("variant=alcc", "leader=mixture")
     once, again = (training.run(tiny("train", *said), tmp_path / x) for x in "ab")

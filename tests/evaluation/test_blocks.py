@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import run_command, tiny
-from helpers import ACTION, POPULATION, compose, network, wavy_profiles
+from helpers import ACTION, POPULATION, compose, network, slow_but, wavy_profiles
 from omegaconf import DictConfig
 
 from lcc_rl import results
@@ -144,7 +144,7 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(Store, "put", counted)
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 11])
+@pytest.mark.parametrize("count", slow_but([5], [0, 1, 5, 11]))
 def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, count) -> None:
     folder = tmp_path / "run"
     with monkeypatch.context() as patched:
@@ -325,6 +325,7 @@ def test_a_compiled_evaluation_differs_by_rounding() -> None:
         pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @COMPILER
 def test_a_compiled_step_names_what_is_not_a_number() -> None:
     cfg = compose("alcc", "agent.hidden=[8]")

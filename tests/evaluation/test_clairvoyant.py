@@ -14,6 +14,7 @@ from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.results.policies import load_policy
+from lcc_rl.runs.cli import main_guard
 
 STEPS = 60
 BOTH = ["total_steady_energy_kj", "total_acceleration_loss_kj"]
@@ -122,6 +123,6 @@ def test_the_command(tmp_path, capsys) -> None:
         (["+knowledge=preview"], "+knowledge=preview: the controller is that of --policy"),
     ):
         with pytest.raises(SystemExit) as stop:
-            tool.main_guard(tool.main)([*out, *wrong])
+            main_guard(tool.main)([*out, *wrong])
         assert stop.value.code == 2
         assert words in capsys.readouterr().err

@@ -21,6 +21,7 @@ MORE = {
 }
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("name", TASKS)
 def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, capsys) -> None:
     words = [f"task={name}", "compare=[pi_saturation]", *FEW, *MORE.get(name, ())]

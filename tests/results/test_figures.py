@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -11,6 +12,7 @@ from study_frames import episodes, training
 
 from lcc_rl.config import identity, load
 from lcc_rl.errors import ConfigError
+from lcc_rl.io.files import write_parquet
 from lcc_rl.results import drawing, training_figures
 from lcc_rl.results import figures as study_figures
 from lcc_rl.results.drawing import in_words, save
@@ -236,3 +238,17 @@ def test_unknown_formats_are_refused_before_anything_begins(entry) -> None:
 def test_formats_do_not_make_another_run() -> None:
     one, other = (load("train", words) for words in ([], ["figure_formats=[png,pdf]"]))
     assert identity(one) == identity(other)
+
+
+def test_figures_of_a_run_with_pieces_of_ones_own_need_no_trust(tmp_path) -> None:
+    write_parquet(episodes(), tmp_path / "episodes.parquet")
+    both = pd.concat([steps(), steps().assign(strategy="reference")])
+    write_parquet(both, tmp_path / "steps.parquet")
+    scenario = {"string": "automated human", "road": "open", "vehicle_length": 5.0}
+    scenario["pieces"] = {"mine": {"_target_": "not_installed.Mine"}}
+    settings = {"scenario": scenario, "figure_formats": ["png", "svg"]}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    drawn = study_figures.write_study_figures(tmp_path)
+    names = {path.name for path in drawn}
+    assert {"overview.png", "episode_alcc.png", "improvement_reference_vs_idm.png"} <= names
+    assert all(path.with_suffix(".svg").exists() for path in drawn)

@@ -1,0 +1,30 @@
+"""Tables and figures of the documentation are drawn again from what is kept."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import redraw
+from matplotlib.image import imread
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.slow
+def test_everything_is_drawn_again_and_the_page_is_the_same(tmp_path) -> None:
+    page = Path(shutil.copy(ROOT / "docs" / "tasks.md", tmp_path))
+    written = redraw.redraw(ROOT / redraw.REFERENCE, tmp_path, page)
+    assert page.read_text() == (ROOT / "docs" / "tasks.md").read_text()
+    images = [path for path in written if path.suffix == ".png"]
+    assert {path.name for path in images} == {
+        "fleets.png",
+        "fleets_ring.png",
+        "ring.png",
+        "limits.png",
+    }
+    for image in images:
+        pixels = imread(image)[..., :3].reshape(-1, 3)
+        colours = {tuple(row) for row in (255 * pixels[::7]).astype(int) if min(row) < 200}
+        assert len(colours) > 100, image  # lines of several colours, not a blank frame
