@@ -49,7 +49,7 @@ def test_rules_have_names_and_others_are_refused(tmp_path) -> None:
         ("task.unit=mpg", "unit=mpg"),
         ("task.score=fuel", "task.score"),
         ("+task.limit=3", "limit"),
-        ("+task.limits.gap=3", "task.limits.gap"),
+        ("+task.limits.gap=3", "task.limits 'gap'; valid: max_gap_m"),
     ],
 )
 def test_mistakes_of_a_task_are_named_before_it_begins(override, words, tmp_path) -> None:
