@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from copy import deepcopy
 from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigResult, ConfigSource
+from composing import composed_once
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -22,21 +19,9 @@ DEFAULT_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def configurations_are_parsed_once() -> Iterator[None]:
-    """Keep what the package's yaml files hold: composing them anew is much of many a test."""
-    Plugins.instance()  # registers the sources of configurations
-    source = SourcesRegistry.instance().types["pkg"]
-    parse = source.load_config
-    known: dict[tuple[str, str], ConfigResult] = {}
-
-    def load_config(self: ConfigSource, config_path: str) -> ConfigResult:
-        key = self.path, config_path
-        if key not in known:
-            known[key] = parse(self, config_path)
-        return deepcopy(known[key])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(source, "load_config", load_config)
+def configurations_are_composed_once() -> Iterator[None]:
+    """Compose the package's files once for each choice of them."""
+    with composed_once():
         yield
 
 

@@ -13,7 +13,10 @@ from typing import Any
 
 import fuzz
 import pytest
+from composing import composed_anew
 from helpers import POPULATION, VARIANTS, compose, slow_but, wavy_profiles
+from hydra import compose as hydra_compose
+from hydra import initialize_config_module
 from omegaconf import DictConfig, OmegaConf
 
 import lcc_rl
@@ -475,3 +478,18 @@ def test_every_room_can_be_entered_first() -> None:
     words = [sys.executable, "-c", FRESH, *rooms]
     done = subprocess.run(words, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("entry", ["train", "evaluate", "pipeline", "calibrate"])
+def test_what_tests_compose_is_what_hydra_composes(entry: str) -> None:
+    agent = () if entry == "calibrate" else ("agent=td3", "variant=ddpg", "+filter=cbf")
+    words = ["experiment=smoke", *agent, "seed=3", "hydra.job.chdir=true"]
+    with initialize_config_module("lcc_rl.conf", version_base="1.3"):
+        kept = [hydra_compose(entry, words, return_hydra_config=True) for _ in range(2)]
+        with composed_anew():
+            fresh = hydra_compose(entry, words, return_hydra_config=True)
+    for cfg in kept:
+        assert OmegaConf.to_yaml(cfg) == OmegaConf.to_yaml(fresh)
+        assert OmegaConf.is_struct(cfg)
+    kept[0].seed = 4
+    assert kept[1].seed == 3
