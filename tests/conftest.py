@@ -11,6 +11,7 @@ import torch
 from composing import composed_once
 from matplotlib.figure import Figure
 from PIL import Image
+from streams import driven_once
 
 # Several test processes share a machine's cores; more threads each would only slow them down.
 torch.set_num_threads(1)
@@ -19,9 +20,9 @@ DEFAULT_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def configurations_are_composed_once() -> Iterator[None]:
-    """Compose the package's files once for each choice of them."""
-    with composed_once():
+def work_that_all_tests_share() -> Iterator[None]:
+    """Compose the package's files once for each choice of them, and drive each stream once."""
+    with composed_once(), driven_once():
         yield
 
 
