@@ -9,28 +9,23 @@ from __future__ import annotations
 import pickle
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
 import pytest
 from hydra._internal import config_loader_impl as loader
-from hydra._internal.config_repository import IConfigRepository
-from hydra._internal.sources_registry import SourcesRegistry
+from hydra._internal.config_repository import ConfigRepository, IConfigRepository
 from hydra.core.default_element import ResultDefault
 from hydra.core.override_parser.types import Override
-from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
 
 CONSTANT = {"pkg", "structured"}  # schemes of files that no test writes
 
 
-Plugins.instance()  # registers the sources of configurations
-SOURCE = SourcesRegistry.instance().types["pkg"]
 LOADER = loader.ConfigLoaderImpl
-PARSE, CHOOSE, MERGE = (
-    SOURCE.load_config,
+READ, CHOOSE, MERGE = (
+    ConfigRepository.load_config,
     loader.create_defaults_list,
     LOADER._compose_config_from_defaults_list,
 )
@@ -38,35 +33,38 @@ PARSE, CHOOSE, MERGE = (
 
 @contextmanager
 def composed_once() -> Iterator[None]:
-    """Keep parsed files, chosen lists of files, and what each list is merged to."""
-    with _with(_parsing(PARSE), _choosing(CHOOSE), _merging(MERGE)):
+    """Keep what files hold, chosen lists of files, and what each list is merged to."""
+    with _with(_reading(READ), _choosing(CHOOSE), _merging(MERGE)):
         yield
 
 
 @contextmanager
 def composed_anew() -> Iterator[None]:
     """Let Hydra compose as it does for a user."""
-    with _with(PARSE, CHOOSE, MERGE):
+    with _with(READ, CHOOSE, MERGE):
         yield
 
 
 @contextmanager
-def _with(parse: Any, choose: Any, merge: Any) -> Iterator[None]:
+def _with(read: Any, choose: Any, merge: Any) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SOURCE, "load_config", parse)
+        patch.setattr(ConfigRepository, "load_config", read)
         patch.setattr(loader, "create_defaults_list", choose)
         patch.setattr(LOADER, "_compose_config_from_defaults_list", merge)
         yield
 
 
-def _parsing(parse: Any) -> Any:
-    known: dict[Hashable, ConfigResult] = {}
+def _reading(read: Any) -> Any:
+    known: dict[Hashable, bytes] = {}
 
-    def load_config(self: ConfigSource, config_path: str) -> ConfigResult:
-        key = self.path, config_path
+    def load_config(self: ConfigRepository, config_path: str) -> ConfigResult | None:
+        places = _sources(self)
+        if not places:
+            return read(self, config_path)
+        key = places, config_path
         if key not in known:
-            known[key] = parse(self, config_path)
-        return deepcopy(known[key])
+            known[key] = pickle.dumps(read(self, config_path))
+        return pickle.loads(known[key])
 
     return load_config
 
