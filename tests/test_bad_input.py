@@ -60,6 +60,7 @@ def test_what_the_schema_knows_passes() -> None:
     check_keys(load("train", ["+reward.terms.x={_target_: mine.X}", "experiment=smoke"]))
 
 
+@pytest.mark.slow
 def test_a_filter_is_put_on_the_policy_of_a_platoon_and_not_on_baselines(tmp_path) -> None:
     words = ["variant=ddpg", "policy=pretrained", "experiment=smoke", "scenario.horizon=40"]
     gaps = [

@@ -65,6 +65,7 @@ def test_same_command_same_rows(trained, tmp_path) -> None:
     assert_same_tables(trained, tmp_path)
 
 
+@pytest.mark.slow
 def test_policies_are_kept_on_the_way_and_change_nothing(trained, tmp_path) -> None:
     training.run(tiny("train", "variant=alcc", "training.keep_every=2"), tmp_path, quiet=True)
     one, two = (read_parquet(folder / "training.parquet") for folder in (trained, tmp_path))
@@ -225,6 +226,7 @@ def test_what_would_fail_late_fails_before_anything_is_written(tmp_path, overrid
     assert not (tmp_path / "training.parquet").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
     training.run(tiny("train", "variant=direct", agent=False), tmp_path / "direct", quiet=True)
@@ -276,6 +278,7 @@ def test_multirun_sweep_and_results_load(tmp_path) -> None:
     assert training.groupby("seed")["episode_reward"].first().nunique() == 2
 
 
+@pytest.mark.slow
 def test_sigkill_and_resume_equal_an_uninterrupted_run(tmp_path) -> None:
     longer = ("training.episodes=160", "variant=alcc")
     training.run(tiny("train", *longer), tmp_path / "whole", quiet=True)

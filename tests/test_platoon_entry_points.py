@@ -106,6 +106,7 @@ def test_with_a_spacing_term_a_platoon_keeps_its_gaps(tmp_path) -> None:
     assert whole["energy_ratio"].max() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_evaluate_every_variant(trained, tmp_path) -> None:
     yardsticks = {"cacc path", "cacc paper_like", "cacc tuned", "deadbeat", "deadbeat oracle"}

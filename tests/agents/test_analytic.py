@@ -8,7 +8,7 @@ import signal
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, REWARD, TERMS, compose, make_agent, string, wavy_profiles
+from helpers import POPULATION, REWARD, TERMS, compose, make_agent, slow_but, string, wavy_profiles
 
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import derived_seed
@@ -41,8 +41,11 @@ def weights(trainer: GradientTrainer) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
 
 
-@pytest.mark.parametrize("vehicles", ["automated human", "(automated human*5)*2"])
-@pytest.mark.parametrize("variant", ["alcc", "reference"])
+PAIR, PLATOON = "automated human", "(automated human*5)*2"
+BOTH = [("alcc", PAIR), ("reference", PAIR), ("alcc", PLATOON), ("reference", PLATOON)]
+
+
+@pytest.mark.parametrize(("variant", "vehicles"), slow_but([BOTH[0], BOTH[3]], BOTH))
 def test_same_seed_same_rows_and_weights(tmp_path, variant, vehicles) -> None:
     settings = (string(vehicles), "training.episodes=16")
     one, two = (make(tmp_path / name, *settings, variant=variant) for name in "ab")

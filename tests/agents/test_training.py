@@ -118,6 +118,7 @@ def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
     assert all(torch.equal(value, best[key]) for key, value in trainer.best["weights"].items())
 
 
+@pytest.mark.slow
 def test_a_literal_training_resumes_bit_for_bit(tmp_path) -> None:
     whole = make(tmp_path / "whole", *LITERAL)
     expected = whole.run()

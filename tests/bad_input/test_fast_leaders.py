@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import tiny
+from helpers import slow_but
 from study_frames import episodes
 
 from lcc_rl.commands import evaluation
@@ -48,7 +49,10 @@ def fast(share: float) -> pd.DataFrame:
     return frame.assign(**shares, cav_distance_m=500.0, hdv_distance_m=500.0)
 
 
-@pytest.mark.parametrize(("share", "said"), [(0.19, False), (0.21, True)])
+AROUND = [(0.19, False), (0.21, True)]
+
+
+@pytest.mark.parametrize(("share", "said"), slow_but(AROUND[1:], AROUND))
 def test_the_warning_stands_in_table_and_page(tmp_path: Path, share: float, said: bool) -> None:
     frame = fast(share)
     found = leader_too_fast(frame)

@@ -95,6 +95,7 @@ def test_the_log_says_which_package_simulates(way, request, uneven_lengths, capl
         assert caplog.messages[-1] == f"drivers are simulated with {way.removesuffix('_only')}"
 
 
+@pytest.mark.slow
 def test_numba_and_torch_find_the_same_drivers(numba, known_episodes, monkeypatch):
     # The same draws; roundings may let another of two equally good individuals survive.
     found = {mode: fit(known_episodes, mode, seed=2).drivers for mode in MODES}

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from helpers import slow_but
 
 from lcc_rl.data.episodes import ALIASES
 from lcc_rl.drivers import fit_error
@@ -126,7 +127,7 @@ def test_known_drivers_are_recovered(model, objective, known_drivers, make_episo
     assert local["rmspe"].max() < 0.01
 
 
-@EACH
+@pytest.mark.parametrize("model", slow_but(["fvdm"], LAWS))
 def test_all_parameters_of_known_drivers_are_recovered(model, known_drivers, make_episodes):
     speeds, gaps = (known_drivers[name].tolist()[:8] for name in ("desired_speed", "time_gap"))
     episodes = make_episodes(speeds, gaps, KNOWN[model], model=model)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import slow_but
 from torchrl.envs.utils import check_env_specs
 
 import lcc_rl
@@ -32,7 +33,10 @@ def test_every_vehicle_has_the_power_of_its_class() -> None:
     assert Fleet({"all": PaperMotor()}).acceleration_loss(speed, acceleration).min() >= 0.0
 
 
-@pytest.mark.parametrize("string", ["automated*2 human*6", "{size: 8, penetration: 0.25}"])
+STRINGS = ["automated*2 human*6", "{size: 8, penetration: 0.25}"]
+
+
+@pytest.mark.parametrize("string", slow_but(STRINGS[1:], STRINGS))
 def test_classes_are_drawn_by_share_and_constant(string) -> None:
     overrides = [
         "energy=mixture",

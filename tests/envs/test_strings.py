@@ -15,6 +15,7 @@ from helpers import (
     VARIANTS,
     composed,
     single_env,
+    slow_but,
     small_env,
     string,
     wavy_profiles,
@@ -119,8 +120,10 @@ def vectorised(view: str):
     return small_env("alcc", 2, [string("(automated human)*2")], seed=1)
 
 
-@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
-@pytest.mark.parametrize("view", ["single", "group"])
+KINDS = [(kind, view) for kind in (SerialEnv, ParallelEnv) for view in ("single", "group")]
+
+
+@pytest.mark.parametrize(("kind", "view"), slow_but([*KINDS[:2], KINDS[3]], KINDS))
 def test_in_torchrls_vectors_of_environments(kind, view) -> None:
     own = {"mp_start_method": "fork"} if kind is ParallelEnv else {}  # spawning takes 25 s
     env = kind(2, partial(vectorised, view), **own)

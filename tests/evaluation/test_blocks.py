@@ -219,6 +219,7 @@ def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog)
     assert len(results.load(root, strict=True)) == len(own)
 
 
+@pytest.mark.slow
 def test_a_finished_part_of_a_sweep_is_played_again_for_a_newer_policy(tmp_path, caplog) -> None:
     shutil.copy(Path(results.__file__).parents[1] / "assets/pretrained/alcc.pt", tmp_path / "a.pt")
     words = ["variant=alcc", f"policy={tmp_path / 'a.pt'}", "evaluation.baselines=[]"]

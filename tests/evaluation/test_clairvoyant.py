@@ -80,6 +80,7 @@ def test_misses(gap, relative_speed, speed, missed) -> None:
     assert float(found) == pytest.approx(missed, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_without_regard_the_car_alone_saves() -> None:
     start = learned()
     plans = [clairvoyant(start, INPUTS, 2, 1, 30, False, own) for own in (True, False)]

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from commands import DATA, tiny
+from helpers import slow_but
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.tasks import task_of
@@ -12,6 +13,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import BASELINES, DIRECT, rules
 
 TASKS = sorted(path.stem for path in Path("conf/task").glob("*.yaml"))
+QUICK = ("i80-follow", "i24-mixed", "ring-22")
 FEW = ("experiment=smoke", "evaluation.profiles=2", "scenario.horizon=12")
 MORE = {
     "i80-follow": [*DATA, "evaluation.drivers=2"],
@@ -22,7 +24,7 @@ MORE = {
 
 
 @pytest.mark.usefixtures("blank_figures")
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", slow_but(QUICK, TASKS))
 def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, capsys) -> None:
     words = [f"task={name}", "compare=[pi_saturation]", *FEW, *MORE.get(name, ())]
     cfg = load("evaluate", words)

@@ -53,7 +53,7 @@ def benchmark() -> ModuleType:
     return module
 
 
-LONG = ("sweep", "calibrate", "read")  # longer than all others together
+LONG = ("sweep", "calibrate", "read", "evaluate", "seeds")  # longer than all others together
 
 
 def check_rows(rows: pd.DataFrame, name: str) -> None:

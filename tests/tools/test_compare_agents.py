@@ -9,7 +9,7 @@ import compare_agents as tool
 import pandas as pd
 import pytest
 from agent_results import course
-from helpers import compose
+from helpers import compose, slow_but
 from limit_results import HUES, MEANS
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
@@ -112,7 +112,7 @@ def test_policies_are_put_behind_the_filter_once(tmp_path, monkeypatch) -> None:
     assert table.loc["none", "filtered_saving_vs_idm"] == pytest.approx(1 - own / 120.0)
 
 
-@pytest.mark.parametrize("part", ["agents", "knowledge"])
+@pytest.mark.parametrize("part", slow_but(["agents"], ["agents", "knowledge"]))
 def test_every_run_it_would_start_composes(part, tmp_path) -> None:
     words = [part, "--seeds", "1", "--out", str(tmp_path), "experiment=smoke"]
     options, overrides = tool.parser().parse_known_args(words)

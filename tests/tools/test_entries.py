@@ -15,6 +15,9 @@ from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.entries import ENTRIES
 
+# One process for all: to make the environments takes longer than to look at them.
+pytestmark = pytest.mark.xdist_group("entries")
+
 
 @pytest.fixture(scope="module")
 def environments():
