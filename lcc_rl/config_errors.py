@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -54,6 +54,8 @@ def explain(error: Exception, valid: Any) -> Exception:
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _missing_choice(error)
+    if isinstance(error, OverrideParseException):
+        return _unread(error.override)
     key = refused_key(error)
     if key is None:
         return _not_merged(error)
@@ -82,6 +84,16 @@ def explain(error: Exception, valid: Any) -> Exception:
         return ConfigError(f"{key}: not every run of this sweep has it; sweep those that do alone")
     names = {*map(str, node), *(() if parent else ("experiment",))}
     return unknown_name(_what(parent), name, names)
+
+
+def _unread(word: str) -> ConfigError:
+    """Return the error for a word that the grammar of settings cannot read."""
+    key, _, value = word.partition("=")
+    bare = value.strip("'\"")
+    return ConfigError(
+        f"{word}: cannot be read as a setting. Brackets must be closed, and text with spaces, "
+        f"commas or signs stands in quotes within quotes: \"{key}='{bare}'\""
+    )
 
 
 def _not_merged(error: Exception) -> Exception:

@@ -69,6 +69,8 @@ def run(
 
 def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
     """Return the part of an episode that is shown."""
+    require(start >= 0.0, f"--start must be at least 0, got {start:g}")
+    require(duration is None or duration > 0.0, f"--duration must be positive, got {duration}")
     end = float("inf") if duration is None else start + duration
     inside = ((motion.time >= start) & (motion.time <= end)).nonzero()[0]
     if len(inside) < 2:

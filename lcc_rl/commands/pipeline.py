@@ -23,13 +23,13 @@ from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_settings, check_sizes
 from lcc_rl.config import load, plain, require
 from lcc_rl.data.episodes import write_episodes
-from lcc_rl.envs.inputs import build_source
+from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import Interrupted, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.drawing import save
-from lcc_rl.results.main_page import as_rich, write_page
+from lcc_rl.results.main_page import as_rich, caption_of, write_page
 from lcc_rl.results.tables import show
 from lcc_rl.results.training_figures import training_figure
 from lcc_rl.results.trust import check_targets
@@ -75,6 +75,11 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> Rows:
 def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     prepare_torch(cfg)
     require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
+    for item in overrides:
+        require(
+            root_key(item) != "variant",
+            f"{item} has no effect on lcc-rl run, which trains several: say variants=[…]",
+        )
     shared = [item for item in overrides if root_key(item) not in OWN]
     # Every part is composed before the first one runs: a typo must not cost an hour.
     parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
@@ -107,15 +112,16 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
         place = folder / "evaluation" / "figures" / "learning_curve.png"
         save(curve, place, formats=cfg.get("figure_formats", ()))
     if paged and isinstance(rows, pd.DataFrame):
-        _conclude(folder, overrides)
+        _conclude(folder, overrides, caption_of(parts.values()))
     return rows
 
 
-def _conclude(folder: Path, overrides: list[str]) -> None:
+def _conclude(folder: Path, overrides: list[str], caption: str) -> None:
     """Draw the figures, print the headline and write the page."""
     evaluation.draw(folder / "evaluation")
-    page, table = write_page(folder, [" ".join(["lcc-rl run", *overrides])])
-    show(as_rich(table, "A leader, the car, and a human driver behind it: held-out windows"))
+    page, table = write_page(folder, [" ".join(["lcc-rl run", *overrides])], caption)
+    title = "A leader, the car, and a human driver behind it: held-out windows"
+    show(as_rich(table, title, caption))
     tell(f"rows, figures and policies: {folder}")
     tell(f"page: {page}")
 
@@ -172,7 +178,9 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
         loaded = build_source(cfg.data).load()
         for line in loaded.report:
             log.info(line)
-        tell(f"data: {loaded.report[-1]}")
+        counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
+        tell(f"data: {(counts or loaded.report)[-1]}")
+        load_inputs(cfg, loaded.episodes).to_learn_from()  # whether they can be split
         write_episodes(loaded.episodes, table)
     if not drivers.exists():
         own = OmegaConf.create(plain(cfg))

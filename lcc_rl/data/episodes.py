@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,8 @@ def load_episodes(path: str | Path) -> tuple[pd.DataFrame, list[str]]:
     names = {old: new for old, new in ALIASES.items() if new not in frame.columns}
     frame = frame.rename(columns=names)
     lacking = [name for name in OPTIONAL if name not in frame.columns]
+    for name in set(COLUMNS) - set(OPTIONAL) - set(frame.columns):
+        raise _absent(name, str(path), [str(column) for column in frame.columns])
     placed = not set(POSITIONS) & set(lacking)
     filled = frame.assign(
         **{name: stem(path) if name == "recording" else 0.0 for name in lacking if len(frame)}
@@ -98,6 +101,8 @@ def _from_text(path: Path) -> tuple[pd.DataFrame, list[str]]:
     twice = [name for name in known if known.count(name) > 1]
     if twice:
         raise DataError(f"{path}: has column {twice[0]!r} twice; expected it once")
+    if not known:
+        raise _absent(COLUMNS[0], str(path), text.header)
     places = {text.header.index(name): name for name in known}
     frame = text.parse([*places]).to_pandas()
     frame = frame.rename(columns={str(place): name for place, name in places.items()})
@@ -171,9 +176,16 @@ def _check_columns(frame: pd.DataFrame, source: str) -> None:
         if present.count(name) > 1:
             raise DataError(f"{source}: has column {name!r} twice; expected it once")
         if name not in present:
-            near = get_close_matches(name, present, n=1)
-            hint = f"; the nearest is {near[0]!r}" if near else ""
-            raise DataError(f"{source}: has no column {name!r}{hint}. It has: {', '.join(present)}")
+            raise _absent(name, source, present)
+
+
+def _absent(name: str, source: str, present: Sequence[str]) -> DataError:
+    near = get_close_matches(name, present, n=1)
+    hint = f"; the nearest is {near[0]!r}" if near else ""
+    return DataError(
+        f"{source}: has no column {name!r}{hint}. It has: {', '.join(present)}. Tables of other "
+        "columns or units are read by data=table"
+    )
 
 
 def _at(source: str, wrong: pd.Series | NDArray[np.bool_], name: str, message: str) -> DataError:

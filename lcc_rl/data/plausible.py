@@ -61,7 +61,7 @@ class Plausible:
     max_gap: float = 500.0
     max_step: float = 10.0
     max_share: float = 0.1
-    max_mismatch: float = 1.6
+    max_mismatch: float = 1.5
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -110,7 +110,7 @@ class Plausible:
             said = f"{place(row, fault.column)} {fault.words.format(fault.values[row])}, {limit}"
             lines.append(f"left out {int(bad.sum()):,} implausible record(s), the first: {said}")
             more = remedy if fault.setting == "max_acceleration" else ""
-            told = told or f"{said}; mend the file{more} or raise that threshold"
+            told = told or f"{said}; mend the file{more}, or raise that threshold"
             keep &= ~bad
         self._check_share(keep, f"{setting}.max_share={self.max_share:g}", source, told)
         kept = table if keep.all() else table[np.repeat(keep, lengths)].reset_index(drop=True)

@@ -78,7 +78,7 @@ class NgsimSource:
             episodes, report = extract(trajectories, self.criteria or Criteria())
         except DataError as error:
             raise DataError(f"{source}: {error}") from error
-        remedy = "" if self.smoothing else f", smooth it ({SMOOTHING}),"
+        remedy = "" if self.smoothing else f", smooth it ({SMOOTHING})"
         lines = [*trajectories.report.lines(), *report.lines()]
         return plausible_episodes(self.plausible, episodes, source, lines, remedy)
 

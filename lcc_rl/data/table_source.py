@@ -85,7 +85,10 @@ class TableSource:
                 "data.columns must name gap, or position and length (or say data.vehicle_length)"
             )
         if self.smoothing is not None and ("gap" in given or "position" not in given):
-            raise ConfigError("data.smoothing smooths positions; it needs them, and no column gap")
+            raise ConfigError(
+                "data.smoothing smooths positions: name data.columns.position, and leave out "
+                "data.columns.gap, which would not agree with them; or smooth the file yourself"
+            )
 
     def load(self) -> LoadedEpisodes:
         """Read, smooth where asked, and extract.
@@ -101,8 +104,15 @@ class TableSource:
         trajectories = to_trajectories(rows, names, report)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
-        remedy = f", smooth it ({SMOOTHING})," if rows.position is not None else ""
+        smooth = f", smooth it ({SMOOTHING})" if rows.position is not None else ""
+        remedy = f", name its units (data.units, here {self._units()}){smooth}"
         return episodes_of(trajectories, self.criteria, self.plausible, remedy)
+
+    def _units(self) -> str:
+        """The units of the columns that there are, as a line."""
+        named = {**COLUMNS, **self.columns}
+        units = {**UNITS, **self.units}
+        return ", ".join(f"{key} {unit}" for key, unit in units.items() if named[key] is not None)
 
     def _rows(self, tables: Sequence[Table], report: ReadReport) -> tuple[Rows, list[str]]:
         """Rows of all files in SI, and the names of the recordings."""

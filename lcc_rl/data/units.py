@@ -60,10 +60,11 @@ def check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None
             )
 
 
+SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
 # Units that the columns of a table may be in, by what they measure, and their size in SI.
 QUANTITIES: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
-    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600},
+    "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
 }
 # What the columns of tables measure, by their key.

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
+from omegaconf import DictConfig, OmegaConf
 from rich.markup import escape
 from rich.table import Table
 
@@ -46,6 +47,24 @@ CAPTION = (
 )
 
 
+LIMIT = "agent.limits.efficiency"
+HELD_TO = (
+    f"The networks learn within a limit of long time gaps, {LIMIT}={{limit}} of the time; rows "
+    "with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these data."
+)
+
+
+def caption_of(trainings: Iterable[DictConfig]) -> str:
+    """Say what the table shows, and what only the networks are held to.
+
+    Args:
+        trainings: configuration of each.
+    """
+    limits = {OmegaConf.select(cfg, LIMIT) for cfg in trainings} - {None}
+    held = ", ".join(f"{limit:.2g}" for limit in sorted(limits))
+    return CAPTION if not limits else f"{CAPTION} {HELD_TO.format(limit=held)}"
+
+
 def headline(found: pd.DataFrame) -> pd.DataFrame:
     """Shorten a summary to what a reader asks first.
 
@@ -71,9 +90,9 @@ def headline(found: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index(drop=True)
 
 
-def as_rich(table: pd.DataFrame, title: str) -> Table:
+def as_rich(table: pd.DataFrame, title: str, caption: str = CAPTION) -> Table:
     """Return a headline as a table for the terminal, a row per strategy, at most 100 wide."""
-    drawn = Table(title=escape(title), caption=CAPTION)
+    drawn = Table(title=escape(title), caption=escape(caption))
     shown = [name for name in HEADINGS if name in table]
     for name in shown:
         drawn.add_column(escape(HEADINGS[name]), justify="right" if name != "who" else "left")
@@ -92,12 +111,15 @@ def _cells(table: pd.DataFrame, name: str) -> list[str]:
     ]
 
 
-def write_page(folder: str | Path, commands: Sequence[str]) -> tuple[Path, pd.DataFrame]:
+def write_page(
+    folder: str | Path, commands: Sequence[str], caption: str = CAPTION
+) -> tuple[Path, pd.DataFrame]:
     """Write ``report.html`` of a job: the headline, figures, drivers, and how it was made.
 
     Args:
         folder: the job's folder, with ``evaluation``, ``calibration`` and a folder per training.
         commands: what was typed.
+        caption: of the results, see :func:`caption_of`.
 
     Returns:
         The page's path, and the headline.
@@ -111,7 +133,7 @@ def write_page(folder: str | Path, commands: Sequence[str]) -> tuple[Path, pd.Da
     sections = [
         Section(
             "Results",
-            CAPTION,
+            caption,
             [("Held-out windows", table.rename(columns=NAMES))],
             _figures(folder, FIRST),
         ),

@@ -137,6 +137,7 @@ def flags_first(words: Sequence[str]) -> list[str]:
         ConfigError: naming a flag that does not exist.
     """
     parser = get_args_parser()
+    parser.allow_abbrev = False  # --experiment is none of Hydra's flags
     known, unknown = parser.parse_known_intermixed_args(list(words))
     if unknown:
         raise ConfigError(

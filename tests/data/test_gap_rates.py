@@ -57,7 +57,7 @@ def test_consistent_gaps_have_the_rate_one_also_with_a_biased_speedometer() -> N
 def test_wrong_units_are_refused(column: list[str], factor: float, said: str) -> None:
     table = pairs()
     table[column] *= factor
-    with pytest.raises(DataError, match=rf"f\.csv: gaps change by {said} where .*max_mismatch=1.6"):
+    with pytest.raises(DataError, match=rf"f\.csv: gaps change by {said} where .*max_mismatch=1.5"):
         select(table, Plausible(max_speed=100.0))
     assert len(select(table, Plausible(max_speed=100.0, max_mismatch=4.0))) == len(table)
 

@@ -55,9 +55,15 @@ RADIO = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error", "
 ESTIMATED = ("predicted_acceleration", "predicted_power", "estimate", "covariance")
 
 
+def arrays(name: str) -> dict[str, np.ndarray]:
+    """Read a file of arrays; what is left open would be closed, with a warning, in another test."""
+    with np.load(REFERENCE / name) as file:
+        return dict(file)
+
+
 def recorded_profiles() -> Profiles:
     """The leaders of the recording, as they were: a sine may be rounded otherwise elsewhere."""
-    speeds = np.load(REFERENCE / "rollouts" / "inputs.npz")["profile_speeds"]
+    speeds = arrays("rollouts/inputs.npz")["profile_speeds"]
     records = [torch.from_numpy(speed) for speed in speeds]
     names = [f"rec{i % 2}/{i}@0.0s" for i in range(len(records))]
     return from_records(records, names, [f"rec{i % 2}" for i in range(len(records))], 0.1)
@@ -111,7 +117,7 @@ def compare(found: torch.Tensor, reference: np.ndarray, what: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_rollouts(name) -> None:
-    data = np.load(REFERENCE / "rollouts" / f"{name}.npz")
+    data = arrays(f"rollouts/{name}.npz")
     played = roll(name)
     moments, steps = played["moments"], played["steps"]
     for entry in ("seed", "profile", "start"):
@@ -146,7 +152,7 @@ def test_rollouts(name) -> None:
 
 @pytest.mark.parametrize("name", ["alcc", "reference", "ddpg"])
 def test_shipped_policies_act_as_before(name) -> None:
-    data = np.load(REFERENCE / "policies.npz")
+    data = arrays("policies.npz")
     weights, cfg = load_policy(f"pretrained/{name}")
     agent = build_agent(cfg, bootstrap())
     agent.policy.load_state_dict(weights)
