@@ -12,7 +12,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 
 REFUSED = re.compile(r"Could not (?:override|delete from config\.|append to config\.?) '([^']+)'")
 MERGED = re.compile(r"^Error merging override \+*([^=]+)=(.*)", re.DOTALL)
@@ -158,7 +158,7 @@ def _missing_choice(error: MissingConfigException) -> ConfigError:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
         extra = EXTRAS[name]
-        return ConfigError(f"{group}/{name} is not installed: pip install -e '.[{extra}]'")
+        return ConfigError(f"{group}/{name} is not installed: {how_to_install(extra)}")
     shipped = Path(str(files("lcc_rl.conf"))) / group
     options = error.options or [path.stem for path in shipped.glob("*.yaml")]
     return unknown_name(f"choice of {group}" if group else "option", name, options)

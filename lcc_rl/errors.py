@@ -110,6 +110,11 @@ def require_whole(where: str, least: int, most: int | None = None, **settings: A
             raise ConfigError(f"{key} must be a whole number {bounds}, got {value!r}")
 
 
+def how_to_install(extra: str) -> str:
+    """Say how an extra of this package is installed, in a clone or from a wheel."""
+    return f"pip install -e '.[{extra}]', or '<wheel>[{extra}]' where there is no clone"
+
+
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     """Build the error for an unknown name, listing the valid ones and the nearest."""
     options = sorted(valid)

@@ -55,6 +55,18 @@ def pairs(path: Path) -> None:
     write_episodes(NgsimSource(str(path.with_suffix(".csv"))).load().episodes, path)
 
 
+def wide(path: Path) -> None:
+    """Pairs with names and units of one's own, a row per moment."""
+    time = np.arange(0.0, 60.0, 0.04)
+    parts = []
+    for run in range(4):
+        ahead, own = (10.0 + 3.0 * np.sin((time - late) / (4.0 + run)) for late in (0.0, 1.0))
+        gap = 20.0 + np.cumsum(ahead - own) * 0.04
+        speeds = {"v_leader_kmh": 3.6 * ahead, "v_follower_kmh": 3.6 * own}
+        parts.append(pd.DataFrame({"run": run, "clock": time, **speeds, "gap_ft": gap / 0.3048}))
+    pd.concat(parts).to_csv(path, index=False)
+
+
 def table(path: Path) -> None:
     """A table with names and units of its own."""
     frame = long_table(cars=6, rows=600).rename(columns={"gap": "distance"})
@@ -103,6 +115,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "portal.csv": portal,
     "other.csv": official,
     "my.csv": table,
+    "mine.csv": wide,
     "pairs.parquet": pairs,
     "outputs/pipeline/<run>/trajectories.parquet": pairs,
     "astazero/*.csv.gz": openacc,

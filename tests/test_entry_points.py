@@ -342,6 +342,7 @@ def test_commands_that_no_other_test_starts_as_a_process(tmp_path, words, code, 
         (["lcc_rl.train", "resume=nowhere"], "nowhere"),
         (["lcc_rl.train", "resume=nowhere", "seed=3"], "resume=nowhere: not a run folder"),
         (["lcc_rl.pipeline", "variants=[]"], "variants is empty"),
+        (["lcc_rl.pipeline", "variant=idm"], "variant=idm has no effect on lcc-rl run"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> None:

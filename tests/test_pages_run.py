@@ -87,8 +87,6 @@ NEEDS = {"docs/interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime"
 def test_everything_on_a_page_runs(page, run, tmp_path, monkeypatch) -> None:
     for extra in NEEDS.get(name_of(page), ()):
         pytest.importorskip(extra)
-        if extra == "gymnasium":
-            registered()
     jobs_in_threads(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -102,17 +100,6 @@ def test_everything_on_a_page_runs(page, run, tmp_path, monkeypatch) -> None:
         if (tmp_path / f"{name}.py").exists():
             del sys.modules[name]
     assert not reader.failures, "\n\n".join(f"{name_of(page)}:{said}" for said in reader.failures)
-
-
-def registered() -> None:
-    """Let Gymnasium find the environments, also where the package is not installed anew."""
-    import gymnasium
-
-    import lcc_rl.interfaces.gym
-
-    if "lcc_rl/alcc-v0" not in gymnasium.registry:
-        with gymnasium.envs.registration.namespace("lcc_rl"):
-            lcc_rl.interfaces.gym.register()
 
 
 class Reader:

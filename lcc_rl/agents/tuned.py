@@ -22,7 +22,7 @@ from lcc_rl.agents.simulated import SimulatedAgent, SimulatedLoop, SimulatedSett
 from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import ConfigError, require_positive, require_whole
+from lcc_rl.errors import ConfigError, how_to_install, require_positive, require_whole
 
 MOST_WEIGHTS = 500  # beyond, the covariance of a generation's candidates says too little
 
@@ -82,7 +82,7 @@ class Tuned(SimulatedAgent):
         try:
             from cmaes import CMA
         except ImportError as error:
-            raise ConfigError("agent=tuned needs cmaes: pip install -e '.[tune]'") from error
+            raise ConfigError(f"agent=tuned needs cmaes: {how_to_install('tune')}") from error
         size, seed = self.settings.candidates, derived_seed(self.seed, "search")
         return CMA(self.start, self.settings.sigma, seed=seed, population_size=size)
 

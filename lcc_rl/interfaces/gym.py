@@ -1,7 +1,7 @@
 """Gymnasium environments of strings with one automated vehicle.
 
-``gymnasium.make("lcc_rl/alcc-v0")``, ``gymnasium.make_vec("lcc_rl/alcc-v0", 64)``: Gymnasium finds
-them by this package's entry point ``gymnasium.envs``; nothing need be imported.
+``gymnasium.make("lcc_rl/alcc-v0")``, ``gymnasium.make_vec("lcc_rl/alcc-v0", 64)``: importing this
+module registers them.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ Array = np.ndarray[Any, Any]
 
 
 def register() -> None:
-    """Register ``alcc-v0``, ``reference-v0`` and ``own_energy-v0`` in the namespace at hand."""
+    """Register ``lcc_rl/alcc-v0``, ``lcc_rl/reference-v0`` and ``lcc_rl/own_energy-v0``."""
     for variant in VARIANTS:
-        gymnasium.register(
-            id=f"{variant}-v0",
-            entry_point=f"{__name__}:CarFollowing",
-            vector_entry_point=f"{__name__}:CarFollowingVector",
-            kwargs={"variant": variant},
-        )
+        if (name := f"lcc_rl/{variant}-v0") not in gymnasium.registry:
+            gymnasium.register(
+                id=name,
+                entry_point=f"{__name__}:CarFollowing",
+                vector_entry_point=f"{__name__}:CarFollowingVector",
+                kwargs={"variant": variant},
+            )
 
 
 def _spaces(size: int) -> tuple[Box, Box]:
@@ -152,3 +153,6 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         observation = self._td["observation"].numpy().copy()
         flat = (after[name].squeeze(-1).numpy() for name in ("reward", "terminated", "truncated"))
         return observation, *flat, info
+
+
+register()

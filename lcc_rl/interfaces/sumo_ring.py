@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from omegaconf import DictConfig
 
-from lcc_rl.config import load
+from lcc_rl.config import load, require
 from lcc_rl.errors import ConfigError, require_in, require_whole
 from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
@@ -110,7 +110,7 @@ def simulate(
     sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
     try:
         sumo.simulationStep()
-        bridge = None if driver is None else Bridge(driver, FIRST, seed=seed)
+        bridge = None if driver is None else Bridge(driver, FIRST, seed=seed, trust=list(cfg.trust))
         noise = np.random.default_rng(seed)
         rows = []
         for number in range(round(seconds / step)):
@@ -188,13 +188,19 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="The ring road of task=ring-22 in SUMO.")
     parser.add_argument("driver", help="run folder, policy.pt, pretrained/<name> or a rule")
     parser.add_argument("overrides", nargs="*", help="settings: scenario.circumference=230")
-    parser.add_argument("--from-s", type=float, default=300.0, help="it drives from then on")
-    parser.add_argument("--seconds", type=float, default=600.0, help="how long in all")
-    parser.add_argument("--seed", type=int, default=0, help="of the humans' noise")
+    parser.add_argument(
+        "--from-s", type=float, default=300.0, help="it drives from then on [s], 300"
+    )
+    parser.add_argument("--seconds", type=float, default=600.0, help="how long in all [s], 600")
+    parser.add_argument("--seed", type=int, default=0, help="of the humans' noise, 0")
     parser.add_argument("--folder", type=Path, default=Path("outputs/sumo"))
     options = parser.parse_intermixed_args(words)
     require_in("lcc-rl sumo", "[0, inf)", from_s=options.from_s)
-    require_in("lcc-rl sumo", f"({options.from_s}, 36000]", seconds=options.seconds)
+    require_in("lcc-rl sumo", "(0, 36000]", seconds=options.seconds)
+    require(
+        options.seconds > options.from_s,
+        f"--seconds={options.seconds:g} ends before --from-s={options.from_s:g}, when it drives",
+    )
     require_whole("", 0, seed=options.seed)
     cfg = load("evaluate", ["variant=alcc", "task=ring-22", *options.overrides])
     _check(cfg)

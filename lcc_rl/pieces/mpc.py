@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole
+from lcc_rl.errors import ConfigError, how_to_install, require_in, require_positive, require_whole
 from lcc_rl.functional.mpc import Array, FollowingProgram, MPCSettings
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.controllers import Controller
@@ -60,7 +60,7 @@ class MPC(Controller):
             ConfigError: saying how to install it.
         """
         if find_spec("osqp") is None:
-            raise ConfigError("controller=mpc needs osqp: pip install -e '.[mpc]'")
+            raise ConfigError(f"controller=mpc needs osqp: {how_to_install('mpc')}")
 
     @torch.compiler.disable
     def command(self, *entries: Tensor) -> tuple[Tensor, Tensor]:

@@ -68,7 +68,7 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
             module = str(value).rpartition(".")[0]
             raise ResultsError(
                 f"{where}: {key} names {value!r}, which is not part of lcc_rl; if you trust it, "
-                f"say trust=[{module}]"
+                f"say trust=[{module}] (of lcc-rl export: --trust {module})"
             )
 
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from torchrl.record.loggers import Logger
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, how_to_install
 
 KINDS = ("tensorboard", "wandb", "mlflow")
 Row = Mapping[str, float]
@@ -62,7 +62,7 @@ class RowLogger:
             logger = self._make(folder)
         except ImportError as error:
             raise ConfigError(
-                f"logger={self.kind} is not installed: pip install -e '.[{self.kind}]' ({error})"
+                f"logger={self.kind} is not installed: {how_to_install(self.kind)} ({error})"
             ) from error
         try:
             yield partial(_send, logger)

@@ -147,11 +147,22 @@ def test_a_setting_that_some_runs_of_a_sweep_lack_is_named(tmp_path) -> None:
 
 @pytest.mark.parametrize("entry", ["train", "evaluate", "calibrate", "pipeline"])
 def test_an_unknown_flag_is_one_line(tmp_path, entry) -> None:
-    done = run_command(f"lcc_rl.{entry}", "variant=idm", "--seed", "3", cwd=tmp_path)
+    # argparse would take --experiment for an abbreviation of a flag of Hydra's own
+    flag = "--experiment" if entry == "train" else "--seed"
+    done = run_command(f"lcc_rl.{entry}", "variant=idm", flag, "3", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr.startswith("lcc_rl: error: unknown flag --seed: settings are written key=")
+    assert done.stderr.startswith(f"lcc_rl: error: unknown flag {flag}: settings are written key=")
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("path", ["dir ü ñ/daten=ß,1.csv", "…", "a (copy).csv"])
+def test_a_word_that_cannot_be_read_is_said_in_quotes(tmp_path, path) -> None:
+    done = run_command("lcc_rl.train", f"data.path={path}", cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"quotes within quotes: \"data.path='{path}'\"" in done.stderr
+    assert "http" not in done.stderr
+    assert load("train", ["data=ngsim", f"data.path='{path}'"]).data.path == path
 
 
 # -- refused commands ------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import pytest
 import torch
-from commands import NO_AGENT, run_command, tiny
+from commands import DATA, NO_AGENT, run_command, tiny
 from omegaconf import OmegaConf
 from table_text import long_table
 
@@ -135,6 +135,15 @@ def test_a_pipeline_checks_its_parts_before_the_data(tmp_path, setting) -> None:
     done = run_command("lcc_rl.pipeline", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert f"{setting.split('=')[0]} must be a whole number from 1" in done.stderr
+
+
+def test_a_pipeline_splits_the_data_before_it_calibrates(tmp_path) -> None:
+    words = ("experiment=smoke", *DATA, "data.recordings=1", "hydra.run.dir=job")
+    done = run_command("lcc_rl.pipeline", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "by recording: only" in done.stderr
+    assert "say split=vehicle" in done.stderr
+    assert not (tmp_path / "job" / "calibration").exists()
 
 
 def test_more_samples_than_episodes_are_all_episodes(tmp_path) -> None:

@@ -15,9 +15,6 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 import lcc_rl.interfaces.gym  # noqa: E402
 
 SHORT = ["scenario.horizon=20", "data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
-if "lcc_rl/alcc-v0" not in gymnasium.registry:  # where the package is not installed anew
-    with gymnasium.envs.registration.namespace("lcc_rl"):
-        lcc_rl.interfaces.gym.register()
 
 
 @pytest.fixture(scope="module")

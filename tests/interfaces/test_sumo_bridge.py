@@ -221,7 +221,7 @@ def test_bad_input_is_one_clear_error(driver, step, expected, tmp_path) -> None:
         (["scenario.string=human*22"], "first vehicle alone is automated"),
         (["drivers=i80"], "drivers=fixed"),
         (["scenario.circumference=100"], "circumference must lie in"),
-        (["--seconds", "200"], "seconds must lie in"),
+        (["--seconds", "200"], "--seconds=200 ends before --from-s=300"),
     ],
 )
 def test_a_ring_that_cannot_be_simulated_is_one_clear_error(words, expected, tmp_path) -> None:

@@ -5,7 +5,8 @@ import pytest
 from rich.console import Console
 from study_frames import episodes
 
-from lcc_rl.results.main_page import AGAINST, as_rich, headline
+from lcc_rl.config import load
+from lcc_rl.results.main_page import AGAINST, CAPTION, as_rich, caption_of, headline
 from lcc_rl.results.tables import summary
 
 
@@ -39,3 +40,10 @@ def test_the_terminal_shows_a_dash_where_nothing_is_compared(found) -> None:
     assert "title [x]" in text
     assert "–" in text
     assert "nan" not in text
+
+
+def test_the_caption_says_what_limit_the_networks_keep() -> None:
+    limited = load("train", ["variant=alcc", "experiment=main"])
+    literal = load("train", ["variant=alcc"])
+    assert "agent.limits.efficiency=0.01 of the time" in caption_of([limited, literal])
+    assert caption_of([literal]) == CAPTION
