@@ -33,7 +33,7 @@ def test_without_the_extra_one_error_says_how_to_install_it(monkeypatch, tmp_pat
     monkeypatch.setattr(
         "lcc_rl.pieces.mpc.find_spec", lambda name: None if name == "osqp" else found(name)
     )
-    expected = r"^controller=mpc needs osqp: pip install -e '\.\[mpc\]'$"
+    expected = r"^controller=mpc needs osqp: pip install -e '\.\[mpc\]', or '<wheel>\[mpc\]' where"
     with pytest.raises(ConfigError, match=expected):
         MPC()
     # Before any data are read: there is no such file.
