@@ -105,6 +105,7 @@ def test_a_recipe_that_chooses_what_learns_is_refused_elsewhere(experiment, vari
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("experiment", "variant"),
     slow_but(
@@ -471,6 +472,7 @@ for room in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_every_room_can_be_entered_first() -> None:
     # A circular import shows only where no room is imported yet and the wrong one begins.
     rooms = [*ROOMS, "synthetic.stream", "studies.alcc", "studies.hcfs"]

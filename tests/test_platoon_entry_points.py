@@ -131,6 +131,7 @@ def test_evaluate_every_variant(trained, tmp_path) -> None:
     assert reward.idxmax() == "deadbeat oracle"
 
 
+@pytest.mark.slow
 def test_other_gains_stand_beside_the_named_ones(tmp_path) -> None:
     cfg = tiny("evaluate", "cacc", "gains.k4=1.1")
     rows = evaluation.run(cfg, tmp_path, quiet=True)

@@ -83,6 +83,7 @@ print("loaded:", *sys.modules, file=sys.stderr)
     assert out == "[3]\n"
 
 
+@pytest.mark.slow
 def test_a_training_loads_nothing_that_it_does_not_use(tmp_path) -> None:
     program = (
         "import sys, lcc_rl.commands.training; print('loaded:', *sys.modules, file=sys.stderr)"

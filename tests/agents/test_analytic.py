@@ -194,7 +194,8 @@ EARLY = (
 )
 
 
-@pytest.mark.parametrize("overrides", [pytest.param(EARLY, marks=pytest.mark.slow), WHOLE])
+@pytest.mark.slow
+@pytest.mark.parametrize("overrides", [EARLY, WHOLE])
 def test_learns_to_keep_going(tmp_path, overrides) -> None:
     rows = make(
         tmp_path,

@@ -87,6 +87,7 @@ LITERAL = (
 )
 
 
+@pytest.mark.slow
 def test_learning_starts_and_noise_falls_with_every_update(tmp_path) -> None:
     rows = make(tmp_path, *LITERAL).run()
     assert rows["updates"].tolist() == [max(0, 20 * n - 59) for n in range(1, 21)]
@@ -218,6 +219,7 @@ def test_an_unknown_collector_is_refused(tmp_path) -> None:
         make(tmp_path, "training.collector=ray")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicles", ["automated human", "(automated human)*2"])
 def test_torchrls_collector_gives_the_same_rows(tmp_path, vehicles) -> None:
     rows = [

@@ -50,6 +50,7 @@ def test_candidates_of_a_generation_drive_the_same_episodes(tmp_path) -> None:
     assert (rows["price_efficiency"].to_numpy().reshape(-1, 4).std(1) == 0.0).all()
 
 
+@pytest.mark.slow
 def test_it_finds_better_constants(tmp_path) -> None:
     # From a driver who keeps far too great a distance.
     loop = make(tmp_path, "agent.constants={time_gap: 4.0}", "training.episodes=640")

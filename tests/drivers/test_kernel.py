@@ -49,6 +49,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
+@pytest.mark.slow
 def test_what_was_compiled_is_found_again_and_a_damaged_file_is_no_harm(folder, expected, caplog):
     np.testing.assert_allclose(called(kernel.Kernel("float32")), expected, rtol=1e-5)
     (code,), (index,) = folder.rglob("*.nbc"), folder.rglob("*.nbi")

@@ -195,6 +195,7 @@ def test_a_resumed_evaluation_takes_no_other_settings(whole, tmp_path) -> None:
 # -- shards ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog) -> None:
     words = [*WORDS, BLOCK, "experiment=smoke", "data.platoons=2", "data.recordings=2"]
     words += ["data.duration_s=[32,40]", "scenario.horizon=40", "sweep=parts"]
@@ -293,6 +294,7 @@ def test_pairs_are_counted_with_their_repeat(tmp_path) -> None:
     assert row["drivers_worse_than_idm"] == 0.0  # driver 0 draws 4 and 3
 
 
+@pytest.mark.slow
 def test_many_rows_are_a_dataset_and_draw_no_figures(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("lcc_rl.io.files.FEW", 20)
     rows = evaluation.run(settings(BLOCK), tmp_path)

@@ -212,6 +212,7 @@ def test_no_collision_behind_measured_leaders(shared_data) -> None:
     assert series["gap"].min() > 0.0
 
 
+@pytest.mark.slow
 def test_without_the_cap_it_drives_through_its_predecessor() -> None:
     # The reward has no spacing term: an actor 10 cm/s too fast wins every frame against CACC.
     steady = leader(8.0 + 1.5 * torch.sin(T * torch.arange(651.0) / 3.0))
@@ -221,6 +222,7 @@ def test_without_the_cap_it_drives_through_its_predecessor() -> None:
     assert safe["gap"].min() > 0.4
 
 
+@pytest.mark.slow
 def test_a_spacing_weight_keeps_a_parent_that_drifts_at_its_place() -> None:
     # The same hasty actor, without the cap: the switch itself takes the rule before it is near.
     steady = leader(8.0 + 1.5 * torch.sin(T * torch.arange(651.0) / 3.0))

@@ -80,6 +80,7 @@ def test_a_delay_replays_the_same_law_on_what_was(model) -> None:
         assert torch.equal(data["next", "command", "human"][:, step], expected), step
 
 
+@pytest.mark.slow
 def test_a_delay_makes_a_string_less_stable() -> None:
     time = torch.arange(600) * 0.1
     dip = 15.0 - 3.0 * torch.exp(-(((time - 15.0) / 3.0) ** 2))

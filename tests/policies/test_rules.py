@@ -88,6 +88,7 @@ def test_the_agent_learns_the_constants_alone() -> None:
     assert [tuple(entry.shape) for entry in agent.policy.parameters()] == [(5,)]
 
 
+@pytest.mark.slow
 def test_a_rule_is_trained_stored_and_evaluated_like_a_network(tmp_path) -> None:
     words = ("agent=analytic", "agent.policy=residual_idm", "surrogates@agent=limits")
     small = ("agent.hidden=[8]", "training.segment=20", "training.environments=4")

@@ -55,6 +55,7 @@ def spread(speed: Tensor, first: float, last: float) -> Tensor:
     return speed[round(10 * first) : round(10 * last)].std(-1).mean(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("circumference", [230.0, 260.0])
 def test_a_wave_grows_by_itself(circumference) -> None:
     speed = speeds(300.0, circumference)

@@ -240,6 +240,7 @@ def test_formats_do_not_make_another_run() -> None:
     assert identity(one) == identity(other)
 
 
+@pytest.mark.slow
 def test_figures_of_a_run_with_pieces_of_ones_own_need_no_trust(tmp_path) -> None:
     write_parquet(episodes(), tmp_path / "episodes.parquet")
     both = pd.concat([steps(), steps().assign(strategy="reference")])
