@@ -17,7 +17,7 @@ run: $(STAMP)
 	$(BIN)/python -m lcc_rl.pipeline experiment=main $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
 
 test-all: lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
