@@ -27,7 +27,7 @@ extras: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[test,interfaces,docs,bench,sumo,sweeps]"
 
 coverage: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --cov $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --cov $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -21,8 +21,6 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
 
 CONSTANT = {"pkg", "structured"}  # schemes of files that no test writes
-
-
 LOADER = loader.ConfigLoaderImpl
 READ, CHOOSE, MERGE = (
     ConfigRepository.load_config,

@@ -49,7 +49,7 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     cfg = load("evaluate", ["task=ring-22"])
     ring = space_time(read_parquet(reference / RING), SHOWN, cfg, every=1)
     assert ring is not None
-    save(ring, figures / "ring.png")
+    save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
     save(figure_of_limits(reference / "limits"), figures / "limits.png")
     names = [*(f"{name}.png" for name in fleets.NAMES.values()), "ring.png", "limits.png"]
     return [page, *(figures / name for name in names)]

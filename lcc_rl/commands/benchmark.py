@@ -16,6 +16,7 @@ from shutil import which
 import pandas as pd
 import torch
 from rich.console import Console
+from rich.markup import escape
 
 from lcc_rl.benchmarks.calibrate import calibrate
 from lcc_rl.benchmarks.collect import collect
@@ -30,7 +31,7 @@ from lcc_rl.benchmarks.seeds import seeds
 from lcc_rl.benchmarks.sweep import sweep
 from lcc_rl.benchmarks.train import train
 from lcc_rl.benchmarks.update import update
-from lcc_rl.errors import LccError, unknown_name
+from lcc_rl.errors import LccError, how_to_install, unknown_name
 from lcc_rl.io.files import processor, write_parquet
 
 LISTED = (
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.width = max(console.width, 110)
     missing = [name for name in EXTRA if not installed(name)]
     if missing:
-        console.print(f"left out: {', '.join(missing)} (pip install -e '.\\[bench]')")
+        console.print(escape(f"left out: {', '.join(missing)} ({how_to_install('bench')})"))
     try:
         for name in options.names:
             if name not in BENCHMARKS:

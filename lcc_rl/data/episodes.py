@@ -65,8 +65,9 @@ def load_episodes(path: str | Path) -> tuple[pd.DataFrame, list[str]]:
     names = {old: new for old, new in ALIASES.items() if new not in frame.columns}
     frame = frame.rename(columns=names)
     lacking = [name for name in OPTIONAL if name not in frame.columns]
-    for name in set(COLUMNS) - set(OPTIONAL) - set(frame.columns):
-        raise _absent(name, str(path), [str(column) for column in frame.columns])
+    needed = [name for name in COLUMNS if name not in (*OPTIONAL, *frame.columns)]
+    if needed:
+        raise _absent(needed[0], str(path), [str(name) for name in frame.columns])
     placed = not set(POSITIONS) & set(lacking)
     filled = frame.assign(
         **{name: stem(path) if name == "recording" else 0.0 for name in lacking if len(frame)}
