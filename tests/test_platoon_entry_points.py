@@ -100,7 +100,7 @@ def test_with_a_spacing_term_a_platoon_keeps_its_gaps(tmp_path) -> None:
     short = ("training.episodes=7680", "evaluation.profiles=1", "evaluation.baselines=[]")
     words = ["variant=ddpg", "agent=analytic", "experiment=hcfs_spacing", "leader.cases={}", *short]
     rows = training.run(load("train", words), tmp_path, quiet=True)
-    whole = rows[rows["case"] == "full length"]
+    whole = rows[rows["case"] == "full length us06"]
     assert whole["frames"].min() > 2900
     assert whole["max_gap_error_m"].max() < 2.0
     assert whole["energy_ratio"].max() < 1.0

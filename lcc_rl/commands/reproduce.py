@@ -81,7 +81,7 @@ def concluded(
 def rewrite(arguments: argparse.Namespace, command: str) -> int:
     """Rewrite tables, figures and page of a study's folder."""
     study = read_notes(arguments.folder).get("study", "alcc")
-    log.info("wrote %s", REPORTS[study](arguments.folder, arguments.formats))
+    log.info("wrote %s", REPORTS[study](arguments.folder, arguments.formats, arguments.page))
     return 0
 
 
@@ -102,6 +102,7 @@ def parser() -> argparse.ArgumentParser:
     again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
     again.set_defaults(run=rewrite, overrides=[])
     again.add_argument("folder", type=Path)
+    again.add_argument("--page", type=Path, help="a Markdown page whose tables are written anew")
     listing(again, "--formats", (), OTHERS)
     return top
 

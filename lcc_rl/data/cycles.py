@@ -54,14 +54,14 @@ class Leaders:
         training: records to draw windows from.
         windows: held-out windows of one horizon.
         cases: named evaluation cases.
-        full_length: a whole held-out record; None for none.
+        full_length: whole held-out records.
         report: lines on what was read.
     """
 
     training: Profiles
     windows: Profiles
     cases: tuple[Case, ...] = ()
-    full_length: Case | None = None
+    full_length: tuple[Case, ...] = ()
     report: tuple[str, ...] = ()
 
 
@@ -130,6 +130,7 @@ def join(parts: Sequence[Profiles]) -> Profiles:
 # Settings of a stretch and of a case in the configuration.
 STRETCH = {"path", "scale", "from_s", "to_s"}
 CASE = {"path", "scale", "start_s", "followers"}
+WHOLE = "full length"  # a case that is a whole record, before the record's name
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class RecordLeaders:
         training: training stretches by name: ``path``, ``scale``, ``from_s``, ``to_s``.
         held_out: stretches that windows for evaluation are cut from, likewise.
         cases: by name (``case_1`` for "case 1"): ``path``, ``scale``, ``start_s``, ``followers``.
-        full_length: a stretch driven from end to end; None for none.
+        full_length: stretches driven from end to end, by name; None for none.
         least_variation: evaluation windows whose total speed change is below this are left out
             [m/s].
         path: default path of the stretches.
@@ -168,7 +169,7 @@ class RecordLeaders:
         Args:
             time_step: step of the scenario [s].
             horizon: steps of a window and of a case.
-            followers: vehicles of the full length; None reads neither that nor the cases.
+            followers: vehicles behind a whole record; None reads neither these nor the cases.
 
         Raises:
             DataError: if a record cannot be used, naming the file.
@@ -176,21 +177,27 @@ class RecordLeaders:
         """
         training = join(self._stretches("training", self.training, time_step))
         held_out = join(self._stretches("held_out", self.held_out, time_step))
-        whole = None
-        if self.full_length is not None and followers is not None:
-            settings = self._checked(self.full_length, "leader.full_length", STRETCH)
-            whole = Case("full length", stretch(time_step=time_step, **settings), followers)
         windows = varying(held_out.windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"]
         for group, profiles in (("training", training), ("held_out", held_out)):
             for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True):
                 report.append(f"{group}: {name}, {length * time_step:g} s")
-        nodes = {} if followers is None else self.cases
-        cases = (self._case(name, node, time_step, horizon) for name, node in nodes.items())
-        return Leaders(training, windows, tuple(cases), whole, tuple(report))
+        if followers is None:
+            return Leaders(training, windows, report=tuple(report))
+        whole = self._stretches("full_length", self.full_length or {}, time_step)
+        return Leaders(
+            training,
+            windows,
+            tuple(self._case(name, node, time_step, horizon) for name, node in self.cases.items()),
+            tuple(
+                Case(f"{WHOLE} {name}", profile, followers)
+                for name, profile in zip(self.full_length or {}, whole, strict=True)
+            ),
+            tuple(report),
+        )
 
     def _stretches(self, group: str, nodes: Mapping[str, Any], time_step: float) -> list[Profiles]:
-        if not nodes:
+        if not nodes and group != "full_length":
             raise ConfigError(f"leader.{group} names no record")
         return [
             stretch(time_step=time_step, **self._checked(node, f"leader.{group}.{name}", STRETCH))

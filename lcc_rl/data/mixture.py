@@ -64,6 +64,6 @@ class Mixture:
             replace(training, weights=torch.cat(each) if each else None),
             replace(windows, sources=names),
             tuple(case for one in found.values() for case in one.cases),
-            next((one.full_length for one in found.values() if one.full_length), None),
+            tuple(case for one in found.values() for case in one.full_length),
             tuple(f"{name}: {line}" for name, one in found.items() for line in one.report),
         )

@@ -33,7 +33,7 @@ class Inputs:
         population: the human drivers.
         report: what was read and dropped, as plain lines.
         cases: runs that are looked at closely.
-        full_length: a whole record to drive; None for none.
+        full_length: whole records to drive.
     """
 
     training: Profiles
@@ -41,7 +41,7 @@ class Inputs:
     population: Population
     report: tuple[str, ...] = ()
     cases: tuple[Case, ...] = ()
-    full_length: Case | None = None
+    full_length: tuple[Case, ...] = ()
 
     def to_learn_from(self) -> Profiles:
         """Return the profiles for training.

@@ -1,4 +1,4 @@
-"""Evaluation with one row per vehicle: cases, held-out windows and one whole record."""
+"""Evaluation with one row per vehicle: cases, held-out windows and whole records."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Series = dict[str, Tensor]
 def evaluate(
     strategy: Strategy, cfg: DictConfig, inputs: Inputs
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Drive one strategy through every case, the held-out windows and the whole record.
+    """Drive one strategy through every case, the held-out windows and the whole records.
 
     Returns:
         One row per run and vehicle, and the time series of the cases.
@@ -59,10 +59,9 @@ def evaluate(
 
 
 def cases_of(cfg: DictConfig, inputs: Inputs) -> list[Case]:
-    """Return what an evaluation drives: its cases, the held-out windows and one whole record."""
+    """Return what an evaluation drives: its cases, the held-out windows and whole records."""
     windows = Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))
-    whole = [inputs.full_length] if inputs.full_length and cfg.evaluation.full_length else []
-    return [*inputs.cases, windows, *whole]
+    return [*inputs.cases, windows, *(inputs.full_length if cfg.evaluation.full_length else ())]
 
 
 def check_cases(cfg: DictConfig, inputs: Inputs) -> None:

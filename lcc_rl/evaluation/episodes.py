@@ -282,8 +282,9 @@ def needed(
     if settings.rows == "episodes":
         count = plan_of(cfg, inputs).size
     steps = cfg.scenario.horizon
-    if settings.full_length and inputs.full_length and inputs.full_length.horizon > count * steps:
-        count, steps = 1, inputs.full_length.horizon
+    longest = max((case.horizon for case in inputs.full_length), default=0)
+    if settings.full_length and longest > count * steps:
+        count, steps = 1, longest
     what = f"an evaluation of {count} episodes of {steps} steps side by side"
     return {what: count * copies * size * steps}
 

@@ -46,12 +46,20 @@ def mean(values: ArrayLike) -> Estimate:
     return Estimate(_mean(numbers), float(low), float(high))
 
 
+def crossed(values: ArrayLike) -> Estimate:
+    """Return the mean of ``[windows, seeds]`` with its interval, resampled as in :func:`saving`."""
+    table = np.asarray(values, dtype=np.float64)
+    if max(table.shape) < 2:
+        return Estimate(_mean(table), np.nan, np.nan)
+    return Estimate(_mean(table), *bounds(_means(table, 1)))
+
+
 def share_saved(value: Any, baseline: Any) -> Any:
     """Return the saved share of a baseline's energy, also where that is negative (recuperation)."""
     return (baseline - value) / abs(baseline)
 
 
-def saving(values: ArrayLike, baseline: ArrayLike) -> Estimate:
+def saving(values: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Estimate:
     """Return the share saved by the mean against that of a baseline, see :func:`share_saved`.
 
     A clustered bootstrap: held-out windows and training seeds are resampled crosswise (the
@@ -65,6 +73,7 @@ def saving(values: ArrayLike, baseline: ArrayLike) -> Estimate:
         values: mean energy over all drivers, ``[windows, seeds]``.
         baseline: that of the baseline in the same windows, ``[windows, its seeds]``; of one that
             was not trained (a human driver) a single column.
+        paired: column by column, both sides come from the same training.
 
     Returns:
         The share with its interval; without one where there is one window and one seed of each.
@@ -74,12 +83,13 @@ def saving(values: ArrayLike, baseline: ArrayLike) -> Estimate:
     value = share_saved(_mean(own), _mean(other))
     if max(*own.shape, *other.shape) < 2:
         return Estimate(value, np.nan, np.nan)
-    windows = weights(len(own), 0)
-    means = [
-        ((windows @ side) * weights(side.shape[1], stream)).sum(1)
-        for stream, side in enumerate((own, other), 1)
-    ]
+    means = _means(own, 1), _means(other, 1 if paired else 2)
     return Estimate(value, *bounds(share_saved(*means)))
+
+
+def _means(table: NDArray[np.float64], stream: int) -> NDArray[np.float64]:
+    """Return the resampled means of ``[windows, seeds]``; a stream draws its own seeds."""
+    return ((weights(len(table), 0) @ table) * weights(table.shape[1], stream)).sum(1)
 
 
 def bounds(resampled: NDArray[np.float64]) -> tuple[float, float]:

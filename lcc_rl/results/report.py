@@ -191,6 +191,14 @@ def _table(caption: str, frame: pd.DataFrame) -> str:
     )
 
 
+def as_markdown(frame: pd.DataFrame) -> str:
+    """Return a table for a Markdown page, with the headings and cells of :func:`write_report`."""
+    shown = [str(name) for name in frame if not _is_bound(frame, str(name))]
+    cells = zip(*(column_cells(frame, name) for name in shown), strict=True)
+    rows = [[heading(name) for name in shown], ["---"] * len(shown), *map(list, cells)]
+    return "\n".join("| " + " | ".join(row).replace("|e_v|", "abs e_v") + " |" for row in rows)
+
+
 def heading(column: str) -> str:
     """Return a column's name for readers: ``"total_energy_kj"`` → ``"total energy [kJ]"``."""
     for suffix, unit in sorted(UNITS.items(), key=lambda item: -len(item[0])):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
 
+from lcc_rl.errors import ResultsError
+from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.drawing import save
-from lcc_rl.results.report import Section, made, write_report
+from lcc_rl.results.report import Section, as_markdown, made, write_report
 from lcc_rl.studies.runner import read_notes
+
+MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 
 
 class Page:
@@ -25,6 +30,7 @@ class Page:
     def __init__(self, folder: str | Path, formats: Iterable[str] = ()) -> None:
         self.folder, self.formats = Path(folder), tuple(formats)
         self.sections: list[Section] = []
+        self.tables: dict[str, pd.DataFrame] = {}
 
     def add(
         self,
@@ -48,10 +54,28 @@ class Page:
         for name, caption, frame in tables:
             write_parquet(frame, self.folder / "tables" / f"{name}.parquet")
             shown.append((caption, frame))
+            self.tables[name] = frame
         for name, caption, figure in figures:
             place = self.folder / "figures" / f"{name}.png"
             drawn.append((caption, save(figure, place, dpi=130, formats=self.formats)))
         self.sections.append(Section(heading, text, shown, drawn))
+
+    def fill(self, page: Path) -> None:
+        """Write tables into a Markdown file, between ``<!-- table: name -->`` and ``<!-- end -->``.
+
+        Raises:
+            ResultsError: if a marked table is none of the page's, or the file cannot be written.
+        """
+
+        def table(found: re.Match[str]) -> str:
+            begin, name, end = found.groups()
+            if name not in self.tables:
+                raise ResultsError(f"{page}: no table {name!r}; known: {', '.join(self.tables)}")
+            return f"{begin}\n\n{as_markdown(self.tables[name])}\n\n{end}"
+
+        text = MARKED.sub(table, page.read_text())
+        with atomic_path(page) as part:
+            part.write_text(text)
 
     def write(self, title: str, details: Sequence[tuple[str, str]], more: str = "") -> Path:
         """Add how the study was made, and write ``report.html``.

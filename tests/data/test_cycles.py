@@ -133,7 +133,7 @@ def test_measured_leaders(shared_data) -> None:
     cfg = load("train", ["variant=cacc", "leader=openacc", f"leader.path='{path}'"])
     inputs = load_inputs(cfg)
     assert len(inputs.evaluation) > 5
-    assert inputs.full_length is not None
+    assert [case.name for case in inputs.full_length] == ["full length record"]
 
 
 def test_leaders_of_recorded_trajectories() -> None:
@@ -159,4 +159,4 @@ def test_a_node_builds_its_own_leaders() -> None:
     )
     built = build(node, "leader")
     assert isinstance(built, RecordLeaders)
-    assert built.load(0.2, 100, 3).full_length is None
+    assert not built.load(0.2, 100, 3).full_length

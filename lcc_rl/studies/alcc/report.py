@@ -30,7 +30,9 @@ ITSELF = "none (the recipe itself)"
 NO_FILTER = "without"
 
 
-def write_results(folder: str | Path, formats: Iterable[str] = ()) -> Path:
+def write_results(
+    folder: str | Path, formats: Iterable[str] = (), target: Path | None = None
+) -> Path:
     """Write tables/*.parquet, figures/*.png and report.html from a study's parquet files alone.
 
     Sections whose runs do not exist are left out.
@@ -38,6 +40,7 @@ def write_results(folder: str | Path, formats: Iterable[str] = ()) -> Path:
     Args:
         folder: a study's folder, written by ``lcc-rl reproduce alcc``.
         formats: further formats of the figures.
+        target: Markdown file whose marked tables are written anew, too.
 
     Returns:
         The page's path.
@@ -52,6 +55,8 @@ def write_results(folder: str | Path, formats: Iterable[str] = ()) -> Path:
         )
     for add in (add_main, _filter, _learning, _ablations, _single, _followers, _people):
         add(page)
+    if target is not None:
+        page.fill(target)
     return _made(page)
 
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from omegaconf import DictConfig
 
 from lcc_rl.commands.evaluation import evaluate_and_write
-from lcc_rl.commands.pipeline import known_settings
+from lcc_rl.commands.pipeline import known_settings, root_key
 from lcc_rl.config import load, plain
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.fit import check_policy
@@ -21,9 +22,11 @@ from lcc_rl.evaluation.strategies import (
     driven_by,
     with_weights,
 )
+from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.precision import prepare_torch
+from lcc_rl.studies.hcfs.tables import per_run, rounded
 from lcc_rl.studies.runner import (
     EPISODES,
     FINISHED,
@@ -41,6 +44,10 @@ log = logging.getLogger("lcc_rl")
 LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
 BASELINES = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
+TRAINING = "training.parquet"
+STEPS = "steps.parquet"
+# A second whole record beside the default leader's.
+WLTC = "+leader.full_length.wltc={path: wltc_3b, scale: 0.5}"
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,9 @@ class Study(BaseStudy):
     def evaluation(self, *own: str) -> DictConfig:
         """Return the configuration of an evaluation of the hybrid."""
         shared = known_settings(list(self.overrides), "evaluate")
-        return load("evaluate", [f"experiment={self.recipe}", "variant=hcfs", *shared, *own])
+        more = () if any(root_key(item) == "leader" for item in self.overrides) else (WLTC,)
+        words = [f"experiment={self.recipe}", "variant=hcfs", *more, *shared, *own]
+        return load("evaluate", words)
 
 
 def run(study: Study, command: str = "") -> list[Outcome]:
@@ -90,18 +99,36 @@ def run(study: Study, command: str = "") -> list[Outcome]:
     target = study.folder / "evaluation"
     _evaluate(baselines(cfg), cfg, inputs, target / BASELINES)
     done = [outcome.run.folder for outcome in outcomes if outcome.status == FINISHED]
-    for number, folder in enumerate(sorted(done)):
-        # Of the trainings only the first drives the full-length record, which takes long.
-        own = study.evaluation(
-            f"policy='{folder}'", *(() if number == 0 else ("evaluation.full_length=false",))
-        )
+    for folder in sorted(done):
+        own = study.evaluation(f"policy='{folder}'")
         weights, trained = load_policy(folder)
         check_policy(own, trained)
         own.agent = trained.agent
         learned = with_weights(own, weights, trained.seed, str(folder), inputs.population)
         strategies = hybrid_strategies(own, learned)
         _evaluate(strategies, own, inputs, target / folder.name, folder)
+    keep(study.folder, sorted(done))
     return outcomes
+
+
+def keep(folder: Path, trainings: Sequence[Path]) -> None:
+    """Write what the page is made of: a row per run, the cases over time, the learning curves.
+
+    Of the cases over time, those of the first training.
+    """
+    root = folder / "evaluation"
+    seeds = [root / path.name for path in trainings]
+    found = [read_parquet(path / EPISODES) for path in (root / BASELINES, *seeds)]
+    write_parquet(per_run(pd.concat(found, ignore_index=True)), folder / EPISODES)
+    found = [read_parquet(path / STEPS) for path in (root / BASELINES, *seeds[:1])]
+    write_parquet(rounded(pd.concat(found, ignore_index=True)), folder / STEPS)
+    found = [
+        read_parquet(path / TRAINING)[["episodes", "episode_reward"]].assign(
+            variant=LEARNED, seed=int(path.name.removeprefix("seed_"))
+        )
+        for path in trainings
+    ]
+    write_parquet(rounded(pd.concat(found, ignore_index=True)), folder / TRAINING)
 
 
 def hybrid_strategies(cfg: DictConfig, learned: Strategy) -> list[Strategy]:

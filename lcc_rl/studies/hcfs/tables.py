@@ -7,8 +7,11 @@ from collections.abc import Sequence
 import pandas as pd
 import torch
 
+from lcc_rl.data.cycles import WHOLE
+from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import intervals
+from lcc_rl.results.string_tables import COUNTS, case_table
 
 # What the paper prints in Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.
 TABLE_IV = {
@@ -16,6 +19,24 @@ TABLE_IV = {
     "DDPG": (146.22, 0.16, 2344.60, -56.81),
     "HCFS": (25.26, 0.04, 192.19, -9.64),
 }
+CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
+RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
+SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
+SUMS += ["collided", *COUNTS]
+LARGEST = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
+
+
+def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Sum the rows of the vehicles of each run; :func:`case_table` reads the result alike."""
+    how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST, "max")}
+    how |= {"min_gap_m": "min", "learned_share": "mean"}
+    return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(how)
+
+
+def rounded(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table whose numbers have the precision that a figure shows."""
+    numbers = frame.select_dtypes("number").columns
+    return frame.assign(**frame[numbers].astype("float32").round(3))
 
 
 def printed() -> pd.DataFrame:
@@ -47,7 +68,7 @@ def win_rates(
     episodes: pd.DataFrame,
     of: str = "hcfs",
     against: Sequence[str] | None = None,
-    case: str = "windows",
+    case: str = WINDOWS,
 ) -> pd.DataFrame:
     """Compare a strategy with others on the same windows.
 
@@ -59,8 +80,9 @@ def win_rates(
 
     Returns:
         One row per other strategy: share of windows [%] in which ``of`` earns more (a tie counts
-        half) and mean difference of Σ reward, the means over seeds with their 95 % intervals.
-        Trained strategies are compared seed by seed.
+        half), mean difference of Σ reward, and that as a share of what the other loses [%], with
+        95 % intervals over windows and seeds. Trained strategies are compared seed by seed;
+        ``seeds_ahead`` counts the seeds with a positive difference.
     """
     own = rewards(episodes, of, case)
     names = [n for n in dict.fromkeys(episodes["strategy"]) if n != of]
@@ -72,14 +94,80 @@ def win_rates(
         shared = own.columns.intersection(other.columns)
         difference = own[shared] - other[shared]
         wins = (difference > 1e-6) + 0.5 * (difference.abs() <= 1e-6)
+        # Rewards are negative: what is saved of the loss.
+        gain = intervals.saving(-own[shared], -other[shared], paired=True)
         rows.append(
             {
                 "strategy": of,
                 "against": name,
                 "trainings": len(shared),
                 "windows": len(difference),
-                **intervals.mean(wins.mean()).columns("wins_pct", 100.0),
-                **intervals.mean(difference.mean()).columns("reward_gain"),
+                **intervals.crossed(wins).columns("wins_pct", 100.0),
+                **intervals.crossed(difference).columns("reward_gain"),
+                **gain.columns("gain_pct", 100.0),
+                "seeds_ahead": int((difference.mean() > 0).sum()),
             }
         )
+    return pd.DataFrame(rows)
+
+
+def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs") -> pd.DataFrame:
+    """Return errors, jerk and reward of strategies on the held-out windows, and what ``of`` gains.
+
+    Intervals are over windows and, where something was learned, seeds.
+    """
+    table = case_table(episodes, WINDOWS).set_index("strategy").loc[list(strategies)]
+    against = win_rates(episodes, of, [s for s in strategies if s != of]).set_index("against")
+    rows = [
+        {
+            "strategy": name,
+            "speed_error_sum_mps": table.at[name, "speed_error_sum_mps"],
+            "jerk_sum_mps3": table.at[name, "jerk_sum_mps3"],
+            **intervals.crossed(rewards(episodes, name, WINDOWS)).columns("Σ reward"),
+        }
+        for name in strategies
+    ]
+    gained = against.reindex(list(strategies)).reset_index(drop=True)
+    columns = {
+        str(name): str(name).replace("wins", f"{of} wins").replace("gain", f"{of} gains")
+        for name in gained
+        if str(name).startswith(("wins", "gain"))
+    }
+    return pd.concat([pd.DataFrame(rows), gained[list(columns)].rename(columns=columns)], axis=1)
+
+
+def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]) -> pd.DataFrame:
+    """Return Σ reward by strategy and case, with intervals over seeds, beside the printed ones."""
+    tables = {case: case_table(episodes, case).set_index("strategy") for case in cases}
+    rows = []
+    for name in like:
+        row: dict[str, object] = {"strategy": name}
+        for case, table in tables.items():
+            for end in ("", "_low", "_high"):
+                row[f"{case}{end}"] = table.at[name, f"reward{end}"]
+        rows.append(row)
+    for name, (*_, reward) in TABLE_IV.items():
+        rows.append({"strategy": f"{name}, paper", "case 1": reward, "case 3": CASE_3[name]})
+    return pd.DataFrame(rows)
+
+
+def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataFrame:
+    """Return reward, with the least and most of the seeds, and safety over whole records."""
+    rows = []
+    for case in (c for c in dict.fromkeys(episodes["case"]) if str(c).startswith(WHOLE)):
+        for name in strategies:
+            runs = episodes[(episodes["case"] == case) & (episodes["strategy"] == name)]
+            if len(runs):
+                rows.append(
+                    {
+                        "record": case.removeprefix(WHOLE).strip(),
+                        "strategy": name,
+                        "reward": runs["reward"].mean(),
+                        "reward_low": runs["reward"].min(),
+                        "reward_high": runs["reward"].max(),
+                        "smallest gap_m": runs["min_gap_m"].min(),
+                        "seeds that collide": f"{(runs['collided'] > 0).sum()} of {len(runs)}",
+                        "string ratio": runs["energy_ratio"].max(),
+                    }
+                )
     return pd.DataFrame(rows)
