@@ -111,7 +111,7 @@ SHOWN = ("index", "tasks", "limits", "alcc", "sweeps", "reference/api", "referen
 
 
 @pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="no Chromium")
-@pytest.mark.parametrize("page", [*SHOWN, "reports/alcc_i80", "reports/hcfs", "report"])
+@pytest.mark.parametrize("page", [*SHOWN, "reports/hcfs", "report"])
 def test_a_page_fits_the_width_and_reports_no_error(page, address, tmp_path) -> None:
     browser = next(filter(None, map(shutil.which, BROWSERS)))
     quiet = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars")

@@ -1,12 +1,14 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
-The tables of docs/tasks.md, and of docs/figures: fleets.png, fleets_ring.png, ring.png and
-limits.png. The other figures are drawn from runs that were not kept, or from recorded data.
+The tables of docs/tasks.md and docs/hcfs.md, docs/reports, and of docs/figures: fleets.png,
+fleets_ring.png, ring.png and limits.png. The other figures are drawn from runs that were not kept,
+or from recorded data.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +22,7 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
 from lcc_rl.runs.cli import main_guard
+from lcc_rl.studies.hcfs import report as hcfs_report
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 RING = "tasks/ring_steps.parquet"
@@ -55,6 +58,14 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     return [page, *(figures / name for name in names)]
 
 
+def redraw_hcfs(reference: Path, docs: Path) -> list[Path]:
+    """Write the tables of the study's page, and the page of its figures; return the files."""
+    page, report = docs / "hcfs.md", docs / "reports" / "hcfs.html"
+    report.parent.mkdir(exist_ok=True)
+    shutil.copyfile(hcfs_report.write_results(reference / "hcfs", page=page), report)
+    return [page, report]
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Draw again."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -66,6 +77,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.ring is not None:
         keep_ring(options.ring, options.reference / RING)
     print(*redraw(options.reference, options.figures, Path(options.page)), sep="\n")
+    print(*redraw_hcfs(options.reference, Path(options.page).parent), sep="\n")
     return 0
 
 

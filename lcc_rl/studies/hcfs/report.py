@@ -13,18 +13,21 @@ from lcc_rl.results import string_figures
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.training_figures import learning_curve
 from lcc_rl.studies.hcfs import tables
-from lcc_rl.studies.hcfs.study import LEARNED, STEPS, TRAINING
+from lcc_rl.studies.hcfs.study import STEPS, TRAINING
+from lcc_rl.studies.hcfs.tables import LEARNED
 from lcc_rl.studies.page import Page
 from lcc_rl.studies.runner import EPISODES
 
+LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
 TITLE = "Hybrid Car-Following Strategy: the study"
 CASES = {"case 1": "Table IV", "case 2": "Table V", "case 3": "Table VI"}
 RULES = ("cacc path", "cacc paper_like", "cacc tuned")
 HYBRIDS = ("hcfs", "hcfs oracle", "hcfs untuned")
+PARENTS = ("cacc tuned", LEARNED)
 BOUNDS = ("deadbeat", "deadbeat oracle")
 STRATEGIES = (*RULES, LEARNED, *HYBRIDS, *BOUNDS)
 IN_CASES = ("cacc paper_like", "cacc tuned", LEARNED, "hcfs", "hcfs untuned", "deadbeat")
-WHOLE = ("cacc tuned", LEARNED, "hcfs", "hcfs J=10", "hcfs literal", "hcfs oracle", "deadbeat")
+WHOLE = ("cacc tuned", LEARNED, "hcfs", "hcfs literal", "deadbeat")
 
 
 def write_results(
@@ -51,17 +54,7 @@ def write_results(
     for case in CASES:
         _case(made, episodes, steps, case)
     _whole(made, episodes)
-    made.add(
-        "Training of the DDPG parent",
-        "",
-        figures=[
-            (
-                "learning_curve",
-                "Learning curve",
-                learning_curve(read_parquet(made.folder / TRAINING)),
-            )
-        ],
-    )
+    _training(made)
     text = """The weights of the reward are not printed. Table IV determines them: the sums of
         errors and jerks printed there give its sums of reward within 0.1."""
     shown = ("weights", "Σ reward from Σ|e_v| and Σ|jerk|", tables.weights())
@@ -69,6 +62,17 @@ def write_results(
     if page is not None:
         made.fill(page)
     return made.write(TITLE, ())
+
+
+def _training(made: Page) -> None:
+    text, listed = "", []
+    if (made.folder / LENGTHS).exists():  # only where several studies were put side by side
+        text = "The same study with trainings of other lengths; intervals over windows and seeds."
+        table = tables.lengths(read_parquet(made.folder / LENGTHS))
+        listed.append(("lengths", "Σ reward per window by the length of the training", table))
+    curve = learning_curve(read_parquet(made.folder / TRAINING))
+    drawn = [("learning_curve", "Learning curve", curve)]
+    made.add("Training of the DDPG parent", text, listed, drawn)
 
 
 def _windows(made: Page, episodes: pd.DataFrame) -> None:
@@ -85,7 +89,7 @@ def _windows(made: Page, episodes: pd.DataFrame) -> None:
         the leader's next speed."""
     untuned = tables.win_rates(episodes, "hcfs untuned", ["cacc paper_like", LEARNED, "hcfs"])
     listed = [
-        ("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES)),
+        ("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES[:-1])),
         ("win_rates", "HCFS (rule: CACC tuned) against every other", gained),
         ("win_rates_untuned", "HCFS with the CACC of Table IV", untuned),
         ("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOWS)),
@@ -125,5 +129,8 @@ def _whole(made: Page, episodes: pd.DataFrame) -> None:
         energy of the speed error to the predecessor over that of the vehicle ahead: above 1 a
         disturbance grows along the string. The literal rule has neither the clamp to the jerk
         bound of 10 m/s³ nor the safe cap."""
-    listed = [("whole", "Σ reward over whole records", tables.whole_records(episodes, WHOLE))]
+    listed = [
+        ("whole", "Σ reward over whole records", tables.whole_records(episodes, WHOLE)),
+        ("whole_gains", "HCFS against its parents", tables.whole_gains(episodes, PARENTS)),
+    ]
     made.add("Whole records", text, listed)

@@ -26,7 +26,7 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.studies.hcfs.tables import per_run, rounded
+from lcc_rl.studies.hcfs.tables import LEARNED, per_run, rounded
 from lcc_rl.studies.runner import (
     EPISODES,
     FINISHED,
@@ -41,7 +41,6 @@ from lcc_rl.studies.runner import (
 
 log = logging.getLogger("lcc_rl")
 
-LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
 BASELINES = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
 TRAINING = "training.parquet"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import pandas as pd
 import torch
 
@@ -13,6 +14,7 @@ from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import intervals
 from lcc_rl.results.string_tables import COUNTS, case_table
 
+LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
 # What the paper prints in Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.
 TABLE_IV = {
     "CACC": (159.39, 0.22, 720.06, -59.70),
@@ -20,6 +22,18 @@ TABLE_IV = {
     "HCFS": (25.26, 0.04, 192.19, -9.64),
 }
 CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
+NAMES = {  # of strategies, for readers
+    "cacc path": "CACC, PATH gains",
+    "cacc paper_like": "CACC, fitted to Table IV",
+    "cacc tuned": "CACC, tuned",
+    "ddpg": "DDPG",
+    "hcfs": "HCFS",
+    "hcfs J=10": "HCFS, J = 10",
+    "hcfs literal": "HCFS, literal",
+    "hcfs oracle": "HCFS, oracle",
+    "hcfs untuned": "HCFS of the fitted CACC",
+    "deadbeat": "dead-beat, nothing learned",
+}
 RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
 SUMS += ["collided", *COUNTS]
@@ -120,20 +134,39 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
     against = win_rates(episodes, of, [s for s in strategies if s != of]).set_index("against")
     rows = [
         {
-            "strategy": name,
-            "speed_error_sum_mps": table.at[name, "speed_error_sum_mps"],
-            "jerk_sum_mps3": table.at[name, "jerk_sum_mps3"],
+            "strategy": NAMES[name],
+            "Σ abs e_v_mps": table.at[name, "speed_error_sum_mps"],
+            "Σ abs jerk_mps3": table.at[name, "jerk_sum_mps3"],
             **intervals.crossed(rewards(episodes, name, WINDOWS)).columns("Σ reward"),
         }
         for name in strategies
     ]
     gained = against.reindex(list(strategies)).reset_index(drop=True)
     columns = {
-        str(name): str(name).replace("wins", f"{of} wins").replace("gain", f"{of} gains")
+        str(name): str(name).replace("wins", "HCFS wins").replace("gain", "HCFS gains")
         for name in gained
         if str(name).startswith(("wins", "gain"))
     }
     return pd.concat([pd.DataFrame(rows), gained[list(columns)].rename(columns=columns)], axis=1)
+
+
+def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
+    """Return what HCFS gains on its parents over whole records, with intervals over seeds."""
+    cases = [c for c in map(str, dict.fromkeys(episodes["case"])) if c.startswith(WHOLE)]
+    rows = []
+    for case in cases:
+        table = win_rates(episodes, against=parents, case=case).set_index("against")
+        for name in parents:
+            row: dict[str, object] = {"record": _record(case), "against": NAMES[name]}
+            for end in ("", "_low", "_high"):
+                row[f"HCFS gains_pct{end}"] = table.at[name, f"gain_pct{end}"]
+            row["seeds ahead"] = table.at[name, "seeds_ahead"]
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _record(case: str) -> str:
+    return case.removeprefix(WHOLE).strip().upper()
 
 
 def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]) -> pd.DataFrame:
@@ -141,7 +174,7 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     tables = {case: case_table(episodes, case).set_index("strategy") for case in cases}
     rows = []
     for name in like:
-        row: dict[str, object] = {"strategy": name}
+        row: dict[str, object] = {"strategy": NAMES[name]}
         for case, table in tables.items():
             for end in ("", "_low", "_high"):
                 row[f"{case}{end}"] = table.at[name, f"reward{end}"]
@@ -151,22 +184,47 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     return pd.DataFrame(rows)
 
 
+def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
+    """Return Σ reward per window of DDPG and HCFS by the length of DDPG's training.
+
+    Args:
+        rewards_by_length: rows of the windows of several studies, with ``training_episodes``.
+    """
+    rows = []
+    for episodes, group in rewards_by_length.groupby("training_episodes"):
+        parent = win_rates(group, against=[LEARNED])
+        rows.append(
+            {
+                "episodes of training": episodes,
+                "trainings": parent["trainings"].iloc[0],
+                **intervals.crossed(rewards(group, LEARNED, WINDOWS)).columns("DDPG"),
+                **intervals.crossed(rewards(group, "hcfs", WINDOWS)).columns("HCFS"),
+                **{
+                    column.replace("gain", "HCFS gains"): parent[column].iloc[0]
+                    for column in ("gain_pct", "gain_pct_low", "gain_pct_high")
+                },
+            }
+        )
+    return pd.DataFrame(rows)
+
+
 def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataFrame:
     """Return reward, with the least and most of the seeds, and safety over whole records."""
     rows = []
     for case in (c for c in dict.fromkeys(episodes["case"]) if str(c).startswith(WHOLE)):
         for name in strategies:
             runs = episodes[(episodes["case"] == case) & (episodes["strategy"] == name)]
+            many = len(runs) > 1
             if len(runs):
                 rows.append(
                     {
-                        "record": case.removeprefix(WHOLE).strip(),
-                        "strategy": name,
-                        "reward": runs["reward"].mean(),
-                        "reward_low": runs["reward"].min(),
-                        "reward_high": runs["reward"].max(),
+                        "record": _record(str(case)),
+                        "strategy": NAMES[name],
+                        "Σ reward": runs["reward"].mean(),
+                        "Σ reward_low": runs["reward"].min() if many else np.nan,
+                        "Σ reward_high": runs["reward"].max() if many else np.nan,
                         "smallest gap_m": runs["min_gap_m"].min(),
-                        "seeds that collide": f"{(runs['collided'] > 0).sum()} of {len(runs)}",
+                        "runs that collide": f"{(runs['collided'] > 0).sum()} of {len(runs)}",
                         "string ratio": runs["energy_ratio"].max(),
                     }
                 )
