@@ -226,7 +226,7 @@ def _is_number(values: pd.Series) -> bool:
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
     """Return the cells of a column as text, with its interval where the frame has one."""
     values = frame[name]
-    places = frame.attrs.get("decimals", min(_places(values), 1 if name.endswith("_pct") else 4))
+    places = frame.attrs.get("decimals", _places(values))
     cells = [_cell(value, places) for value in values]
     if f"{name}_low" not in frame:
         return cells
