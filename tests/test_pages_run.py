@@ -33,6 +33,7 @@ NOT_RUN = {
     "lcc-rl animate": "tests/results/test_animation.py runs it",
     "lcc-rl benchmark": "tests/tools/test_benchmark.py runs it",
     "python tools/compare_agents.py": "tests/tools/test_compare_agents.py runs it",
+    "python tools/compare_lengths.py": "tests/tools/test_compare_lengths.py runs it",
     "python tools/compare_launchers.py": "runs of every launcher, of extras",
     "ray-environment/bin/python": "needs the extra ray",
     "python tools/kill_test.py": "takes an hour",

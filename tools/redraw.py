@@ -1,8 +1,8 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
-The tables of docs/tasks.md and docs/hcfs.md, docs/reports, and of docs/figures: fleets.png,
-fleets_ring.png, ring.png and limits.png. The other figures are drawn from runs that were not kept,
-or from recorded data.
+The tables of docs/tasks.md and docs/hcfs.md, docs/reports, and of docs/figures: calibration.png,
+fleets.png, fleets_ring.png, limits.png, record.png and ring.png. The other figures are drawn from
+runs that were not kept, or from recorded data.
 """
 
 from __future__ import annotations
@@ -15,12 +15,17 @@ from pathlib import Path
 
 import fleets
 import leaderboard
+from compare_lengths import figure_of_lengths
 from limit_results import figure_of_limits
+from matplotlib.figure import Figure
 
-from lcc_rl.config import load, require
+from lcc_rl.config import build, load, require
+from lcc_rl.data.cycles import stretch
+from lcc_rl.envs.inputs import string_of
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
+from lcc_rl.results.string_figures import record_figure
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.studies.hcfs import report as hcfs_report
 
@@ -42,6 +47,14 @@ def keep_ring(run: Path, path: Path) -> None:
     write_parquet(kept.reset_index(drop=True), path)
 
 
+def figure_of_record() -> Figure:
+    """Draw the speed record that platoons train on, and their test cases."""
+    cfg = load("evaluate", ["variant=cacc"])
+    step, used = cfg.scenario.time_step, cfg.leader.training.udds
+    leaders = build(cfg.leader, "leader").load(step, cfg.scenario.horizon, len(string_of(cfg)))
+    return record_figure(stretch(used.path, step, used.scale), used.from_s, leaders.cases)
+
+
 def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     """Write the tables into the page and the figures; return the files written."""
     code = leaderboard.main(["--reference", str(reference / "tasks"), "--page", str(page)])
@@ -53,8 +66,14 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     ring = space_time(read_parquet(reference / RING), SHOWN, cfg, every=1)
     assert ring is not None
     save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
-    save(figure_of_limits(reference / "limits"), figures / "limits.png")
-    names = [*(f"{name}.png" for name in fleets.NAMES.values()), "ring.png", "limits.png"]
+    drawn = {
+        "limits.png": figure_of_limits(reference / "limits"),
+        "record.png": figure_of_record(),
+        "calibration.png": figure_of_lengths(read_parquet(reference / "calibration.parquet")),
+    }
+    for name, figure in drawn.items():
+        save(figure, figures / name)
+    names = [*(f"{name}.png" for name in fleets.NAMES.values()), "ring.png", *drawn]
     return [page, *(figures / name for name in names)]
 
 

@@ -132,12 +132,17 @@ class Gains:
 
 
 def cacc_acceleration(
-    errors: Errors, gains: Gains, time_step: float, max_acceleration: float
+    errors: Errors,
+    gains: Gains,
+    time_step: float,
+    max_acceleration: float,
+    speed: Tensor | None = None,
 ) -> Tensor:
     """Compute the acceleration of the CACC law (H11), ``[*batch, N, 1]`` [m/s²].
 
     H11 is dimensionally a speed command, v_cmd = v_i + k1 e_x(i,i−1) + k2 e_v(i,i−1) +
-    k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = clip((v_cmd − v_i)/T, ±a_max).
+    k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = clip((v_cmd − v_i)/T, ±a_max). With
+    ``speed``, v_i, the law is as printed, where v_cmd is the acceleration: a = clip(v_cmd, ±a_max).
     """
     change = (
         gains.k1 * errors.gap
@@ -145,7 +150,8 @@ def cacc_acceleration(
         + gains.k3 * errors.leader_gap
         + gains.k4 * errors.leader_speed
     )
-    return (change / time_step).clamp(-max_acceleration, max_acceleration)
+    wanted = change / time_step if speed is None else speed + change
+    return wanted.clamp(-max_acceleration, max_acceleration)
 
 
 LOOKAHEADS = ("causal", "hold", "oracle")

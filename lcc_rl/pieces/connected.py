@@ -128,6 +128,9 @@ class CACC(Controller):
         k2: gain of e_v(i,i−1).
         k3: gain of e_x(i,0) [1/s].
         k4: gain of e_v(i,0).
+        literal: take H11 as printed, where v_i + … is the acceleration. v_i feeds back positively:
+            unstable unless k2 + k4 > 1 + T (k1 + k3)/2, and then the first vehicle of a chain
+            settles v_0/(k1 + k3) too close to its leader. Stability is not checked.
         string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
 
     Raises:
@@ -145,19 +148,23 @@ class CACC(Controller):
         k2: float = 0.12,
         k3: float = 1.4,
         k4: float = 1.3,
+        literal: bool = False,
         string: VehicleString | None = None,
         role: str = AUTOMATED,
     ) -> None:
-        super().__init__(string, role)
+        super().__init__(string, role, (*self.reads, "self.speed") if literal else None)
         require_positive(f"scenario.controllers.{role}", max_acceleration=max_acceleration)
         require_in(f"scenario.controllers.{role}", "(-inf, inf)", k1=k1, k2=k2, k3=k3, k4=k4)
         self.gains = Gains(k1, k2, k3, k4)
-        self.gains.check_stable(time_step)
+        if not literal:
+            self.gains.check_stable(time_step)
         self.time_step, self.max_acceleration = time_step, max_acceleration
 
-    def command(self, *errors: Tensor) -> Tensor:
+    def command(self, *read: Tensor) -> Tensor:
         """Return the commands."""
-        return cacc_acceleration(Errors(*errors), self.gains, self.time_step, self.max_acceleration)
+        errors, speed = Errors(*read[: len(ERRORS)]), read[len(ERRORS) :]
+        limits = self.time_step, self.max_acceleration
+        return cacc_acceleration(errors, self.gains, *limits, *speed)
 
 
 class DeadBeat(Controller):

@@ -1,8 +1,8 @@
-"""Speeds, jerks and switching of a platoon's followers over time (HCFS Figs. 4–12)."""
+"""A platoon over time: its leader's record, speeds, jerks and switching (HCFS Figs. 3–12)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
+from lcc_rl.data.cycles import Case
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import INK, in_file, in_words, legend_above, new_figure, save, unbox
 from lcc_rl.results.runs import stored_config
@@ -18,6 +20,7 @@ from lcc_rl.results.runs import stored_config
 SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
 NEAR, FAR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
 BOUND = "#b00020"
+PAPER = {"case 1": (0.37, 10.76)}  # first and last speed in the paper [m/s]
 PARENTS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
 
 
@@ -51,6 +54,54 @@ def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
         label = f"follower {follower}" if follower in (1, followers) else None
         colour = hue(follower, followers)
         axis.plot(own["time_s"], own[column], color=colour, lw=1.0, label=label)
+
+
+def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Figure:
+    """Draw the leader's record with the part for training, and the cases' windows (Fig. 3).
+
+    Args:
+        record: the record that the training takes a part of, whole.
+        from_s: where that part begins [s].
+        cases: the windows for tests.
+    """
+    figure = new_figure(7.2, 4.6)
+    grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
+    axis, windows = grid.pop("record"), list(grid.values())
+    _speeds(axis, record)
+    axis.axvspan(
+        from_s, _seconds(record)[-1], color=PARENTS["DDPG"], alpha=0.15, lw=0, label="training"
+    )
+    axis.set_title(_in_record(record), fontsize=10, loc="right")
+    legend_above(axis)
+    for window, case in zip(windows, cases, strict=True):
+        _speeds(window, case.profile)
+        window.set_ylim(-0.5, 13.0)
+        window.set_title(f"{case.name}\n{_in_record(case.profile)}", fontsize=10)
+        if case.name in PAPER:
+            ends = _seconds(case.profile)[[0, -1]]
+            window.plot(ends, PAPER[case.name], "o", color=BOUND, label="paper", clip_on=False)
+            window.legend(frameon=False, fontsize=8, loc="upper left")
+    for left in (axis, windows[0]):
+        left.set_ylabel("speed [m/s]")
+    return figure
+
+
+def _speeds(axis: Axes, profile: Profiles) -> None:
+    axis.plot(_seconds(profile), profile.record(0).numpy(), color=INK, lw=1.0)
+    axis.set_xlabel("time [s]")
+    axis.margins(x=0.01)
+    unbox(axis)
+
+
+def _seconds(profile: Profiles) -> np.ndarray:
+    return profile.time_step * np.arange(int(profile.lengths[0]))
+
+
+def _in_record(profile: Profiles) -> str:
+    """Return a profile's record, and where in it the profile begins."""
+    record, _, start = profile.names[0].partition("@")
+    name = in_words(record).upper()
+    return name if start == "0s" else f"{name} from {in_words(start)} on"
 
 
 def velocities(steps: pd.DataFrame, case: str) -> Figure:

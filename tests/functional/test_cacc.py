@@ -92,6 +92,14 @@ def test_the_law_is_a_speed_command() -> None:
     torch.testing.assert_close(cacc_acceleration(far, gains, T, A_MAX), column(A_MAX))
 
 
+def test_the_law_as_printed_is_an_acceleration() -> None:
+    # 2 + 0.1·1 + 0.2·0.5 + 0.03·2 − 0.4·0.25 = 2.16; at 10 m/s it exceeds a_max.
+    errors = Errors(column(1.0, 1.0), column(0.5, 0.5), column(2.0, 2.0), column(-0.25, -0.25))
+    gains, speed = Gains(0.1, 0.2, 0.03, 0.4), column(2.0, 10.0)
+    printed = cacc_acceleration(errors, gains, T, A_MAX, speed)
+    torch.testing.assert_close(printed, column(2.16, A_MAX))
+
+
 def closed_loop(gains: Gains, followers: int = 3) -> torch.Tensor:
     """Jacobian of one step of the platoon itself behind a steady leader, in (gap, speed)."""
     v0 = torch.tensor([10.0], dtype=torch.float64)

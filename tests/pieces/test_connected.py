@@ -110,6 +110,34 @@ def test_unstable_gains_are_refused_by_the_controller() -> None:
         CACC(T, A_MAX, k2=1.3)
 
 
+@pytest.mark.parametrize(
+    ("gains", "literal", "gap"),
+    # kx = 1.44 1/s at 5 m/s, messages 5 ms late: 5 + 0.025 m, literally 5/1.44 m less.
+    [("tuned", False, 5.025), ("tuned", True, 1.553), ("path", False, 5.025)],
+)
+def test_the_printed_law_does_not_keep_the_gap(gains, literal, gap) -> None:
+    setting = f"scenario.controllers.automated.literal={literal}"
+    driver = Driver((*cacc(gains).overrides, setting))
+    driven = play(leader(torch.full((401,), 5.0)), driver, 1)["gap"]
+    torch.testing.assert_close(driven[-1].squeeze(), torch.tensor(gap), atol=1e-3, rtol=0)
+
+
+def test_the_printed_law_collides_with_gains_below_its_limit() -> None:
+    driver = Driver((*cacc("path").overrides, "scenario.controllers.automated.literal=true"))
+    assert play(leader(torch.full((101,), 5.0)), driver, 1)["gap"].min() < 0.0
+
+
+def test_the_hybrid_takes_the_printed_law_as_its_rule() -> None:
+    # The other parent always accelerates, so that the rule has to keep the gap.
+    gaps = (
+        play(ramps().select([1]), hcfs("bad", clamp=False, safe_cap=False, **own), 1)["gap"]
+        for own in ({}, {"rule.literal": True})
+    )
+    default, literal = (float((gap - 5.0).abs().max()) for gap in gaps)
+    assert default < 0.3
+    assert literal > 5.0
+
+
 # -- jerk ------------------------------------------------------------------------------------------
 
 

@@ -177,6 +177,7 @@ def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
             MIXED, T, wiener=0.1, delay=2, string=string, role="calibrated"
         ),
         "CACC": lambda: CACC(T, k3=0.4, string=string, role="cacc"),
+        "CACC, literal": lambda: CACC(T, literal=True, string=string, role="printed"),
         "DeadBeat": lambda: DeadBeat(T, string=string, role="beat"),
         "FollowerStopper": lambda: stopper("stopper"),
         "PISaturation": lambda: PISaturation(T, 0.5, string=string, role="saturating"),

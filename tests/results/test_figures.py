@@ -1,5 +1,7 @@
 """Every figure of a study draws from a tiny table, and says and shows what it should."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,12 +13,13 @@ from PIL import Image
 from study_frames import episodes, training
 
 from lcc_rl.config import identity, load
+from lcc_rl.data.cycles import Case, stretch
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results import drawing, training_figures
 from lcc_rl.results import figures as study_figures
 from lcc_rl.results.drawing import in_words, save
-from lcc_rl.results.string_figures import jerks, velocities
+from lcc_rl.results.string_figures import jerks, record_figure, velocities
 from lcc_rl.studies.alcc import comparison_figures
 from lcc_rl.studies.alcc import figures as alcc_figures
 
@@ -253,3 +256,19 @@ def test_figures_of_a_run_with_pieces_of_ones_own_need_no_trust(tmp_path) -> Non
     names = {path.name for path in drawn}
     assert {"overview.png", "episode_alcc.png", "improvement_reference_vs_idm.png"} <= names
     assert all(path.with_suffix(".svg").exists() for path in drawn)
+
+
+def test_the_record_is_drawn_with_its_training_part_and_the_cases() -> None:
+    record = stretch("udds", 0.2, 0.5)
+    case = Case("case 1", stretch("us06", 0.2, 0.5, 126.0, 146.0), 8)
+    figure = record_figure(record, 600.0, [case, replace(case, name="case 2")])
+    whole, first, second = figure.axes
+    line = whole.lines[0]
+    np.testing.assert_array_equal(line.get_ydata(), record.record(0).numpy())
+    np.testing.assert_allclose(line.get_xdata()[[0, 1, -1]], [0.0, 0.2, 1369.0])
+    part = whole.patches[0].get_path().get_extents(whole.patches[0].get_patch_transform())
+    np.testing.assert_allclose(part.intervalx, [600.0, 1369.0])
+    for axis in (first, second):
+        np.testing.assert_array_equal(axis.lines[0].get_ydata(), case.profile.record(0).numpy())
+    assert [len(axis.lines) for axis in (first, second)] == [2, 1]  # the paper's ends of case 1
+    assert "US06 from 126 s on" in texts(figure)
