@@ -19,7 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config_checks import check_ignored, renamed_option
+from lcc_rl.config_checks import check_ignored, lower_variants, renamed_option
 from lcc_rl.config_errors import check_keys, explain, refused_by_hydra, refused_key
 from lcc_rl.config_types import check_numbers, check_types
 from lcc_rl.errors import ConfigError, LccError, unknown_name
@@ -90,10 +90,11 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictConfig:
+    typed = lower_variants(overrides)
     if GlobalHydra.instance().is_initialized():
-        return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+        return compose(entry, overrides=typed, return_hydra_config=hydra)
     with initialize_config_module(CONF, version_base="1.3"):
-        return compose(entry, overrides=list(overrides), return_hydra_config=hydra)
+        return compose(entry, overrides=typed, return_hydra_config=hydra)
 
 
 def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
@@ -185,7 +186,8 @@ def build(node: Any, where: str, **resources: Any) -> Any:
         OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     )
     if not isinstance(settings, Mapping) or TARGET not in settings:
-        raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}")
+        without = f"; to leave it out, say ~{where}" if settings is None else ""
+        raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}{without}")
     check_numbers(settings, where)
     target = find_target(str(settings[TARGET]), where)
     given = {key: value for key, value in settings.items() if not key.startswith("_")}

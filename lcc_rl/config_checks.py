@@ -51,6 +51,16 @@ REMOVED = (
 )
 
 
+def lower_variants(overrides: Sequence[str]) -> list[str]:
+    """Return what was typed with names of variants in lower case, which papers write in capitals.
+
+    Examples:
+        >>> lower_variants(["variant=ALCC,HCFS", "data.path=A"])
+        ['variant=alcc,hcfs', 'data.path=A']
+    """
+    return [x.lower() if re.match(r"\+*variants?=", x) else x for x in overrides]
+
+
 def renamed_option(overrides: Sequence[str]) -> ConfigError | None:
     """Return the error for an option of a former release, naming today's; None for none."""
     for item in overrides:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import pandas as pd
 import torch
+from pages import ROOT, blocks
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
-from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import Clock
-from lcc_rl.pieces import CACC, IDM, NGSIMLeader, Places, StringMotion, VehicleString
-from lcc_rl.pieces.start import EquilibriumStart
+from lcc_rl.pieces import CACC, NGSIMLeader
 from lcc_rl.policies import ControllerPolicy
 from lcc_rl.synthetic.stream import StreamSource
 
@@ -29,19 +28,16 @@ def test_an_ngsim_file_is_a_transform_in_one_line(tmp_path) -> None:
     assert 0.0 <= float(speed.min()) < float(speed.max()) <= recorded + 0.1
 
 
-def test_transforms_of_vehicles_compose_by_hand(tmp_path) -> None:
-    path = tmp_path / "trajectories.csv"
-    StreamSource(recordings=1, platoons=2, vehicles=3, keep=str(path)).load()
-    string, drivers = VehicleString(("human",) * 3), fixed(25.0, 1.2)
-    pieces = [
-        NGSIMLeader.from_file(path, horizon=50),
-        Places(string),
-        IDM(drivers, 0.1, string=string),
-        StringMotion(string, 0.1, {"human": EquilibriumStart(drivers)}),
-    ]
-    gap = TransformedEnv(Clock(50, 2), Compose(*pieces)).rollout(50)["next", "vehicles", "gap"]
-    assert gap.shape == (2, 50, 3, 1)
-    assert float(gap.min()) > 0.0
+def test_the_page_on_composing_by_hand_prints_what_it_says(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, object] = {}
+    for block in blocks(ROOT / "docs" / "compose.md"):
+        if block.language == "python":
+            capsys.readouterr()
+            with torch.random.fork_rng():
+                exec(block.text, space)
+        else:
+            assert capsys.readouterr().out == block.text
 
 
 def test_the_cacc_policy_is_a_transform_and_a_policy() -> None:

@@ -47,6 +47,11 @@ def test_every_variant_composes_builds_and_runs(entry, variant) -> None:
     assert rolled_out(cfg, 10).shape[0] == 2
 
 
+def test_a_variant_may_be_written_as_its_paper_does() -> None:
+    assert load("train", ["variant=ALCC"]) == load("train", ["variant=alcc"])
+    assert load("pipeline", ["variants=[ALCC]"]) == load("pipeline", ["variants=[alcc]"])
+
+
 def rolled_out(cfg: DictConfig, steps: int):
     """Play a few steps with the agent's policy where there is one."""
     policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None

@@ -149,9 +149,8 @@ def page(rows: dict[Key, list[str]]) -> str:
         entries.append((f"`{shown}`", f"`{shape}`", unit, meaning + mark, ", ".join(names)))
     equations = [("equation", "formula", "symbols and units", "implemented by", "deviation")]
     for number, formula, symbols, functions, deviation in EQUATIONS:
-        paths = ", ".join(f"`{path}`" for path in functions) or "–"
-        shown = f"`{formula}`" if functions else formula
-        equations.append((number, shown, symbols.replace("*", r"\*"), paths, deviation))
+        paths = ", ".join(f"`{path}`" for path in functions)
+        equations.append((number, f"`{formula}`", symbols.replace("*", r"\*"), paths, deviation))
     return "\n".join([HEAD, table(*entries), "## Equations\n", PAPERS + "\n", table(*equations)])
 
 

@@ -12,8 +12,7 @@ PAPERS = """A1–A20: Wang et al., *Adaptive Leading Cruise Control in Mixed Tra
 Human Behavioral Diversity* (ALCC). H1–H21: Yan et al., *Hybrid Car-Following Strategy Based on
 Deep Deterministic Policy Gradient and Cooperative Adaptive Cruise Control* (HCFS). Vehicles count
 from the front, 0 is the leader. T is the time step, in A4 and A15 the desired time gap. Import
-paths begin with `lcc_rl.`. – means no unit, or no deviation. *Not recorded*: the paper's formula
-has not been compared with the code. The update of DDPG is `agents.ddpg.DDPG`."""
+paths begin with `lcc_rl.`. – means no unit, or no deviation."""
 REFERENCE = re.compile(r"\b([AH])(\d+)[a-d]?(?:–\1?(\d+)[a-d]?)?")
 
 
@@ -25,9 +24,9 @@ class Equation(NamedTuple):
     """
 
     number: str
-    formula: str = "not recorded"
-    symbols: str = "–"
-    functions: tuple[str, ...] = ()
+    formula: str
+    symbols: str
+    functions: tuple[str, ...]
     deviation: str = "–"
 
 
@@ -46,4 +45,4 @@ def numbers_in(text: str) -> set[str]:
 
 TABLE = Path(__file__).with_suffix(".toml")
 ROWS: list[dict[str, Any]] = tomllib.loads(TABLE.read_text())["equation"]
-EQUATIONS = tuple(Equation(**{**row, "functions": tuple(row.get("functions", ()))}) for row in ROWS)
+EQUATIONS = tuple(Equation(**{**row, "functions": tuple(row["functions"])}) for row in ROWS)

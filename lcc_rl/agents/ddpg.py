@@ -47,7 +47,7 @@ class DDPGSettings(OffPolicySettings):
 
 
 class DDPG(OffPolicy):
-    """Actor, critic, their target networks and one optimizer of both.
+    """Actor, critic, their target networks and one optimizer of both (A7–A9, HCFS H7–H10).
 
     Args:
         observation_size, action_size, seed, settings, device: see

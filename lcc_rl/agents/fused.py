@@ -88,6 +88,8 @@ class Workspace:
 class FusedUpdate:
     """One gradient step of DDPG on actor and critic, and one soft step of the targets due.
 
+    ALCC A8–A9 and HCFS H7–H10; the actor follows the critic as it is before its own step.
+
     Takes the parameters over: they become views of one vector, as do the targets'.
 
     Args:

@@ -21,7 +21,7 @@ LEAST = 1e-3  # a limit of zero is approached as if it were this share
 
 
 class Limits:
-    """The multipliers of all limits.
+    """The multipliers of all limits, such as those of the ALCC paper's problem (A5).
 
     Args:
         largest: largest share of the time of each limit, by name.

@@ -39,7 +39,7 @@ class RewardTerm(RewardPiece):
         string: the string of vehicles; one automated vehicle where not given.
 
     Raises:
-        ConfigError: if the weight is not a finite number.
+        ConfigError: if the weight is negative or not a finite number.
     """
 
     reads: ClassVar[tuple[str, ...]] = ()
@@ -53,7 +53,7 @@ class RewardTerm(RewardPiece):
         reads: Sequence[str] | None = None,
         string: VehicleString | None = None,
     ) -> None:
-        require_in(f"reward.terms.{name}", "(-inf, inf)", weight=weight)
+        require_in(f"reward.terms.{name}", "[0, inf)", weight=weight)
         string = VehicleString() if string is None else string
         self.views = Views(string, AUTOMATED, self.reads if reads is None else reads)
         self.string = string

@@ -67,7 +67,8 @@ class Section:
         heading: its title.
         text: plain paragraphs, separated by blank lines.
         tables: caption and table; a column's unit is the end of its name (``energy_kj``,
-            ``saving_pct``), and ``x``, ``x_low``, ``x_high`` are shown as one column.
+            ``saving_pct``), and ``x``, ``x_low``, ``x_high`` are shown as one column. Numbers
+            have about four digits, or as many decimals as ``table.attrs["decimals"]`` says.
         figures: caption and image file (png or svg).
         details: title and long text, folded away.
     """
@@ -225,7 +226,7 @@ def _is_number(values: pd.Series) -> bool:
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
     """Return the cells of a column as text, with its interval where the frame has one."""
     values = frame[name]
-    places = _places(values)
+    places = frame.attrs.get("decimals", _places(values))
     cells = [_cell(value, places) for value in values]
     if f"{name}_low" not in frame:
         return cells

@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.config import explained, is_sweep, leave_out_foreign
-from lcc_rl.config_checks import check_ignored
+from lcc_rl.config_checks import check_ignored, lower_variants
 from lcc_rl.config_errors import check_keys, refused_by_hydra
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.runs.interrupts import (
@@ -131,7 +131,7 @@ def listed_once() -> Iterator[None]:
 
 
 def flags_first(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line with its flags, as ``-m``, before the settings.
+    """Return the words of a command line, its flags, as ``-m``, first, variants in lower case.
 
     Raises:
         ConfigError: naming a flag that does not exist.
@@ -147,7 +147,7 @@ def flags_first(words: Sequence[str]) -> list[str]:
     flags = list(words)
     for item in known.overrides:
         flags.remove(item)
-    return [*flags, *known.overrides]
+    return [*flags, *lower_variants(known.overrides)]
 
 
 def sweep(command: Callable[[], Any]) -> None:

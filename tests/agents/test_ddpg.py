@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
+from lcc_rl.agents.off_policy import leaves
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.policies import save_policy
@@ -48,6 +49,53 @@ def test_the_fused_update_equals_torchrls_loss(hidden: list[int]) -> None:
     fused, plain = (one.loss.state_dict() for one in agents)
     for name in plain:
         torch.testing.assert_close(fused[name], plain[name], rtol=1e-3, atol=2e-5)
+
+
+def network(weights: list[torch.Tensor], *parts: torch.Tensor) -> torch.Tensor:
+    x = torch.cat(parts, -1)
+    for weight, bias in zip(weights[:-2:2], weights[1:-2:2], strict=True):
+        x = (x @ weight.t() + bias).relu()
+    return x @ weights[-2].t() + weights[-1]
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
+    """A8–A9, H7–H10 in plain torch: two losses, a step of Adam each, soft targets."""
+    learner = agent(fused=fused, saturation=0.0, hidden=[32, 16])
+    own = learner.settings
+    names = ("actor", "value", "target_actor", "target_value")
+    found = [leaves(getattr(learner.loss, f"{name}_network_params")) for name in names]
+    hand = [[tensor.detach().clone() for tensor in part] for part in found]
+    rates = (own.actor_lr, own.critic_lr)
+    adam = [
+        torch.optim.Adam([tensor.requires_grad_() for tensor in part], lr=rate)
+        for part, rate in zip(hand[:2], rates, strict=True)
+    ]
+
+    actor, critic, target_actor, target_critic = hand
+    for step in range(3):
+        batch = transitions(64, step)
+        losses = learner.update(batch.clone())
+        seen, after = batch["observation"], batch["next"]
+        future = network(target_actor, after["observation"]).tanh()
+        future = network(target_critic, after["observation"], future)
+        wanted = after["reward"] + own.gamma * future * ~after["terminated"]
+        loss_value = (network(critic, seen, batch["action"]) - wanted).square().mean()
+        loss_actor = -network(critic, seen, network(actor, seen).tanh()).mean()
+        slopes = torch.autograd.grad(loss_actor, actor), torch.autograd.grad(loss_value, critic)
+        for part, slope, optimizer in zip(hand[:2], slopes, adam, strict=True):
+            for tensor, value in zip(part, slope, strict=True):
+                tensor.grad = value
+            optimizer.step()
+        for online, target in zip(hand[:2], hand[2:], strict=True):
+            for ahead, behind in zip(online, target, strict=True):
+                behind.copy_(own.tau * ahead.detach() + (1.0 - own.tau) * behind)
+        for name, loss in (("loss_actor", loss_actor), ("loss_value", loss_value)):
+            torch.testing.assert_close(losses[name], loss.detach(), rtol=1e-5, atol=1e-6)
+        for name, part, expected in zip(names, found, hand, strict=True):
+            for tensor, value in zip(part, expected, strict=True):
+                close = 1e-6 if name.startswith("target") else 1e-5
+                torch.testing.assert_close(tensor.detach(), value.detach(), rtol=0.0, atol=close)
 
 
 def test_batches_of_all_sizes_are_learned_from() -> None:

@@ -17,7 +17,7 @@ from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole
 from lcc_rl.functional.pattern import parse_string
-from lcc_rl.pieces import Action, DriverEstimator, NGSIMLeader, Observation
+from lcc_rl.pieces import Action, DriverEstimator, NGSIMLeader, Observation, SafetyReward
 from lcc_rl.schemas import RANGES, WHOLE, check_ranges
 
 RESOURCES = {
@@ -117,7 +117,7 @@ NODES = (
         "",
         "reward.terms.safety",
         {
-            "weight": ANY,
+            "weight": NOT_NEGATIVE,
             "threshold": POSITIVE,
             "margin": NOT_NEGATIVE,
             "floor": (0, 4, nan),
@@ -130,7 +130,7 @@ NODES = (
     (
         "experiment=hcfs_spacing",
         "reward.terms.spacing",
-        {"gap_scale": POSITIVE, "weight": ANY},
+        {"gap_scale": POSITIVE, "weight": NOT_NEGATIVE},
     ),
     (
         "",
@@ -291,6 +291,10 @@ def test_a_configuration_changed_in_python_is_checked_when_the_environment_is_bu
         (lambda: Action(max_acceleration=nan), r"automated\.max_acceleration must be positive"),
         (lambda: Action(max_acceleration="3"), r"max_acceleration must be positive"),
         (lambda: NGSIMLeader(wavy_profiles(), 20, 0.1, perturbation=inf), "perturbation must not"),
+        (
+            lambda: SafetyReward(weight=-1),
+            r"^reward\.terms\.safety\.weight must not be negative, got",
+        ),
         (lambda: fixed(time_gap=nan), r"drivers\.time_gap must be positive"),
         (lambda: fixed(min_gap=-1), r"IDM\.min_gap must be positive"),
         (lambda: require_in("a", "[0, 1)", b=1), r"a\.b must lie in \[0, 1\), got 1$"),

@@ -11,6 +11,7 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import RewardSum
 from torchrl.modules import (
+    Actor,
     AdditiveGaussianModule,
     MultiAgentMLP,
     NormalParamExtractor,
@@ -52,7 +53,8 @@ def step(loss: nn.Module, batch, optimizer) -> float:
 def test_single_agent_ddpg() -> None:
     env = single_env("alcc", 4)
     size = env.observation_spec["observation"].shape[-1]
-    actor = TensorDictModule(mlp(size, 1, nn.Tanh()), ["observation"], ["action"])
+    network, spec = mlp(size, 1, nn.Tanh()), env.action_spec_unbatched
+    actor = Actor(network, spec=spec, in_keys=["observation"], safe=True)
 
     class Joined(nn.Module):
         def __init__(self) -> None:

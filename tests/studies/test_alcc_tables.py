@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from study_frames import episodes, training
 
+from lcc_rl.results.report import column_cells
 from lcc_rl.results.savings import per_seed, savings
 from lcc_rl.studies.alcc import paper_tables
 from lcc_rl.studies.alcc import tables as alcc_tables
@@ -125,6 +126,19 @@ def test_table_iv_finds_the_best_and_the_worst_driver() -> None:
     assert paper.loc[("mean", "reference"), "total_energy_kj"] == 408.74
     assert paper.loc[("worst", "alcc"), "saving_pct"] == -4.92
     assert paper.loc[("best", "reference"), "hdv_energy_kj"] == 201.91
+
+
+def test_paper_numbers_are_shown_with_the_papers_digits() -> None:
+    frame = episodes()
+    energies = [name for name in frame if name.endswith("_kj")]
+    frame[energies] *= 3.0  # to the size of the paper's
+    for table, numbers in (
+        (paper_tables.table_iv(frame), "226.46 164.38 390.84 214.85 193.89 408.74 14.43 −4.92"),
+        (paper_tables.holistic(frame), "4.38 14.43 −4.92"),
+        (paper_tables.human_energy(frame), "165.38 212.39"),
+    ):
+        shown = {cell for name in table for cell in column_cells(table, name)}
+        assert set(numbers.split()) <= shown
 
 
 def test_paper_numbers_agree_with_each_other() -> None:

@@ -57,7 +57,7 @@ def table_iv(
                 share = 100.0 * share_saved(energy[strategy], energy[baseline])
                 row[f"{kind}saving_pct"] = share if name == strategy else np.nan
             rows += [row, *_paper_row(label, name, strategy)]
-    return pd.DataFrame(rows)
+    return _with_its_decimals(rows)
 
 
 def _paper_row(driver: str, name: str, strategy: str) -> list[dict[str, object]]:
@@ -186,4 +186,11 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
             "most_driver_pct": PAPER_HUMAN_SAVING["most"],
         }
     )
-    return pd.DataFrame(rows)
+    return _with_its_decimals(rows)
+
+
+def _with_its_decimals(rows: Sequence[dict[str, object]]) -> pd.DataFrame:
+    """Return a table that is shown with as many decimals as the paper prints."""
+    table = pd.DataFrame(rows)
+    table.attrs["decimals"] = 2
+    return table
