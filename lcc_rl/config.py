@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import re
 import typing
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config_checks import check_ignored, lower_variants, renamed_option
+from lcc_rl.config_checks import as_meant, check_ignored, renamed_option
 from lcc_rl.config_errors import check_keys, explain, refused_by_hydra, refused_key
 from lcc_rl.config_types import check_numbers, check_types
 from lcc_rl.errors import ConfigError, LccError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.schemas import check_ranges, register_schemas
+from lcc_rl.settings import Settings, parse, values
 from lcc_rl.targets import TARGET, find_target, forget_places, parameters_of
 
 CONF = "lcc_rl.conf"
@@ -78,6 +81,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     try:
         cfg = _compose(entry, overrides)
         check_keys(cfg)
+        leave_out_foreign(cfg, overrides)
+        complete(cfg)
         check_ignored(cfg, overrides)
         check_ranges(cfg)
     except Exception as error:
@@ -85,16 +90,41 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
             raise
         said = str(explained(error, entry, overrides))
         raise ConfigError(" ".join(said.split())) from error
-    leave_out_foreign(cfg, overrides)
     return cfg
 
 
 def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictConfig:
-    typed = lower_variants(overrides)
+    typed = as_meant(overrides)
     if GlobalHydra.instance().is_initialized():
         return compose(entry, overrides=typed, return_hydra_config=hydra)
     with initialize_config_module(CONF, version_base="1.3"):
         return compose(entry, overrides=typed, return_hydra_config=hydra)
+
+
+def complete(cfg: DictConfig) -> None:
+    """Check the settings of classes with :class:`Settings`, and write their defaults beside them.
+
+    Raises:
+        ConfigError: naming a setting that is unknown or wrong, or a node without a class.
+    """
+    for group in ("reward.terms", "agent.surrogates", "agent.regularizers"):
+        nodes = OmegaConf.select(cfg, group)
+        for name in nodes or ():
+            node = nodes[name]
+            if OmegaConf.is_dict(node) and TARGET not in node:
+                known = [key for key in nodes if TARGET in (nodes[key] or ())]
+                raise unknown_name(f"setting of {group}", str(name), map(str, known))
+            if node is None:
+                continue
+            try:
+                kind = find_target(str(node[TARGET]), f"{group}.{name}")
+            except ConfigError:  # said where it is built
+                continue
+            if inspect.isclass(kind) and issubclass(kind, Settings):
+                given = {k: v for k, v in plain(node).items() if k != TARGET}
+                settled = values(parse(kind, given, f"{group}.{name}"))
+                with open_dict(node):
+                    node.update({k: v for k, v in settled.items() if k not in node})
 
 
 def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
@@ -191,6 +221,8 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     check_numbers(settings, where)
     target = find_target(str(settings[TARGET]), where)
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
+    if inspect.isclass(target) and issubclass(target, Settings):
+        return _bound(parse(target, given, where), resources)
     own = getattr(target, "Settings", None)
     if own is None:
         return _construct(target, given, where, resources)
@@ -198,6 +230,15 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     return _construct(
         target, {}, where, {**resources, "settings": _construct(own, given, where, {})}
     )
+
+
+def _bound(made: Any, resources: Mapping[str, Any]) -> Any:
+    """Put what was built into the world that the caller has to offer."""
+    from lcc_rl.pieces.world import World
+
+    names = {field.name for field in fields(World)}
+    shared = {n: value for n, value in resources.items() if n in names and value is not None}
+    return made.bind(World(**shared), resources.get("name"))
 
 
 def build_as(

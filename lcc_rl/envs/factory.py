@@ -36,6 +36,7 @@ from lcc_rl.pieces import (
 )
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
+from lcc_rl.pieces.world import World
 from lcc_rl.schemas import check_ranges
 
 MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
@@ -77,7 +78,11 @@ def build_env(
     check_pieces(pieces, scenario.horizon, actions)
     require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
-    env = Traffic(clock, Pieces(*pieces))
+    acting = Pieces(*pieces)
+    acting.world = World(
+        string_of(cfg), scenario.time_step, scenario.horizon, energy=build_energy(cfg)
+    )
+    env = Traffic(clock, acting)
     return env.to(device) if device is not None else env
 
 

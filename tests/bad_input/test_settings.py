@@ -293,7 +293,7 @@ def test_a_configuration_changed_in_python_is_checked_when_the_environment_is_bu
         (lambda: NGSIMLeader(wavy_profiles(), 20, 0.1, perturbation=inf), "perturbation must not"),
         (
             lambda: SafetyReward(weight=-1),
-            r"^reward\.terms\.safety\.weight must not be negative, got",
+            r"^SafetyReward\.weight must be greater than or equal to 0, got",
         ),
         (lambda: fixed(time_gap=nan), r"drivers\.time_gap must be positive"),
         (lambda: fixed(min_gap=-1), r"IDM\.min_gap must be positive"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 
@@ -93,6 +94,7 @@ from lcc_rl.pieces import (
     VelocityReward,
 )
 from lcc_rl.pieces.base import as_key
+from lcc_rl.pieces.world import World
 from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, shared_policy
 
 HORIZON, T = 12, 0.1
@@ -208,29 +210,30 @@ def motion(string: VehicleString) -> StringMotion:
 
 
 def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
-    own = {"string": string}
+    world = World(string, T)
+    mixed = replace(world, energy=FLEET)
     return {
-        "SafetyReward": lambda: SafetyReward(**own),
-        "EfficiencyReward": lambda: EfficiencyReward(**own),
-        "EnergyReward": lambda: EnergyReward(T, "self_energy", **own),
-        "EnergyReward, behind": lambda: EnergyReward(T, "behind_energy", of="behind", **own),
+        "SafetyReward": lambda: SafetyReward().bind(world),
+        "EfficiencyReward": lambda: EfficiencyReward().bind(world),
+        "EnergyReward": lambda: EnergyReward().bind(world, "self_energy"),
+        "EnergyReward, behind": lambda: EnergyReward(of="behind").bind(world, "behind_energy"),
         "EnergyReward, estimated": lambda: EnergyReward(
-            T, "estimated", of="behind", power="human.predicted_power", **own
-        ),
-        "EnergyReward, string": lambda: EnergyReward(T, "string_energy", of="string", **own),
-        "CollisionPenalty": lambda: CollisionPenalty(**own),
-        "RangeReward": lambda: RangeReward("longest", largest=9.0, **own),
-        "SmoothRange": lambda: SmoothRange("shortest", 1.0, "time_gap", least=1.2, **own),
-        "VelocityReward": lambda: VelocityReward(**own),
-        "JerkReward": lambda: JerkReward(**own),
-        "SpacingReward": lambda: SpacingReward(**own),
-        "SmoothSafety": lambda: SmoothSafety("smooth_safety", **own),
-        "SmoothEfficiency": lambda: SmoothEfficiency("smooth_efficiency", **own),
-        "Smoothness": lambda: Smoothness(**own),
-        "Correction": lambda: Correction(**own),
-        "PathEnergy": lambda: PathEnergy(T, "path_energy", **own),
-        "PathEnergy, mixed": lambda: PathEnergy(T, "path_mixed", energy=FLEET, **own),
-        "PathEnergy, behind": lambda: PathEnergy(T, "path_behind", of="behind", **own),
+            of="behind", power="human.predicted_power"
+        ).bind(world, "estimated"),
+        "EnergyReward, string": lambda: EnergyReward(of="string").bind(world, "string_energy"),
+        "CollisionPenalty": lambda: CollisionPenalty().bind(world),
+        "RangeReward": lambda: RangeReward(largest=9.0).bind(world, "longest"),
+        "SmoothRange": lambda: SmoothRange(entry="time_gap", least=1.2).bind(world, "shortest"),
+        "VelocityReward": lambda: VelocityReward().bind(world),
+        "JerkReward": lambda: JerkReward().bind(world),
+        "SpacingReward": lambda: SpacingReward().bind(world),
+        "SmoothSafety": lambda: SmoothSafety().bind(world),
+        "SmoothEfficiency": lambda: SmoothEfficiency().bind(world),
+        "Smoothness": lambda: Smoothness().bind(world),
+        "Correction": lambda: Correction().bind(world),
+        "PathEnergy": lambda: PathEnergy().bind(world, "path_energy"),
+        "PathEnergy, mixed": lambda: PathEnergy().bind(mixed, "path_mixed"),
+        "PathEnergy, behind": lambda: PathEnergy(of="behind").bind(world, "path_behind"),
     }
 
 
@@ -473,7 +476,7 @@ class Comfort(RewardTerm):
 
 def test_a_term_appended_to_an_environment_counts() -> None:
     plain, env = (small_env("alcc", 3, seed=2) for _ in range(2))
-    env.append_transform(Comfort("comfort", 0.5, string=made_string(env)))
+    env.append_transform(Comfort(weight=0.5))
     check_env_specs(env)
     # Appended after the checks, whose random actions draw from the environment's generator.
     one, two = (e.set_seed(7) and e.rollout(10, zero) for e in (plain, env))
@@ -485,10 +488,6 @@ def test_a_term_appended_to_an_environment_counts() -> None:
 
 def zero(td: TensorDictBase) -> TensorDictBase:
     return td.set(ACTION, torch.full((3, 1, 1), 0.2))
-
-
-def made_string(env: TransformedEnv) -> VehicleString:
-    return next(piece.string for piece in env.transform if isinstance(piece, StringMotion))
 
 
 # -- policies --------------------------------------------------------------------------------------
