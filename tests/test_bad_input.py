@@ -108,7 +108,7 @@ def test_a_wrong_recipe_names_those_that_exist(given) -> None:
 
 @pytest.mark.parametrize(
     "override",
-    ["agent.gamma=1.5", "training.episodes=25", "reward.terms.safety.weight=heavy"],
+    ["agent.gamma=1.5", "training.episodes=25"],
 )
 def test_settings_are_checked_before_the_data_are_read(tmp_path, override) -> None:
     # The data do not exist: whoever reads them first says so instead.
