@@ -46,7 +46,10 @@ RENAMED = (
     (r"controller\.", "deployed."),
 )
 # Settings whose defaults the classes hold (lcc_rl.settings).
-IN_CLASSES = re.compile(r"(reward\.terms|agent\.(surrogates|regularizers))\.\w+\.\w+=")
+IN_CLASSES = re.compile(
+    r"((reward\.terms|agent\.(surrogates|regularizers)|scenario\.(controllers|filters|pieces|start))"
+    r"\.\w+|observation|deployed)(\.(after|rule))?\.\w+="
+)
 # Options that are gone, and why.
 REMOVED = (
     (r"calibration\.compiled\b", "a calibration on a CPU is compiled wherever numba is installed"),
@@ -64,7 +67,7 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         ['variant=alcc,hcfs', 'data.path=A', '++reward.terms.safety.margin=0']
     """
     lower = (x.lower() if re.match(r"\+*variants?=", x) else x for x in overrides)
-    return [f"++{x}" if IN_CLASSES.match(x) else x for x in lower]
+    return [f"++{x}" if IN_CLASSES.match(x) and not renamed_option([x]) else x for x in lower]
 
 
 def renamed_option(overrides: Sequence[str]) -> ConfigError | None:

@@ -72,7 +72,7 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
         ConfigError: naming the first setting that is unknown or wrong.
     """
     try:
-        return kind(**given)
+        return kind(**{key: value for key, value in given.items() if value != "???"})
     except ConfigError as error:
         if isinstance(error.__cause__, ValidationError):
             raise refused(error.__cause__, kind, where) from error
@@ -86,6 +86,8 @@ def refused(error: ValidationError, kind: type[Settings], where: str) -> ConfigE
         known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
         return unknown_name(f"setting of {where} ({kind.__name__})", str(first["loc"][-1]), known)
     key = ".".join([where, *map(str, first["loc"])])
+    if first["type"] == "missing" and len(first["loc"]) == 1:
+        return ConfigError(f"{key} is required: say {key}=…")
     if first["type"] == "value_error":
         return ConfigError(f"{key}: {first['ctx']['error']}")
     return ConfigError(

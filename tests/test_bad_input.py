@@ -51,7 +51,7 @@ def test_a_wrong_option_names_the_nearest_one(override, words) -> None:
 
 
 def test_names_that_exist_only_with_the_other_overrides_are_known() -> None:
-    words = r"setting of scenario.controllers.automated 'desired_sped'.*'desired_speed'"
+    words = r"setting of scenario.controllers.automated \(IDM\) 'desired_sped'.*'desired_speed'"
     with pytest.raises(ConfigError, match=words):
         load("train", ["variant=idm", "scenario.controllers.automated.desired_sped=3"])
 

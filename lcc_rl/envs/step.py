@@ -118,11 +118,11 @@ def written_by(piece: Piece, moment: Any) -> list[Written]:
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
     """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
     kept = list(chosen)
-    keys = set(wanted) | {key for piece in kept for _, key in piece.sources}
+    keys = set(wanted) | {key for piece in kept for _, key in piece.needs}
     grown = True
     while grown:
         more = [piece for piece in pieces if piece not in kept and written([piece]) & keys]
-        keys |= {key for piece in more for _, key in piece.sources}
+        keys |= {key for piece in more for _, key in piece.needs}
         kept, grown = kept + more, bool(more)
     return [piece for piece in pieces if piece in kept]
 
@@ -164,7 +164,8 @@ class Pieces(Compose):
         place = places[-1]
         total: Any = self.transforms[place]
         transform = transform.bind(self.world, getattr(transform, "name", None))
-        renewed = TotalReward([*total.terms, transform.name], total.string)
+        terms = [*total.terms, transform.name]
+        renewed = TotalReward(terms=terms).bind(World(total.string))
         self.pop(place)
         self.insert(place, transform)
         self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)

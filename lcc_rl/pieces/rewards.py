@@ -14,51 +14,41 @@ and ``+reward.terms.comfort={_target_: mymodule.Comfort, weight: 0.1}`` on the c
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
 from lcc_rl.pieces.base import RewardPiece
 from lcc_rl.pieces.sections import Sections
-from lcc_rl.pieces.views import VEHICLES, Views
+from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Positive, Settings, values
+from lcc_rl.settings import NonNegative, Positive
 
 TERMS = (AUTOMATED, "reward_terms")
 REWARD = (AUTOMATED, "reward")
 TOUCH = 1e-6  # [m]; room that is left within the margin: none, but not a collision
 
 
-class RewardTerm(Settings, RewardPiece):
-    """Base of all terms: writes ``("automated", "reward_terms", name)``, ``[*batch, A, 1]``."""
+class RewardTerm(RewardPiece):
+    """Base of all terms: writes ``("automated", "reward_terms", name)``, ``[*batch, A, 1]``.
+
+    The name is the key under ``reward.terms``; by default from that of the class.
+    """
 
     weight: NonNegative = 1.0  # factor of the term; 0 takes it out
 
-    name: ClassVar[str]  # of a term in an environment
     reads: ClassVar[Sequence[str]] = ()
     # Maps what is read, one row per automated vehicle, to the unweighted term, [*batch, A, 1].
     reward: ClassVar[Callable[..., Tensor]]
 
-    def settled(self) -> None:
-        """Make it a transform, which reads and writes nothing before :meth:`bind`."""
-        RewardPiece.__init__(self, (), ())
-
-    def bind(self, world: World | None = None, name: str | None = None) -> Self:
-        """Return the term as part of an environment.
-
-        Args:
-            world: what the pieces of the environment share.
-            name: the key under ``reward.terms``; by default from the name of the class.
-        """
-        bound = type(self).__new__(type(self))
-        bound.__dict__.update(values(self), name=name or _name_of(type(self)))
-        bound.setup(world or World())
-        return bound
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        cls.name = re.sub("(Reward|Penalty)$", "", cls.__name__).lower()
 
     def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
         """Derive from a world what depends on it; a term that overrides this calls it at the end.
@@ -67,19 +57,12 @@ class RewardTerm(Settings, RewardPiece):
             world: what the pieces of the environment share.
             reads: names of what is read, where they depend on settings.
         """
-        views = Views(world.string, AUTOMATED, self.reads if reads is None else reads)
-        shape = (world.string.count(AUTOMATED), 1)
-        RewardPiece.__init__(self, views.keys, [(*TERMS, self.name)], shape)
-        self.views, self.string = views, world.string
+        self.see(world, self.reads if reads is None else reads, [(*TERMS, self.name)])
+        self.string = world.string
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the weighted term."""
         return self.weight * self.reward(*self.views(*entries))
-
-
-def _name_of(kind: type) -> str:
-    """Return what a term is called by default: ``safety`` of SafetyReward."""
-    return re.sub("(Reward|Penalty)$", "", kind.__name__).lower()
 
 
 class SafetyReward(RewardTerm):
@@ -174,25 +157,17 @@ class CollisionPenalty(RewardTerm):
 
 
 class TotalReward(RewardPiece):
-    """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``.
+    """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``."""
 
-    Args:
-        terms: the terms, by name.
-        string: the string of vehicles; one automated vehicle where not given.
+    terms: Sequence[str]  # their names
 
-    Raises:
-        ConfigError: if there is no term.
-    """
-
-    def __init__(
-        self, terms: Sequence[str] | Mapping[str, object], string: VehicleString | None = None
-    ) -> None:
-        names = list(terms)
-        if not names:
+    def setup(self, world: World) -> None:
+        """Read the terms."""
+        if not self.terms:
             raise ConfigError("reward.terms is empty: an environment needs at least one term")
-        string = VehicleString() if string is None else string
-        super().__init__([(*TERMS, name) for name in names], [REWARD], (string.count(AUTOMATED), 1))
-        self.terms, self.string = names, string
+        shape = (world.string.count(AUTOMATED), 1)
+        self.wire([(*TERMS, name) for name in self.terms], [REWARD], shape)
+        self.string = world.string
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""

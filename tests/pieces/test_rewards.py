@@ -130,7 +130,7 @@ def test_what_is_unknown_is_refused() -> None:
 
 
 def test_sum() -> None:
-    torch.testing.assert_close(TotalReward(["a", "b"]).compute(t(1.0), t(-3.0)), t(-2.0))
+    torch.testing.assert_close(TotalReward(terms=["a", "b"]).compute(t(1.0), t(-3.0)), t(-2.0))
 
 
 @pytest.mark.parametrize("settings", [{"margin": -1.0}, {"floor": 5.0}, {"weight": math.nan}])
