@@ -85,7 +85,7 @@ def refused(error: ValidationError, kind: type[Settings], where: str) -> ConfigE
     if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
         known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
         return unknown_name(f"setting of {where} ({kind.__name__})", str(first["loc"][-1]), known)
-    key = ".".join([where, *map(str, first["loc"])])
+    key = where + "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
     if first["type"] == "missing" and len(first["loc"]) == 1:
         return ConfigError(f"{key} is required: say {key}=…")
     if first["type"] == "value_error":

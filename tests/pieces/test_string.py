@@ -325,8 +325,8 @@ def test_follower_stopper_desires_its_own_mean_speed() -> None:
     ("given", "words"),
     [
         ({"gaps": [4.5, 6.0, 5.25]}, "gaps must increase"),
-        ({"gaps": [4.5, 6.0]}, r"FollowerStopper\.gaps\.2"),
-        ({"time_gaps": [0.1, -0.1, 0.2]}, r"FollowerStopper\.time_gaps\.1 must be greater than"),
+        ({"gaps": [4.5, 6.0]}, r"FollowerStopper\.gaps\[2\]"),
+        ({"time_gaps": [0.1, -0.1, 0.2]}, r"FollowerStopper\.time_gaps\[1\] must be greater than"),
     ],
 )
 def test_impossible_rules(given, words) -> None:
