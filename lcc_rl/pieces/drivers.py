@@ -169,6 +169,8 @@ class Drivers(Controller):
 class DriverModel(Drivers):
     """Drivers of one model: those of the population, or one and the same in all vehicles.
 
+    They execute what they wish with a relative error (A18).
+
     A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
     :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
     """

@@ -97,11 +97,13 @@ def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:
 
 
 class MotorPower(StepTransform):
-    """Writes the power of the step just taken [W], from the speed at its start (A2 by default)."""
+    """Writes the power of the step just taken [W], from the speed at its start (A2 by default).
+
+    Of a predicted acceleration it is what an automated vehicle believes of a human driver (A16).
+    """
 
     vehicles: str = VEHICLES  # whose power: "vehicles" for all of them, or a role
-    # Entry of theirs that holds the acceleration; "predicted_acceleration" for what an automated
-    # vehicle believes of a human driver (A16).
+    # Entry of theirs that holds the acceleration, or "predicted_acceleration".
     acceleration: str = "acceleration"
     power: str = "power"  # entry of theirs that is written
     recuperation: bool = True  # braking feeds the battery
