@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import re
 import typing
@@ -19,12 +20,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config_checks import check_ignored, lower_variants, renamed_option
+from lcc_rl.config_checks import as_meant, check_ignored, renamed_option
 from lcc_rl.config_errors import check_keys, explain, refused_by_hydra, refused_key
 from lcc_rl.config_types import check_numbers, check_types
 from lcc_rl.errors import ConfigError, LccError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.schemas import check_ranges, register_schemas
+from lcc_rl.settings import Settings, parse, values
 from lcc_rl.targets import TARGET, find_target, forget_places, parameters_of
 
 CONF = "lcc_rl.conf"
@@ -78,6 +80,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     try:
         cfg = _compose(entry, overrides)
         check_keys(cfg)
+        leave_out_foreign(cfg, overrides)
+        complete(cfg)
         check_ignored(cfg, overrides)
         check_ranges(cfg)
     except Exception as error:
@@ -85,16 +89,58 @@ def load(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
             raise
         said = str(explained(error, entry, overrides))
         raise ConfigError(" ".join(said.split())) from error
-    leave_out_foreign(cfg, overrides)
     return cfg
 
 
 def _compose(entry: str, overrides: Sequence[str], hydra: bool = False) -> DictConfig:
-    typed = lower_variants(overrides)
+    typed = as_meant(overrides)
     if GlobalHydra.instance().is_initialized():
         return compose(entry, overrides=typed, return_hydra_config=hydra)
     with initialize_config_module(CONF, version_base="1.3"):
         return compose(entry, overrides=typed, return_hydra_config=hydra)
+
+
+# Nodes of classes with settings: by name, and single ones. What others refer to comes first.
+NODES = (
+    *("reward.terms", "agent.surrogates", "agent.regularizers"),
+    *(f"scenario.{name}" for name in ("start", "pieces", "controllers", "filters")),
+)
+SINGLE = ("observation", "deployed")
+
+
+def complete(cfg: DictConfig) -> None:
+    """Check the settings of classes with :class:`Settings`, and write their defaults beside them.
+
+    Raises:
+        ConfigError: naming a setting that is unknown or wrong, or a node without a class.
+    """
+    for group in NODES:
+        nodes = OmegaConf.select(cfg, group)
+        for name in nodes or ():
+            node = nodes[name]
+            if OmegaConf.is_dict(node) and TARGET not in node:
+                known = [key for key in nodes if TARGET in (nodes[key] or ())]
+                raise unknown_name(f"setting of {group}", str(name), map(str, known))
+            _complete(node, f"{group}.{name}")
+    for name in SINGLE:
+        _complete(OmegaConf.select(cfg, name), name)
+
+
+def _complete(node: Any, where: str) -> None:
+    """Complete one node, if it is one, and those in it."""
+    if not OmegaConf.is_dict(node) or TARGET not in node:
+        return
+    try:
+        kind = find_target(str(node[TARGET]), where)
+    except ConfigError:  # said where it is built
+        return
+    if inspect.isclass(kind) and issubclass(kind, Settings):
+        for key in node:
+            if not OmegaConf.is_interpolation(node, key):
+                _complete(node[key], f"{where}.{key}")
+        settled = values(_made(plain(node), where, {}))
+        with open_dict(node):
+            node.update({k: v for k, v in settled.items() if k not in node})
 
 
 def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
@@ -166,17 +212,21 @@ def _culprit(entry: str, overrides: Sequence[str]) -> str:
     return " ".join(overrides)
 
 
-def build(node: Any, where: str, **resources: Any) -> Any:
+def build(
+    node: Any, where: str, world: Any = None, name: str | None = None, **resources: Any
+) -> Any:
     """Construct the object that a configuration node describes.
 
-    The keys of the node are the arguments of its ``_target_``; arguments that the node does not
-    give are taken from ``resources`` where the names match, else the constructor's defaults
-    stand. Nested nodes are built first, in the same way.
+    The keys of the node are the settings of its ``_target_``, or its arguments; arguments that
+    the node does not give are taken from ``resources`` where the names match, else the
+    constructor's defaults stand. Nested nodes are built first, in the same way.
 
     Args:
         node: a mapping with ``_target_``.
         where: the node's place in the configuration, for messages.
-        **resources: what the caller has to offer: profiles, population, time_step …
+        world: the :class:`lcc_rl.pieces.world.World` that a part of an environment is put into.
+        name: the name that it has there.
+        **resources: what the caller has to offer a constructor: population, time_step …
 
     Raises:
         ConfigError: if the target is unknown, a key is none of its arguments, one is missing, or
@@ -189,15 +239,37 @@ def build(node: Any, where: str, **resources: Any) -> Any:
         without = f"; to leave it out, say ~{where}" if settings is None else ""
         raise ConfigError(f"{where}: expected a node with {TARGET}, got {settings!r}{without}")
     check_numbers(settings, where)
+    made = _made(settings, where, resources)
+    if world is None or not isinstance(made, Settings) or not hasattr(made, "bind"):
+        return made
+    try:
+        return made.bind(world, name)
+    except (LccError, OSError):
+        raise
+    except Exception as error:  # whatever a class of the user's own raises
+        raise _not_built(where, type(made), error) from error
+
+
+def _made(settings: Mapping[str, Any], where: str, resources: dict[str, Any]) -> Any:
+    """Construct what plain settings describe, and what is nested in them."""
     target = find_target(str(settings[TARGET]), where)
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
+    for key, value in given.items():
+        if isinstance(value, Mapping) and TARGET in value:
+            given[key] = build(value, f"{where}.{key}", **resources)
+    if inspect.isclass(target) and issubclass(target, Settings):
+        return parse(target, given, where)
     own = getattr(target, "Settings", None)
     if own is None:
         return _construct(target, given, where, resources)
     # A class with a dataclass of settings: the node's keys are its fields.
-    return _construct(
-        target, {}, where, {**resources, "settings": _construct(own, given, where, {})}
-    )
+    settled = _construct(own, given, where, {})
+    return _construct(target, {}, where, {**resources, "settings": settled})
+
+
+def _not_built(where: str, target: Any, error: Exception) -> ConfigError:
+    called = getattr(target, "__name__", str(target))
+    return ConfigError(f"{where}: {called} cannot be built: {type(error).__name__}: {error}")
 
 
 def build_as(
@@ -232,24 +304,17 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
         if given[key] == "???":
             raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
     offered = {k: v for k, v in resources.items() if k in signature and k not in given}
-    arguments = {
-        key: build(value, f"{where}.{key}", **resources)
-        if isinstance(value, Mapping) and TARGET in value
-        else value
-        for key, value in given.items()
-    }
-    check_types(target, arguments, where)
+    check_types(target, given, where)
     required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}
-    missing = sorted(required - set(arguments) - set(offered))
+    missing = sorted(required - set(given) - set(offered))
     if missing:
         raise ConfigError(f"{where}: missing {', '.join(missing)} of {called}")
     try:
-        return target(**arguments, **offered)
+        return target(**given, **offered)
     except (LccError, OSError):  # of a file: its name says more than the node's
         raise
     except Exception as error:  # whatever a constructor of the user's own raises
-        words = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{where}: {called} cannot be built: {words}") from error
+        raise _not_built(where, target, error) from error
 
 
 def short_name(target: object) -> str:

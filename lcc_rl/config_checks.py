@@ -45,20 +45,29 @@ RENAMED = (
     (r"agent\.(desired_speed|time_gap|lookahead|k[1-4])\b", rf"{AUTO}.\1"),
     (r"controller\.", "deployed."),
 )
+# Settings whose defaults the classes hold (lcc_rl.settings).
+IN_CLASSES = re.compile(
+    r"((reward\.terms|agent\.(surrogates|regularizers)|scenario\.(controllers|filters|pieces|start))"
+    r"\.\w+|observation|deployed)(\.(after|rule))?\.\w+="
+)
 # Options that are gone, and why.
 REMOVED = (
     (r"calibration\.compiled\b", "a calibration on a CPU is compiled wherever numba is installed"),
 )
 
 
-def lower_variants(overrides: Sequence[str]) -> list[str]:
-    """Return what was typed with names of variants in lower case, which papers write in capitals.
+def as_meant(overrides: Sequence[str]) -> list[str]:
+    """Return what was typed as Hydra has to read it.
+
+    Names of variants, which papers write in capitals, are in lower case; settings whose defaults
+    stand in a class and not in a file may be set like all others.
 
     Examples:
-        >>> lower_variants(["variant=ALCC,HCFS", "data.path=A"])
-        ['variant=alcc,hcfs', 'data.path=A']
+        >>> as_meant(["variant=ALCC,HCFS", "data.path=A", "reward.terms.safety.margin=0"])
+        ['variant=alcc,hcfs', 'data.path=A', '++reward.terms.safety.margin=0']
     """
-    return [x.lower() if re.match(r"\+*variants?=", x) else x for x in overrides]
+    lower = (x.lower() if re.match(r"\+*variants?=", x) else x for x in overrides)
+    return [f"++{x}" if IN_CLASSES.match(x) and not renamed_option([x]) else x for x in lower]
 
 
 def renamed_option(overrides: Sequence[str]) -> ConfigError | None:

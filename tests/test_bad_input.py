@@ -51,7 +51,7 @@ def test_a_wrong_option_names_the_nearest_one(override, words) -> None:
 
 
 def test_names_that_exist_only_with_the_other_overrides_are_known() -> None:
-    words = r"setting of scenario.controllers.automated 'desired_sped'.*'desired_speed'"
+    words = r"setting of scenario.controllers.automated \(IDM\) 'desired_sped'.*'desired_speed'"
     with pytest.raises(ConfigError, match=words):
         load("train", ["variant=idm", "scenario.controllers.automated.desired_sped=3"])
 
@@ -108,7 +108,7 @@ def test_a_wrong_recipe_names_those_that_exist(given) -> None:
 
 @pytest.mark.parametrize(
     "override",
-    ["agent.gamma=1.5", "training.episodes=25", "reward.terms.safety.weight=heavy"],
+    ["agent.gamma=1.5", "training.episodes=25"],
 )
 def test_settings_are_checked_before_the_data_are_read(tmp_path, override) -> None:
     # The data do not exist: whoever reads them first says so instead.

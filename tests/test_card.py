@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from lcc_rl.envs import Clock
 from lcc_rl.pieces import CACC, NGSIMLeader
+from lcc_rl.pieces.world import World
 from lcc_rl.policies import ControllerPolicy
 from lcc_rl.synthetic.stream import StreamSource
 
@@ -41,7 +42,7 @@ def test_the_page_on_composing_by_hand_prints_what_it_says(tmp_path, monkeypatch
 
 
 def test_the_cacc_policy_is_a_transform_and_a_policy() -> None:
-    rule = CACC(0.2)
+    rule = CACC().bind(World(time_step=0.2))
     assert isinstance(rule, Transform)
     errors = {f"{name}_error": torch.tensor([[[0.5]]]) for name in ("gap", "speed")}
     errors |= {f"leader_{name}": value for name, value in errors.items()}

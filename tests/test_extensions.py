@@ -46,9 +46,9 @@ class Comfort(RewardTerm):
 class Kinetic(Feature):
     """Half the square of the speed."""
 
-    def __init__(self, string):
+    def setup(self, world):
         key = ("vehicles", "kinetic")
-        super().__init__([("vehicles", "speed")], [key], (len(string), 1))
+        self.wire([("vehicles", "speed")], [key], (len(world.string), 1))
 
     def compute(self, speed):
         return 0.5 * speed.square()

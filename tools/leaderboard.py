@@ -57,7 +57,7 @@ def decision_ms(strategy: Strategy, env: TransformedEnv) -> float:
             if isinstance(piece, Controller) and piece.role == AUTOMATED
         )
         moment = entries(td)
-        values = [moment[key] for _, key in controller.sources]
+        values = [moment[key] for _, key in controller.needs]
 
         def decide() -> object:
             return controller.compute(*values)

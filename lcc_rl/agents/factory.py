@@ -22,6 +22,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Piece
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.pieces.world import World
 from lcc_rl.targets import TARGET
 
 
@@ -44,7 +45,7 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
             f"scenario.string={cfg.scenario.string}: nobody is automated, so nothing can be "
             "learned; say agent=none to evaluate it"
         )
-    observation = build_as("a piece", Piece, cfg.observation, "observation", string=string)
+    observation = build_as("a piece", Piece, cfg.observation, "observation", world=World(string))
     driver = cfg.scenario.controllers.get(AUTOMATED) or {}
     # The acceleration of action 1, where the vehicles are driven by actions.
     limits = {key: driver[key] for key in ("max_acceleration",) if key in driver}

@@ -15,6 +15,7 @@ from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
+from lcc_rl.pieces.world import World
 
 
 class Objective:
@@ -24,16 +25,16 @@ class Objective:
         settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
             :class:`lcc_rl.agents.simulated.SimulatedSettings`.
         device: where the terms compute.
-        **resources: what terms may need: ``time_step``, ``string``, ``energy``.
+        world: what the terms share.
 
     Raises:
         ConfigError: if a node or a limit is wrong.
     """
 
-    def __init__(self, settings: Any, device: str, **resources: Any) -> None:
+    def __init__(self, settings: Any, device: str, world: World) -> None:
         def made(where: str) -> dict[str, RewardTerm]:
             return {
-                name: build(node, f"agent.{where}.{name}", name=name, **resources).to(device)
+                name: build(node, f"agent.{where}.{name}", world, name).to(device)
                 for name, node in getattr(settings, where).items()
                 if node is not None
             }
@@ -59,7 +60,7 @@ class Objective:
         Raises:
             ConfigError: naming a term that reads another one.
         """
-        read = [(term, key) for term, _ in self.terms for _, key in term.sources]
+        read = [(term, key) for term, _ in self.terms for _, key in term.needs]
         for term, key in read:
             if key not in known:
                 what = f"{term.name} ({type(term).__name__})"
@@ -112,4 +113,4 @@ class Objective:
 
 
 def _entries(term: RewardTerm, data: TensorDictBase) -> list[Tensor]:
-    return [data.get(next_key(key)) for _, key in term.sources]
+    return [data.get(next_key(key)) for _, key in term.needs]

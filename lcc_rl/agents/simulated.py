@@ -11,13 +11,14 @@ from tensordict.nn import TensorDictModule
 
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.objective import Objective
-from lcc_rl.energy import Fleet
+from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
+from lcc_rl.pieces.world import World
 from lcc_rl.policies.rules import make_policy
 
 
@@ -81,7 +82,8 @@ class SimulatedAgent(ABC):
         self.settings: Any = self.Settings() if settings is None else settings
         self.seed, self.device = seed, device
         own = self.settings
-        self.objective = Objective(own, device, time_step=time_step, string=string, energy=energy)
+        world = World(string or VehicleString(), time_step, energy=as_fleet(energy))
+        self.objective = Objective(own, device, world)
         self.policy: TensorDictModule = make_policy(
             own.policy, observation, own.hidden, seed, own.constants, max_acceleration
         ).to(device)

@@ -42,7 +42,7 @@ def infer(options: Namespace) -> list[Row]:
             if not float((got - wanted).abs().max()) <= TOLERANCE:
                 raise RuntimeError(f"{name}: another action than the network's")
         if find_spec("osqp"):
-            runs["mpc"] = partial(_planned, MPC(), cycle(_moments()))
+            runs["mpc"] = partial(_planned, MPC().bind(), cycle(_moments()))
         spent = alternate(
             {k: partial(times, calls, run) for k, run in runs.items()}, options.repeats
         )

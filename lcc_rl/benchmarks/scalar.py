@@ -40,7 +40,7 @@ class ScalarLoop:
     def __init__(self, plain: PlainLoop) -> None:
         motion, human, estimator = plain.motion, plain.human, plain.estimator
         self.dt, self.max_acceleration = motion.time_step, plain.max_acceleration
-        first, second = motion.start["automated"], motion.start["human"]
+        first, second = motion.starts["automated"], motion.starts["human"]
         self.standstill_gap, self.initial_time_gap = first.standstill_gap, first.time_gap
         self.speeds: list[float] = plain.leader.speeds.tolist()
         self.offsets: list[int] = plain.leader.offsets.tolist()

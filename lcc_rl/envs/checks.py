@@ -153,7 +153,7 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
     for piece in pieces:
         known |= set(piece.constants) if isinstance(piece, StepTransform) else set()
     for piece in pieces:
-        for _, key in piece.sources:
+        for _, key in piece.needs:
             if key in known:
                 continue
             if key[-1] == "action":

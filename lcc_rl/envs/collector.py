@@ -108,7 +108,7 @@ class StringCollector(BaseCollector):
         read = {SEED, STEP, DONE, *map(self._inner, self.reads)}
         read |= {self._inner(key) for key in self.keys if key[0] != NEXT}
         for piece, _ in self.step.pieces:
-            read |= {key for late, key in piece.sources if not late}
+            read |= {key for late, key in piece.needs if not late}
             read |= set(piece.constants) if isinstance(piece, StepTransform) else set()
         return read
 

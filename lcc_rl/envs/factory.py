@@ -21,7 +21,7 @@ from lcc_rl.envs.inputs import load_inputs, string_of
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.functional.pattern import AUTOMATED, RING, VehicleString
+from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces import (
     Action,
@@ -36,7 +36,9 @@ from lcc_rl.pieces import (
 )
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
+from lcc_rl.pieces.world import World
 from lcc_rl.schemas import check_ranges
+from lcc_rl.settings import parse
 
 MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
 
@@ -70,15 +72,33 @@ def build_env(
     scenario = cfg.scenario
     check_ranges(cfg)
     pieces = build_pieces(cfg, profiles, population, nominal)
-    acts = any(key == ACTION for piece in pieces for _, key in piece.sources)
+    acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
         actions[ACTION] = (string_of(cfg).count(AUTOMATED), 1)
     check_pieces(pieces, scenario.horizon, actions)
     require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
-    env = Traffic(clock, Pieces(*pieces))
+    acting = Pieces(*pieces)
+    acting.world = world_of(cfg)
+    env = Traffic(clock, acting)
     return env.to(device) if device is not None else env
+
+
+def world_of(
+    cfg: DictConfig, profiles: Any = None, population: Any = None, nominal: bool = False
+) -> World:
+    """Return what the pieces of a configuration share; arguments as of :func:`build_env`."""
+    scenario = cfg.scenario
+    return World(
+        string_of(cfg),
+        scenario.time_step,
+        scenario.horizon,
+        profiles,
+        population,
+        build_energy(cfg),
+        nominal,
+    )
 
 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
@@ -101,105 +121,90 @@ def build_pieces(
     Raises:
         ConfigError: naming the option at fault.
     """
-    scenario, string, energy = cfg.scenario, string_of(cfg), build_energy(cfg)
-    resources = {
-        "profiles": profiles,
-        "population": population,
-        "time_step": scenario.time_step,
-        "horizon": scenario.horizon,
-        "string": string,
-        "energy": energy,
-        "nominal": nominal,
-    }
+    scenario, world = cfg.scenario, world_of(cfg, profiles, population, nominal)
+    string, energy = world.string, world.energy
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
-    pieces = _leader(scenario, named.pop("leader", None), resources)
-    drivers = _drivers(scenario, string, resources)
+    pieces = _leader(scenario, named.pop("leader", None), world)
+    drivers = _drivers(scenario, world)
     for role in energy.roles:
         if role not in scenario.controllers:
             raise unknown_name("role (energy.roles)", role, list(scenario.controllers))
-    classes = [EnergyClasses(string, energy)] if len(energy.models) > 1 else []
-    pieces += [Places(string), *classes, *drivers, _motion(scenario, string, resources)]
-    pieces += _watchers(drivers)
-    pieces += [_build(node, f"scenario.pieces.{name}", **resources) for name, node in named.items()]
+    classes = [EnergyClasses().bind(world)] if len(energy.models) > 1 else []
+    pieces += [Places().bind(world), *classes, *drivers, _motion(scenario, world)]
+    pieces += _watchers(drivers, world)
+    pieces += [_build(node, "scenario.pieces", world, name) for name, node in named.items()]
     check_spacing(pieces, profiles)
     if not string.count(AUTOMATED):
         return pieces
-    pieces.append(_build(cfg.observation, "observation", **resources))
-    pieces += [
-        _build(node, f"reward.terms.{name}", name=name, **resources)
-        for name, node in cfg.reward.terms.items()
-    ]
+    pieces.append(build_as("a piece", Piece, cfg.observation, "observation", world=world))
+    terms = cfg.reward.terms
+    pieces += [_build(node, "reward.terms", world, name) for name, node in terms.items()]
     # The sum stays last, before collisions of the next step.
-    return [*pieces, TotalReward(list(cfg.reward.terms), string)]
+    return [*pieces, TotalReward(terms=list(terms)).bind(world)]
 
 
-def _watchers(drivers: Sequence[Controller | CBFFilter]) -> list[Piece]:
+def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[Piece]:
     """Build the pieces that say what the filters answer for, and what they change."""
     filters = {piece.role: piece for piece in drivers if isinstance(piece, CBFFilter)}
     changed = [
-        Corrected(piece.max_acceleration, piece.string, piece.role)
+        Corrected(max_acceleration=piece.max_acceleration).bind(world, piece.role)
         for piece in drivers
         if isinstance(piece, Action) and piece.role in filters
     ]
     return [*(piece.watch() for piece in filters.values()), *changed]
 
 
-def _build(node: Any, where: str, **resources: Any) -> Any:
+def _build(node: Any, group: str, world: World, name: str) -> Any:
     """Build a piece.
 
     Raises:
         ConfigError: if the node describes something else.
     """
-    return build_as("a piece", Piece, node, where, **resources)
+    return build_as("a piece", Piece, node, f"{group}.{name}", world=world, name=name)
 
 
-def _leader(scenario: Any, node: Any, resources: dict[str, Any]) -> list[Piece]:
+def _leader(scenario: Any, node: Any, world: World) -> list[Piece]:
     """Build the leader of an open road; a ring road has none."""
     if (node is None) != (scenario.road == RING):
         raise ConfigError(
             "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
             f"scenario.road={scenario.road} and leader={node}"
         )
-    return [] if node is None else [_build(node, "scenario.pieces.leader", **resources)]
+    return [] if node is None else [_build(node, "scenario.pieces", world, "leader")]
 
 
-def _drivers(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> list[Any]:
+def _drivers(scenario: Any, world: World) -> list[Any]:
     """Build the controllers of the roles that occur, and their safety filters."""
-    pieces = []
+    pieces, roles = [], world.string.names
     for group, needed in (("controllers", True), ("filters", False)):
         nodes = scenario[group]
-        for role in string.names:
+        for role in roles:
             if nodes.get(role) is not None:
-                where = f"scenario.{group}.{role}"
-                pieces.append(_build(nodes[role], where, role=role, **resources))
+                pieces.append(_build(nodes[role], f"scenario.{group}", world, role))
             elif needed:
                 known = ", ".join(name for name in nodes if nodes[name] is not None)
                 raise ConfigError(
                     f"scenario.string has the role {role!r}, but scenario.controllers names only "
                     f"{known}; say +controller@scenario.controllers.{role}=… for another"
                 )
-        strange = [role for role in nodes if not needed and role not in string.names]
+        strange = [role for role in nodes if not needed and role not in roles]
         if strange:
             raise ConfigError(f"scenario.filters.{strange[0]}: no vehicle has that role")
     return pieces
 
 
-def _motion(scenario: Any, string: VehicleString, resources: dict[str, Any]) -> StringMotion:
+def _motion(scenario: Any, world: World) -> StringMotion:
+    string = world.string
     start = {
-        role: build_as("a start", CALLED, node, f"scenario.start.{role}", role=role, **resources)
+        role: build_as("a start", CALLED, node, f"scenario.start.{role}")
         for role, node in scenario.start.items()
         if role in string.names and node is not None and not string.ring
     }
     if not string.ring and scenario.circumference is not None:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
-    return StringMotion(
-        string,
-        scenario.time_step,
-        start,
-        scenario.circumference,
-        scenario.vehicle_length,
-        scenario.initial_speed,
-    )
+    names = ("circumference", "vehicle_length", "initial_speed")
+    of_ring = {name: scenario[name] for name in names} if string.ring else {}
+    return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 
 
 def make_env(

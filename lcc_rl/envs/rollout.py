@@ -54,7 +54,7 @@ class DifferentiableRollout:
         self.after = [piece for piece in needed if piece not in inside]
         self.step = Step(inside, self.horizon, self.graded)
         self.carried = {SEED, STEP, *written(inside)}
-        entries = {key for piece in needed for _, key in piece.sources} | every
+        entries = {key for piece in needed for _, key in piece.needs} | every
         self.recorded = sorted(entries & {*self.carried, ACTION})
         self.advance = Compiled(self._advance, "the simulator", compiled)
 
@@ -119,4 +119,4 @@ def _is_recurrent(piece: Piece) -> bool:
     """Whether a piece reads what it wrote one moment before."""
     if not isinstance(piece, StepTransform):
         return False
-    return bool({key for late, key in piece.sources if not late} & written([piece]))
+    return bool({key for late, key in piece.needs if not late} & written([piece]))

@@ -17,10 +17,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from lcc_rl.envs.finite import ACTION, Written, check_moment
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
+from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
 # Where none of these is lost after a step, nothing that matters is.
@@ -118,11 +118,11 @@ def written_by(piece: Piece, moment: Any) -> list[Written]:
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
     """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
     kept = list(chosen)
-    keys = set(wanted) | {key for piece in kept for _, key in piece.sources}
+    keys = set(wanted) | {key for piece in kept for _, key in piece.needs}
     grown = True
     while grown:
         more = [piece for piece in pieces if piece not in kept and written([piece]) & keys]
-        keys |= {key for piece in more for _, key in piece.sources}
+        keys |= {key for piece in more for _, key in piece.needs}
         kept, grown = kept + more, bool(more)
     return [piece for piece in pieces if piece in kept]
 
@@ -153,6 +153,8 @@ class Pieces(Compose):
     user may append, are asked. A reward term appended counts in the total reward.
     """
 
+    world: World = World()  # of reward terms that a user appends
+
     def append(self, transform: Transform | Callable[[TensorDictBase], TensorDictBase]) -> None:
         """Append a transform; a reward term goes before the sum of all terms."""
         places = [i for i, piece in enumerate(self.transforms) if isinstance(piece, TotalReward)]
@@ -161,12 +163,9 @@ class Pieces(Compose):
             return
         place = places[-1]
         total: Any = self.transforms[place]
-        if transform.event_shape != total.event_shape or transform.string != total.string:
-            raise ConfigError(
-                f"{type(transform).__name__} was made for another string of vehicles; give it "
-                f"string=parse_string(…) of this environment: {' '.join(total.string.roles)}"
-            )
-        renewed = TotalReward([*total.terms, transform.name], total.string)
+        transform = transform.bind(self.world, getattr(transform, "name", None))
+        terms = [*total.terms, transform.name]
+        renewed = TotalReward(terms=terms).bind(World(total.string))
         self.pop(place)
         self.insert(place, transform)
         self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)

@@ -148,7 +148,7 @@ class Player:
 
 
 def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
-    if policy is None and any(key == ACTION for piece in pieces for _, key in piece.sources):
+    if policy is None and any(key == ACTION for piece in pieces for _, key in piece.needs):
         raise ConfigError(
             "scenario.controllers.automated takes the action of a policy, and there is none: "
             "choose an agent, or another controller"

@@ -154,22 +154,6 @@ def cacc_acceleration(
     return wanted.clamp(-max_acceleration, max_acceleration)
 
 
-LOOKAHEADS = ("causal", "hold", "oracle")
-
-
-def check_lookahead(lookahead: str, where: str) -> str:
-    """Return the name of a look-ahead.
-
-    Raises:
-        ConfigError: if there is none of that name.
-    """
-    if lookahead not in LOOKAHEADS:
-        raise ConfigError(
-            f"{where}.lookahead must be one of {', '.join(LOOKAHEADS)}, got {lookahead!r}"
-        )
-    return lookahead
-
-
 def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float) -> Tensor:
     """Predict the leader's speed one step ahead [m/s].
 

@@ -3,55 +3,55 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from lcc_rl.functional.power import POWER_COEFFICIENTS
+from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 Array = np.ndarray
+MOST_STEPS = 200  # of a plan
 
 
-@dataclass(frozen=True)
-class MPCSettings:
-    """Horizon, prediction, limits and prices of :class:`lcc_rl.pieces.MPC`.
+class MPCSettings(Settings):
+    """Horizon, prediction, limits and prices of :class:`lcc_rl.pieces.MPC`."""
 
-    Args:
-        horizon: how far ahead is planned [s].
-        step: duration of a step of the plan, which the horizon is a multiple of [s].
-        acceleration_time: time constant with which the acceleration of the vehicle ahead is
-            expected to decay; 0: it keeps its speed [s].
-        margin: gap at standstill that is kept [m].
-        least_time_gap: time gap that is kept beyond it [s].
-        longest_time_gap: of the gap that is not exceeded, this times the speed [s] and …
-        longest_gap: … this, which may be negative; more where the vehicle ahead is so slow that
-            it would be less than the gap to be kept [m].
-        least_ttc: time-to-collision that is kept [s].
-        steady_price: weight of what the planned speeds take without accelerating.
-        jerk_price: weight of the squared change of the acceleration per second [s²].
-        near_price: of the squared distance by which the gap is too short [1/(m²s⁴)] …
-        far_price: … or too long, likewise …
-        ttc_price: … or too short for the time-to-collision, likewise.
-        max_acceleration: limit in both directions [m/s²].
-        tolerance: absolute and relative, at which the solver stops.
-        iterations: after which it gives up.
-    """
+    horizon: Positive = 5.0  # how far ahead is planned [s]
+    step: Positive = 0.25  # of the plan; the horizon is a multiple of it [s]
+    # Time constant with which the acceleration of the vehicle ahead is expected to decay; 0: it
+    # keeps its speed [s].
+    acceleration_time: NonNegative = 1.5
+    margin: NonNegative = 1.0  # gap at standstill that is kept [m]
+    least_time_gap: NonNegative = 0.5  # that is kept beyond it [s]
+    # The gap that is not exceeded is this time gap times the speed [s] plus longest_gap, which may
+    # be negative [m]; more where the vehicle ahead is so slow that it would be less than the gap
+    # to be kept.
+    longest_time_gap: Positive = 2.8
+    longest_gap: Number = -8.5
+    least_ttc: NonNegative = 4.1  # time-to-collision that is kept [s]
+    steady_price: NonNegative = 1.0  # of what the planned speeds take without accelerating
+    jerk_price: NonNegative = 0.1  # of the squared change of the acceleration per second [s²]
+    # Of the squared distance by which the gap is too short, too long, or too short for the
+    # time-to-collision [1/(m²s⁴)].
+    near_price: Positive = 3.0
+    far_price: Positive = 0.1
+    ttc_price: Positive = 30.0
+    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    # Absolute and relative, at which the solver stops.
+    tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
+    iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # after which it gives up
 
-    horizon: float = 5.0
-    step: float = 0.25
-    acceleration_time: float = 1.5
-    margin: float = 1.0
-    least_time_gap: float = 0.5
-    longest_time_gap: float = 2.8
-    longest_gap: float = -8.5
-    least_ttc: float = 4.1
-    steady_price: float = 1.0
-    jerk_price: float = 0.1
-    near_price: float = 3.0
-    far_price: float = 0.1
-    ttc_price: float = 30.0
-    max_acceleration: float = 3.0
-    tolerance: float = 1e-4
-    iterations: int = 4000
+    def __post_init__(self) -> None:
+        if self.longest_time_gap <= self.least_time_gap:
+            least = f"least_time_gap={self.least_time_gap}"
+            raise ValueError(f"longest_time_gap must be above {least}, got {self.longest_time_gap}")
+        steps = self.horizon / self.step
+        if not 1 <= round(steps) <= MOST_STEPS or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(
+                f"horizon must be 1 to {MOST_STEPS} times step={self.step:g}, got {self.horizon:g}"
+            )
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
+from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import PRETRAINED, load_policy
 
 # Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
@@ -118,8 +119,8 @@ class Driver:
         return [self._build(ObservationMemory, memory)] if wanted else []
 
     def _build(self, kind: type[StepTransform], node: Any) -> Any:
-        resources = {"time_step": self.time_step, "population": bootstrap(), "string": STRING}
-        return build_as(f"a {kind.__name__}", kind, node, self.name, role=AUTOMATED, **resources)
+        world = World(STRING, self.time_step, population=bootstrap())
+        return build_as(f"a {kind.__name__}", kind, node, self.name, world=world)
 
     def _check(self) -> None:
         """Check that all that is read is measured or remembered."""
@@ -133,7 +134,7 @@ class Driver:
     def reads(self) -> list[Key]:
         """Return the keys of all that is read."""
         names = [] if self.module is None else self.module.names
-        sources = [key for piece in self.pieces for _, key in piece.sources]
+        sources = [key for piece in self.pieces for _, key in piece.needs]
         return [*sources, *(place(name)[0] for name in names)]
 
     def begin(self, measured: State) -> State:

@@ -6,12 +6,15 @@ call, on a stored rollout and in a replay buffer. Two kinds exist:
 * a :class:`Feature` reads one moment: the same function at reset and after every step;
 * a :class:`StepTransform` reads two: keys under ``"next"`` belong to the moment reached, all
   others to the moment left, so that it applies unchanged to any stored transition.
+
+A piece is made of its settings (:mod:`lcc_rl.settings`), and a copy of it is put into a world by
+``bind``, which calls ``setup``: there it says by ``wire`` what it reads and writes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -22,20 +25,19 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.views import NEXT as NEXT
+from lcc_rl.pieces.views import Key as Key
+from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.views import as_key as as_key
+from lcc_rl.pieces.world import Part, World
 
-Key = tuple[str, ...]
 # The entries of one moment by their full keys.
 State = dict[Key, Tensor]
 
-NEXT = "next"
 # Written by the clock: the seed from which everything random in an episode follows, and its step.
 SEED = ("episode", "seed")
 STEP = ("episode", "step")
-
-
-def as_key(key: NestedKey) -> Key:
-    """Return a key as a tuple; a dotted string counts as nested (``"vehicles.gap"``)."""
-    return tuple(key.split(".")) if isinstance(key, str) else tuple(key)
 
 
 def next_key(key: NestedKey) -> Key:
@@ -63,31 +65,55 @@ def require_option(key: Key, values: Tensor, count: Tensor | int) -> None:
         )
 
 
-class Piece(TensorDictModuleBase, Transform):
-    """Base of all pieces; see the module's description.
-
-    Args:
-        reads: keys of the arguments of :meth:`compute`, in order.
-        writes: keys of what :meth:`compute` returns, in order.
-        event_shape: shape of one written entry after the batch dimensions.
-    """
+class Piece(Part, TensorDictModuleBase, Transform):
+    """Base of all pieces; see the module's description."""
 
     # Maps the entries read to the entries written; a pure function of tensors.
-    compute: Callable[..., Any]
+    compute: ClassVar[Callable[..., Any]]
 
-    def __init__(
+    def settled(self) -> None:
+        """Make it a transform, which reads and writes nothing before :meth:`wire`."""
+        Transform.__init__(self, in_keys=[], out_keys=[])
+
+    def wire(
         self,
         reads: Sequence[NestedKey],
         writes: Sequence[NestedKey],
         event_shape: Sequence[int] = (1,),
     ) -> None:
-        super().__init__(
-            in_keys=[as_key(key) for key in reads], out_keys=[as_key(key) for key in writes]
-        )
+        """Set what the piece reads and writes.
+
+        Args:
+            reads: keys of the arguments of :meth:`compute`, in order.
+            writes: keys of what :meth:`compute` returns, in order.
+            event_shape: shape of one written entry after the batch dimensions.
+        """
+        self.in_keys = [as_key(key) for key in reads]
+        self.out_keys = [as_key(key) for key in writes]
         self.event_shape = tuple(event_shape)
         # As plain tuples: TorchRL's properties convert at every access.
-        self.sources = [(as_key(key)[0] == NEXT, root_key(key)) for key in reads]
+        self.needs = [(as_key(key)[0] == NEXT, root_key(key)) for key in reads]
         self.targets = [root_key(key) for key in writes]
+
+    def see(
+        self,
+        world: World,
+        names: Sequence[str],
+        writes: Sequence[NestedKey],
+        role: str = AUTOMATED,
+        **more: Any,
+    ) -> None:
+        """Set what is read as the vehicles of a role see it, one row each: ``self.views`` says how.
+
+        Args:
+            world: what the pieces of the environment share.
+            names: what is seen, see :mod:`lcc_rl.pieces.views`.
+            writes: keys of what :meth:`compute` returns, one number per vehicle, in order.
+            role: the role.
+            **more: further arguments of :meth:`wire`.
+        """
+        self.views = Views(world.string, role, names)
+        self.wire(self.views.keys, writes, (world.string.count(role), 1), **more)
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         """Return the spec of each written key, without ``"next"``."""
@@ -108,7 +134,7 @@ class Piece(TensorDictModuleBase, Transform):
         self._write(self.compute(*values), reached)
 
     def _entries(self, before: State, reached: State) -> list[Tensor]:
-        return [(reached if late else before)[key] for late, key in self.sources]
+        return [(reached if late else before)[key] for late, key in self.needs]
 
     def _write(self, values: Tensor | Sequence[Tensor], reached: State) -> None:
         values = (values,) if isinstance(values, Tensor) else values
@@ -150,7 +176,7 @@ class Feature(Piece):
     """A piece that reads one moment, at reset as well as after every step."""
 
     def _entries(self, before: State, reached: State) -> list[Tensor]:
-        return [reached[key] for _, key in self.sources]
+        return [reached[key] for _, key in self.needs]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -162,26 +188,29 @@ class Feature(Piece):
 
 
 class StepTransform(Piece):
-    """A piece that reads the moment left and the moment reached.
+    """A piece that reads the moment left and the moment reached."""
 
-    Args:
-        reads: keys of the arguments of :meth:`compute`; under ``"next"`` for the moment reached.
-        writes: keys written at the moment reached, given without ``"next"``.
-        constants: keys that :meth:`begin` sets at reset and that keep their value for the whole
-            episode.
-        reset_options: the keys among ``constants`` that a caller may set through ``env.reset``.
-        event_shape: shape of one written entry after the batch dimensions.
-    """
-
-    def __init__(
+    def wire(
         self,
         reads: Sequence[NestedKey],
         writes: Sequence[NestedKey],
+        event_shape: Sequence[int] = (1,),
         constants: Sequence[NestedKey] = (),
         reset_options: Sequence[NestedKey] = (),
-        event_shape: Sequence[int] = (1,),
     ) -> None:
-        super().__init__(reads, [next_key(key) for key in writes], event_shape)
+        """Set what the piece reads and writes.
+
+        Args:
+            reads: keys of the arguments of :meth:`compute`; under ``"next"`` for the moment
+                reached.
+            writes: keys written at the moment reached, given without ``"next"``.
+            event_shape: shape of one written entry after the batch dimensions.
+            constants: keys that :meth:`begin` sets at reset and that keep their value for the
+                whole episode.
+            reset_options: the keys among ``constants`` that a caller may set through
+                ``env.reset``.
+        """
+        super().wire(reads, [next_key(key) for key in writes], event_shape)
         self.constants = [as_key(key) for key in constants]
         self.reset_options = [as_key(key) for key in reset_options]
 
@@ -205,7 +234,7 @@ class StepTransform(Piece):
         reached.update((key, before[key]) for key in self.constants)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        entries = [(next_tensordict if late else tensordict).get(key) for late, key in self.sources]
+        entries = [(next_tensordict if late else tensordict).get(key) for late, key in self.needs]
         reached: State = {}
         self._write(self.compute(*entries), reached)
         reached.update((key, tensordict.get(key)) for key in self.constants)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -11,55 +11,34 @@ from torch import Tensor
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.functional.pattern import HUMAN, VehicleString
-from lcc_rl.pieces.controllers import Population
-from lcc_rl.pieces.drivers import LONGEST, DriverModel
+from lcc_rl.pieces.drivers import LONGEST, Drivers
+from lcc_rl.pieces.world import World
 
 
-class CalibratedDrivers(DriverModel):
-    """Drivers of the population, each by the model and parameters that were calibrated.
-
-    Args:
-        population: the drivers, of one model or several.
-        time_step, noise, wiener, delay, string, role: see
-            :class:`lcc_rl.pieces.drivers.DriverModel`.
-
-    Raises:
-        ConfigError: if a setting is out of range or the population does not tell its parameters.
-    """
+class CalibratedDrivers(Drivers):
+    """Drivers of the population, each by the model and parameters that were calibrated."""
 
     tells_gap = True
     further = ("driver",)
-    kinds: Tensor
+    kinds: ClassVar[Tensor]
 
-    def __init__(
-        self,
-        population: Population,
-        time_step: float,
-        noise: float = 0.05,
-        wiener: float = 0.0,
-        delay: int = 0,
-        string: VehicleString | None = None,
-        role: str = HUMAN,
-    ) -> None:
-        super().__init__(
-            population, time_step, noise, wiener, delay=delay, string=string, role=role
-        )
-        drivers = len(population.time_gap)
-        models = getattr(population, "models", None) or ("idm",) * drivers
+    def setup(self, world: World) -> None:
+        """Take the drivers' models and parameters."""
+        super().setup(world)
+        population = world.population
+        models = getattr(population, "models", None) or ("idm",) * len(population.time_gap)
         self.models = [name for name in LAWS if name in models]
-        kinds = torch.tensor([self.models.index(name) for name in models])
-        self.register_buffer("kinds", kinds)
-        for name, values in population.parameters().items():  # type: ignore[attr-defined]
+        self.register_buffer("kinds", torch.tensor([self.models.index(name) for name in models]))
+        for name, values in population.parameters().items():
             # What a driver's model lacks is computed, too, and must have a gradient.
             otherwise = [getattr(LAWS[model].constants, name, 1.0) for model in self.models]
-            single = values.float().nan_to_num(nan=otherwise[0])
-            self.register_buffer(f"own_{name}", single)
+            self.register_buffer(f"own_{name}", values.float().nan_to_num(nan=otherwise[0]))
 
-    def _checked(self, where: str, population: Population, *_: Any) -> DriverConstants:
-        if not hasattr(population, "parameters"):
+    def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
+        """Return the drivers, see :class:`Drivers`."""
+        if not hasattr(world.population, "parameters"):
             raise ConfigError(f"{where}: expected a population that tells its drivers' parameters")
-        return population.constants
+        return super().described(world, where)
 
     def acceleration(self, speed: Tensor, *more: Tensor) -> Tensor:
         """Return what the drivers wish, each by its own model."""

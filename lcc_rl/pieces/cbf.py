@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from math import inf
-
 import torch
+from pydantic import InstanceOf
 from torch import Tensor
 
-from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.braking import Braking, least_room, safe_acceleration
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import StepTransform
-from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive
 
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
@@ -45,69 +44,39 @@ class CBFFilter(StepTransform):
     pays for it with energy.
 
     Reads and replaces ``("command", role)``, ``[*batch, n, 1]`` [m/s²]. Differentiable.
-
-    Args:
-        time_step: duration of a step [s].
-        max_acceleration: bound of the acceleration in both directions [m/s²].
-        time_to_collision: shortest allowed [s].
-        rate: how fast that limit may be approached [1/s].
-        margin: gap that counts as contact [m].
-        braking_ahead: hardest braking of the vehicle ahead that is reckoned with [m/s²].
-        time_gap: longest allowed [s]; None: no limit.
-        shortest_time_gap: shortest allowed [s]; None: no limit.
-        time_gap_rate: how fast the limits of the time gap may be approached [1/s].
-        full_speed: speed below which the longest time gap falls in proportion; 0: it does not
-            [m/s].
-        least_gap: gap that the limit of the time gap always allows [m].
-        string: the string of vehicles; one automated vehicle where not given.
-        role: whose commands are filtered.
-
-    Raises:
-        ConfigError: if a limit, a rate or the acceleration is not positive, or another setting
-            negative.
     """
 
-    def __init__(
-        self,
-        time_step: float,
-        max_acceleration: float = 3.0,
-        time_to_collision: float = 4.0,
-        rate: float = 3.0,
-        margin: float = 0.2,
-        braking_ahead: float = 2.6,
-        time_gap: float | None = 2.45,
-        shortest_time_gap: float | None = None,
-        time_gap_rate: float = 0.2,
-        full_speed: float = 0.0,
-        least_gap: float = 2.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        where = f"scenario.filters.{role}"
-        limits = {"time_to_collision": time_to_collision, "rate": rate, "margin": margin}
-        limits |= {"time_gap_rate": time_gap_rate, "max_acceleration": max_acceleration}
-        limits |= {"braking_ahead": braking_ahead}
-        require_positive(where, **limits)
-        if time_gap is not None:
-            require_positive(where, time_gap=time_gap)
-        if shortest_time_gap is not None:
-            require_in(where, f"(0, {time_gap or inf})", shortest_time_gap=shortest_time_gap)
-        require_in(where, "[0, inf)", full_speed=full_speed, least_gap=least_gap)
-        string = VehicleString((role,)) if string is None else string
+    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    time_to_collision: Positive = 4.0  # shortest allowed [s]
+    rate: Positive = 3.0  # how fast that limit may be approached [1/s]
+    margin: Positive = 0.2  # gap that counts as contact [m]
+    braking_ahead: Positive = 2.6  # hardest braking of the vehicle ahead reckoned with [m/s²]
+    time_gap: Positive | None = 2.45  # longest allowed; None: no limit [s]
+    shortest_time_gap: Positive | None = None  # shortest allowed; None: no limit [s]
+    time_gap_rate: Positive = 0.2  # how fast limits of the time gap may be approached [1/s]
+    # Speed below which the longest time gap falls in proportion; 0: it does not [m/s].
+    full_speed: NonNegative = 0.0
+    least_gap: NonNegative = 2.0  # gap that the limit of the time gap always allows [m]
+
+    name = AUTOMATED
+
+    def __post_init__(self) -> None:
+        if self.time_gap is not None and (self.shortest_time_gap or 0.0) >= self.time_gap:
+            shortest = f"shortest_time_gap={self.shortest_time_gap}"
+            raise ValueError(f"{shortest} must be below time_gap={self.time_gap}")
+
+    def setup(self, world: World) -> None:
+        """Read the commands of the role and what bounds them."""
         seen = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
-        self.views = Views(string, role, [f"next.command.{role}", *seen])
-        super().__init__(self.views.keys, [("command", role)], event_shape=(string.count(role), 1))
-        self.time_step, self.max_acceleration = time_step, max_acceleration
-        self.rate, self.margin = rate, margin
-        self.braking = Braking(max_acceleration, braking_ahead, time_to_collision)
-        self.string, self.role = string, role
-        self.longest, self.shortest = time_gap, shortest_time_gap
-        self.time_gap_rate = time_gap_rate
-        self.full_speed, self.least_gap = max(full_speed, SLOWEST), least_gap
+        self.role, self.string, self.time_step = self.name, world.string, world.time_step
+        wanted = f"next.command.{self.role}"
+        self.see(world, [wanted, *seen], [("command", self.role)], self.role)
+        self.braking = Braking(self.max_acceleration, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> Promised:
         """Return the piece that says for which steps the filter answers."""
-        return Promised(self.braking, self.margin, self.string, self.role)
+        watching = Promised(braking=self.braking, margin=self.margin)
+        return watching.bind(World(self.string), self.role)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
@@ -119,8 +88,8 @@ class CBFFilter(StepTransform):
         """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²]."""
         closing, shortest = speed - ahead, self.braking.time_to_collision
         command = wanted
-        if self.longest is not None:
-            allowed, slope = self._longest_gap(speed, self.longest)
+        if self.time_gap is not None:
+            allowed, slope = self._longest_gap(speed, self.time_gap)
             least = (-closing - self.time_gap_rate * (allowed - gap)) / slope
             command = torch.maximum(command, least)
         free = gap - self.margin
@@ -128,10 +97,11 @@ class CBFFilter(StepTransform):
         expected = ahead_acceleration + slower / (shortest + 0.5 * self.time_step)
         safe = safe_acceleration(speed, free, ahead, self.braking, self.time_step)
         command = torch.minimum(command, torch.minimum(expected, safe))
-        if self.shortest is not None:
-            room = gap - self.shortest * speed
-            opening = 0.5 * self.time_step * ahead_acceleration - closing
-            held = (self.time_gap_rate * room + opening) / (self.shortest + 0.5 * self.time_step)
+        if self.shortest_time_gap is not None:
+            room = gap - self.shortest_time_gap * speed
+            half = 0.5 * self.time_step
+            opening = half * ahead_acceleration - closing
+            held = (self.time_gap_rate * room + opening) / (self.shortest_time_gap + half)
             command = torch.minimum(command, held)
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
         # Any of them that is no number, or infinite, shows in the sum.
@@ -141,7 +111,7 @@ class CBFFilter(StepTransform):
     def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
         """Return the longest gap at a speed, and how it grows with the speed."""
         moving = speed.clamp(min=SLOWEST)
-        share = (moving / self.full_speed).clamp(max=1.0)
+        share = (moving / max(self.full_speed, SLOWEST)).clamp(max=1.0)
         slope = time_gap * torch.where(share < 1.0, 2.0 * share, share)
         return (time_gap * share * moving).clamp(min=self.least_gap), slope
 
@@ -150,24 +120,17 @@ class Corrected(StepTransform):
     """Writes by how much the command differs from a policy's action, ``(role, "correction")``.
 
     ``[*batch, n, 1]`` [m/s²]: zero where the filter lets the policy drive.
-
-    Args:
-        max_acceleration: acceleration of action 1 [m/s²].
-        string: the string of vehicles; one automated vehicle where not given.
-        role: whose commands are filtered.
     """
 
-    def __init__(
-        self,
-        max_acceleration: float = 3.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        string = VehicleString((role,)) if string is None else string
-        self.views = Views(string, role, [f"{role}.action", f"next.command.{role}"])
-        writes, shape = [(role, "correction")], (string.count(role), 1)
-        super().__init__(self.views.keys, writes, event_shape=shape)
-        self.max_acceleration = max_acceleration
+    max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
+
+    name = AUTOMATED
+
+    def setup(self, world: World) -> None:
+        """Read the actions and commands of the role."""
+        role = self.name
+        seen = (f"{role}.action", f"next.command.{role}")
+        self.see(world, seen, [(role, "correction")], role)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return what the filter added."""
@@ -180,19 +143,17 @@ class Promised(StepTransform):
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
     is reckoned with: time-to-collision at its end is then above the filter's limit; else 0.
-
-    Args:
-        braking: what the filter reckons with.
-        margin: gap that counts as contact [m].
-        string: the string of vehicles.
-        role: whose commands are filtered.
     """
 
-    def __init__(self, braking: Braking, margin: float, string: VehicleString, role: str) -> None:
+    braking: InstanceOf[Braking]  # what the filter reckons with
+    margin: Positive  # gap that counts as contact [m]
+
+    name = AUTOMATED
+
+    def setup(self, world: World) -> None:
+        """Read what bounds the commands of the role."""
         seen = ("self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration")
-        self.views = Views(string, role, seen)
-        super().__init__(self.views.keys, [(role, "promised")], event_shape=(string.count(role), 1))
-        self.braking, self.margin = braking, margin
+        self.see(world, seen, [(self.name, "promised")], self.name)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return 1 for the steps that are covered."""

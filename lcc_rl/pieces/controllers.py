@@ -1,11 +1,13 @@
 """Controllers: what the vehicles of a role wish to do, one acceleration each.
 
-A controller of your own is a class with the names it reads (:mod:`lcc_rl.pieces.views`) and its
-law::
+A controller of your own is a class with its settings (:mod:`lcc_rl.settings`), the names of what
+it reads (:mod:`lcc_rl.pieces.views`) and its law::
 
     class KeepDistance(Controller):
+        distance: Positive = 20.0    # gap to be kept [m]
         reads = ("self.gap", "self.relative_speed")
-        def command(self, gap, relative_speed): return 0.1 * (gap - 20.0) + 0.5 * relative_speed
+        def command(self, gap, relative_speed):
+            return 0.1 * (gap - self.distance) + 0.5 * relative_speed
 
 and ``scenario.controllers.automated._target_=mymodule.KeepDistance`` on the command line. Any
 controller drives any role, and is a policy by :class:`lcc_rl.policies.ControllerPolicy`.
@@ -14,17 +16,17 @@ controller drives any role, and is a policy by :class:`lcc_rl.policies.Controlle
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces.base import StepTransform
-from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import Number, Positive
 
 # The names of the random streams: an episode's seed means the same episode under either.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
@@ -54,39 +56,42 @@ class Population(Protocol):
 class Controller(StepTransform):
     """Base of all controllers: writes ``("command", role)``, ``[*batch, n, 1]`` [m/s²].
 
-    Args:
-        string: the string of vehicles; one automated vehicle where not given.
-        role: the role that it drives.
-        reads: names of what it reads, where they depend on settings.
-        writes: entries written besides the command, in the order of the values after it.
-        constants, reset_options: see :class:`lcc_rl.pieces.base.StepTransform`.
+    The role that it drives is its name in an environment.
     """
 
-    reads: ClassVar[tuple[str, ...]] = ()
+    name: ClassVar[str] = AUTOMATED
+    reads: ClassVar[Sequence[str]] = ()
     # Maps what is read, one row per vehicle of the role, to the commands [*batch, n, 1], or to a
     # tuple of them and the further entries written.
-    command: Callable[..., Any]
+    command: ClassVar[Callable[..., Any]]
 
-    def __init__(
+    def bind(self, world: World | None = None, name: str | None = None) -> Self:
+        """Return the controller of a role; without a world, of one vehicle of that role."""
+        role = name or self.name
+        return super().bind(world or World(VehicleString((role,))), role)
+
+    def setup(self, world: World) -> None:
+        """Derive from a world what depends on it; one that overrides this calls it or drive."""
+        self.drive(world, self.reads)
+
+    def drive(
         self,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-        reads: Sequence[str] | None = None,
+        world: World,
+        reads: Sequence[str],
         writes: Sequence[NestedKey] = (),
-        constants: Sequence[NestedKey] = (),
-        reset_options: Sequence[NestedKey] = (),
+        **more: Sequence[NestedKey],
     ) -> None:
-        string = VehicleString((role,)) if string is None else string
-        self.role, self.string = role, string
-        self.names = tuple(self.reads if reads is None else reads)
-        self.views = Views(string, role, self.names)
-        super().__init__(
-            self.views.keys,
-            [("command", role), *writes],
-            constants,
-            reset_options,
-            (string.count(role), 1),
-        )
+        """Set what is read by name, and what is written besides the command.
+
+        Args:
+            world: what the pieces of the environment share.
+            reads: names of what it reads.
+            writes: entries in the order of the values after the command.
+            **more: see :meth:`lcc_rl.pieces.base.StepTransform.wire`.
+        """
+        self.role, self.string, self.time_step = self.name, world.string, world.time_step
+        self.names = tuple(reads)
+        self.see(world, reads, [("command", self.role), *writes], self.role, **more)
 
     def compute(self, *entries: Tensor) -> Any:
         """Return the commands, and what else is written."""
@@ -98,24 +103,13 @@ class Action(Controller):
 
     Reads ``(role, "action")``, ``[*batch, n, 1]``; like everybody who reads it by its name, it
     sees actions beyond the range as its ends (:mod:`lcc_rl.pieces.views`).
-
-    Args:
-        max_acceleration: acceleration of action 1, braking of action −1 [m/s²].
-        string, role: see :class:`Controller`.
-
-    Raises:
-        ConfigError: if ``max_acceleration`` is not positive.
     """
 
-    def __init__(
-        self,
-        max_acceleration: float = 3.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        require_positive(f"scenario.controllers.{role}", max_acceleration=max_acceleration)
-        super().__init__(string, role, [f"{role}.action"])
-        self.max_acceleration = max_acceleration
+    max_acceleration: Positive = 3.0  # acceleration of action 1, braking of action −1 [m/s²]
+
+    def setup(self, world: World) -> None:
+        """Read the role's action."""
+        self.drive(world, [f"{self.name}.action"])
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commands."""
@@ -123,27 +117,11 @@ class Action(Controller):
 
 
 class ConstantAcceleration(Controller):
-    """The same acceleration always; behind a safety filter, the filter alone drives.
+    """The same acceleration always; behind a safety filter, the filter alone drives."""
 
-    Args:
-        acceleration: that acceleration [m/s²].
-        string, role: see :class:`Controller`.
-
-    Raises:
-        ConfigError: if ``acceleration`` is not finite.
-    """
+    acceleration: Number = 0.0  # [m/s²]
 
     reads = ("self.speed",)
-
-    def __init__(
-        self,
-        acceleration: float = 0.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        require_in(f"scenario.controllers.{role}", "(-inf, inf)", acceleration=acceleration)
-        super().__init__(string, role)
-        self.acceleration = acceleration
 
     def command(self, speed: Tensor) -> Tensor:
         """Return the commands."""

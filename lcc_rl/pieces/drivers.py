@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+from pydantic import Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw
 from lcc_rl.functional.gipps import GIPPS_LAW
 from lcc_rl.functional.idm import IDM_LAW
 from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
-from lcc_rl.functional.pattern import HUMAN, VehicleString
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Key, as_key, require_option
-from lcc_rl.pieces.controllers import Controller, Population, stream_name
+from lcc_rl.pieces.controllers import Controller, stream_name
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive, Share
 
 LEADER_SPEED = ("leader", "speed")
 MOTION = ("self.speed", "self.gap", "self.relative_speed")
@@ -25,104 +28,64 @@ LONGEST = 1000.0  # time gap up to which an equilibrium is told [s]
 MOST_DELAY = 1000  # steps that a driver may be late; each is kept per vehicle
 
 
-class DriverModel(Controller):
+class Drivers(Controller):
     """Base of human drivers: each has its own (v0, T), noise and a reaction delay.
 
-    Every vehicle draws a driver of the population by the episode's seed, unless ``(role,
-    "driver")`` is given to ``env.reset``; or all are the one driver that ``desired_speed`` and
-    ``time_gap`` describe. Constants of the episode under the role, ``[*batch, n, 1]``: driver,
+    Every vehicle draws a driver by the episode's seed, unless ``(role, "driver")`` is given to
+    ``env.reset``. Constants of the episode under the role, ``[*batch, n, 1]``: driver,
     desired_speed [m/s], desired_time_gap [s]; of other models than the IDM behind a leader also
     equilibrium_gap, at which the driver follows at the leader's first speed [m]. With a delay,
     ``(role, "motion_history")``, ``[*batch, n, 3 · delay]``, holds past speeds [m/s], gaps [m] and
     relative speeds [m/s], latest first.
-
-    A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
-    :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
-
-    Args:
-        population: the drivers.
-        time_step: duration of a step [s].
-        noise: largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each
-            step from U(0, noise) (A18).
-        wiener: standard deviation of a random walk of the speed [m/s per √s].
-        desired_speed: v0 of every vehicle; None: that of drivers of the population [m/s].
-        time_gap: T of every vehicle, likewise [s].
-        delay: steps by which speed, gap and relative speed are old when the driver reacts; until
-            then, those at the start of the episode.
-        parameters: those besides v0 and T, the law's constants; None: of the population.
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is out of range, one of v0 and T is given alone, or the drivers
-            of the population have other models.
     """
 
+    # Largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each step from
+    # U(0, noise) (A18).
+    noise: Share = 0.05
+    wiener: NonNegative = 0.0  # standard deviation of a random walk of the speed [m/s per √s]
+    # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
+    # those at the start of the episode.
+    delay: Annotated[int, Field(ge=0, le=MOST_DELAY)] = 0
+
+    name = HUMAN
     law: ClassVar[DriverLaw] = IDM_LAW
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
-    desired_speeds: Tensor
-    time_gaps: Tensor
-    index: Tensor
+    desired_speeds: ClassVar[Tensor]
+    time_gaps: ClassVar[Tensor]
+    index: ClassVar[Tensor]
 
-    def __init__(
-        self,
-        population: Population,
-        time_step: float,
-        noise: float = 0.05,
-        wiener: float = 0.0,
-        desired_speed: float | None = None,
-        time_gap: float | None = None,
-        delay: int = 0,
-        parameters: DriverConstants | None = None,
-        string: VehicleString | None = None,
-        role: str = HUMAN,
-    ) -> None:
-        where = f"scenario.controllers.{role}"
-        require_in(where, "[0, 1)", noise=noise)
-        require_in(where, "[0, inf)", wiener=wiener)
-        require_whole(where, 0, MOST_DELAY, delay=delay)
-        string = VehicleString((role,)) if string is None else string
-        own = _given_driver(where, desired_speed, time_gap)
-        self.drivers = self._checked(where, population, parameters, own is not None)
+    def setup(self, world: World) -> None:
+        """Take the drivers, and choose what is read and written by the settings."""
+        role = self.name
+        speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         told = ["driver", "desired_speed", "desired_time_gap"]
-        self.starts = self.tells_gap and not string.ring
+        self.starts = self.tells_gap and not world.string.ring
         constants = [(role, name) for name in [*told, *["equilibrium_gap"] * self.starts]]
-        history = [(role, "motion_history")] * (delay > 0)
+        history = [(role, "motion_history")] * (self.delay > 0)
         names = [*MOTION, *(".".join(key) for key in constants[1:3]), "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         names += [".".join(key) for key in history]
-        super().__init__(string, role, names, history, constants, constants[:1])
-        self.noise, self.spread, self.delay = noise, wiener / time_step**0.5, delay
-        drivers = (population.desired_speed, population.time_gap) if own is None else own
+        options = constants[:1]
+        self.drive(world, names, history, constants=constants, reset_options=options)
+        self.spread = self.wiener / world.time_step**0.5
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
-        self.register_buffer("desired_speeds", drivers[0])
-        self.register_buffer("time_gaps", drivers[1])
+        self.register_buffer("desired_speeds", speeds)
+        self.register_buffer("time_gaps", time_gaps)
         self.register_buffer("index", torch.arange(self.event_shape[0]).unsqueeze(-1))
 
-    def _checked(
-        self, where: str, population: Population, given: DriverConstants | None, one: bool
-    ) -> DriverConstants:
-        """Return the law's constants; refuse drivers that were calibrated by other models."""
-        models = getattr(population, "models", None)
-        if models and not one:
-            raise ConfigError(
-                f"{where}: the population holds drivers of the model(s) "
-                f"{', '.join(sorted(set(models)))}, expected IDM drivers; "
-                f"controller@{where}=calibrated drives each by its own model"
-            )
-        found = population.constants if given is None else given
-        if not isinstance(found, self.law.constants):
-            expected = self.law.constants.__name__
-            raise ConfigError(f"{where}.parameters: expected {expected}, got {found!r}")
-        if any(isinstance(value, Tensor) for value in vars(found).values()):
-            raise ConfigError(
-                f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
-                "drivers.mode=local), got a population in which they differ by driver; "
-                f"controller@{where}=calibrated drives each by its own"
-            )
-        return found
+    def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
+        """Return v0 [m/s] and T [s] of the drivers, ``[drivers]``, and what they share.
+
+        Raises:
+            ConfigError: if there are none, or they are of other models.
+        """
+        if world.population is None:
+            raise ConfigError(f"{where} needs drivers: bind it to a World(population=…)")
+        population = world.population
+        return population.desired_speed, population.time_gap, population.constants
 
     def command(
         self,
@@ -203,26 +166,61 @@ class DriverModel(Controller):
             start.set(as_key(key), value)
 
 
-def _given_driver(
-    where: str, desired_speed: float | None, time_gap: float | None
-) -> tuple[Tensor, Tensor] | None:
-    """Return v0 and T as a population of one, None where neither is given."""
-    if desired_speed is None and time_gap is None:
-        return None
-    if desired_speed is None or time_gap is None:
-        raise ConfigError(f"{where}: desired_speed and time_gap belong together: give both or none")
-    require_positive(where, desired_speed=desired_speed, time_gap=time_gap)
-    return torch.tensor([float(desired_speed)]), torch.tensor([float(time_gap)])
+class DriverModel(Drivers):
+    """Drivers of one model: those of the population, or one and the same in all vehicles.
+
+    They execute what they wish with a relative error (A18).
+
+    A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
+    :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
+    """
+
+    desired_speed: Positive | None = None  # v0 of every vehicle; None: of the population [m/s]
+    time_gap: Positive | None = None  # T of every vehicle, likewise [s]
+    # Those besides v0 and T, the law's constants; None: of the population.
+    parameters: InstanceOf[DriverConstants] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.desired_speed is None) != (self.time_gap is None):
+            raise ValueError("desired_speed and time_gap belong together: give both or none")
+
+    def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
+        """Return the drivers, see :class:`Drivers`; refuse those calibrated by other models."""
+        one = self.desired_speed is not None
+        if one:
+            own = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
+            known = self.law.constants() if world.population is None else world.population.constants
+            found = (own[0], own[1], known)
+        else:
+            found = super().described(world, where)
+        models = getattr(world.population, "models", None)
+        if models and not one:
+            raise ConfigError(
+                f"{where}: the population holds drivers of the model(s) "
+                f"{', '.join(sorted(set(models)))}, expected IDM drivers; "
+                f"controller@{where}=calibrated drives each by its own model"
+            )
+        constants = found[2] if self.parameters is None else self.parameters
+        if not isinstance(constants, self.law.constants):
+            expected = self.law.constants.__name__
+            raise ConfigError(f"{where}.parameters: expected {expected}, got {constants!r}")
+        if any(isinstance(value, Tensor) for value in vars(constants).values()):
+            raise ConfigError(
+                f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
+                "drivers.mode=local), got a population in which they differ by driver; "
+                f"controller@{where}=calibrated drives each by its own"
+            )
+        return (*found[:2], constants)
 
 
 class IDM(DriverModel):
-    """Drivers of the Intelligent Driver Model (A3–A4); arguments as of :class:`DriverModel`."""
+    """Drivers of the Intelligent Driver Model (A3–A4)."""
 
 
 class OVM(DriverModel):
     """Drivers of the optimal velocity model, see :func:`lcc_rl.functional.ovm.ovm_acceleration`.
 
-    It does not regard the speed difference, and may collide. Arguments as of :class:`DriverModel`.
+    It does not regard the speed difference, and may collide.
     """
 
     law = OVM_LAW
@@ -230,7 +228,7 @@ class OVM(DriverModel):
 
 
 class FVDM(DriverModel):
-    """Drivers of the full velocity difference model; arguments as of :class:`DriverModel`.
+    """Drivers of the full velocity difference model.
 
     See :func:`lcc_rl.functional.ovm.fvdm_acceleration`.
     """
@@ -240,10 +238,7 @@ class FVDM(DriverModel):
 
 
 class Gipps(DriverModel):
-    """Drivers of Gipps' model, see :func:`lcc_rl.functional.gipps.gipps_acceleration`.
-
-    Arguments as of :class:`DriverModel`.
-    """
+    """Drivers of Gipps' model, see :func:`lcc_rl.functional.gipps.gipps_acceleration`."""
 
     law = GIPPS_LAW
     tells_gap = True

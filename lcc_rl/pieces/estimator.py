@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import require_in, require_positive
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
-from lcc_rl.functional.pattern import HUMAN, VehicleString
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.pieces.base import Key, StepTransform
-from lcc_rl.pieces.controllers import Population
-from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive
 
 
 class DriverEstimator(StepTransform):
@@ -29,48 +28,24 @@ class DriverEstimator(StepTransform):
     its start, ``[*batch, n, 1]`` [m/s²], and the belief ``"estimate"`` ``[*batch, n, 2]`` and
     ``"covariance"`` ``[*batch, n, 3]`` (see
     :mod:`lcc_rl.functional.estimation`).
-
-    Args:
-        population: the calibrated drivers; what they share beside (v0, T) is taken as its mean.
-        time_step: duration of a step [s].
-        learning_time: time before the online fit is trusted [s]; None for the population mean
-            throughout.
-        measurement_error: standard deviation of the measured acceleration [m/s²].
-        string: the string of vehicles; one human driver where not given.
-        role: whose acceleration is predicted.
-
-    Raises:
-        ConfigError: if ``measurement_error`` is not positive or ``learning_time`` negative.
     """
 
-    prior_estimate: Tensor
-    prior_covariance: Tensor
+    learning_time: NonNegative | None = 5.0  # until the fit is trusted; None: never [s]
+    measurement_error: Positive = 0.05  # standard deviation of the acceleration [m/s²]
+    role: str = HUMAN  # whose acceleration is predicted
 
-    def __init__(
-        self,
-        population: Population,
-        time_step: float,
-        learning_time: float | None = 5.0,
-        measurement_error: float = 0.05,
-        string: VehicleString | None = None,
-        role: str = HUMAN,
-    ) -> None:
-        where = "scenario.pieces.estimator"
-        require_positive(where, measurement_error=measurement_error)
-        if learning_time is not None:
-            require_in(where, "[0, inf)", learning_time=learning_time)
-        string = VehicleString((role,)) if string is None else string
+    prior_estimate: ClassVar[Tensor]
+    prior_covariance: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        """Take what the drivers of the population have in common; what they share, as its mean."""
+        role, population, time_step = self.role, world.population, world.time_step
         belief = [(role, "estimate"), (role, "covariance")]
         motion = [f"self.{name}" for name in ("speed", "gap", "relative_speed")]
         names = [*motion, *(".".join(key) for key in belief), "episode.step", "next.self.speed"]
-        self.views = Views(string, role, names)
-        super().__init__(
-            self.views.keys,
-            [(role, "predicted_acceleration"), *belief],
-            event_shape=(string.count(role), 1),
-        )
-        self.time_step, self.measurement_error = time_step, measurement_error
-        self.learning_steps = inf if learning_time is None else learning_time / time_step
+        self.see(world, names, [(role, "predicted_acceleration"), *belief], role)
+        self.time_step = time_step
+        self.learning_steps = inf if self.learning_time is None else self.learning_time / time_step
         self.drivers = population.constants.shared()
         self.mean = PopulationMean(population.desired_speed, population.time_gap, self.drivers)
         start = prior(population.desired_speed, population.time_gap, self.drivers.exponent)

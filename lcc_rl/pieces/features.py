@@ -10,31 +10,23 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.energy import EnergyModel, Fleet, as_fleet
-from lcc_rl.errors import require_in, require_positive
-from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
-from lcc_rl.pieces.base import SEED, Feature, Key, StepTransform, as_key, next_key
+from lcc_rl.pieces.base import SEED, Feature, Key, StepTransform, next_key
 from lcc_rl.pieces.views import VEHICLES, Views
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive
 
 
 class TimeToCollision(Feature):
-    """Writes the time-to-collision of every vehicle, ``("vehicles", "ttc")`` [s] (A10).
+    """Writes the time-to-collision of every vehicle, ``("vehicles", "ttc")`` [s] (A10)."""
 
-    Args:
-        string: the string of vehicles.
-        floor: smallest value, which a collision has too [s].
+    floor: Positive = 0.01  # smallest value, which a collision has too [s]
 
-    Raises:
-        ConfigError: if the floor is not positive.
-    """
-
-    def __init__(self, string: VehicleString, floor: float = 0.01) -> None:
-        require_positive("scenario.pieces.ttc", floor=floor)
+    def setup(self, world: World) -> None:
+        """Read the motion."""
         reads = [(VEHICLES, "gap"), (VEHICLES, "relative_speed")]
-        super().__init__(reads, [(VEHICLES, "ttc")], (len(string), 1))
-        self.floor = floor
+        self.wire(reads, [(VEHICLES, "ttc")], (len(world.string), 1))
 
     def compute(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the time-to-collision, ``[*batch, N, 1]``."""
@@ -42,21 +34,14 @@ class TimeToCollision(Feature):
 
 
 class TimeGap(Feature):
-    """Writes the time gap of every vehicle, ``("vehicles", "time_gap")`` [s] (A12).
+    """Writes the time gap of every vehicle, ``("vehicles", "time_gap")`` [s] (A12)."""
 
-    Args:
-        string: the string of vehicles.
-        speed_floor: speeds below this count as this; 0 is the literal rule [m/s].
+    speed_floor: NonNegative = 1.0  # speeds below this count as this; 0: the literal rule [m/s]
 
-    Raises:
-        ConfigError: if the floor is negative.
-    """
-
-    def __init__(self, string: VehicleString, speed_floor: float = 1.0) -> None:
-        require_in("scenario.pieces.time_gap", "[0, inf)", speed_floor=speed_floor)
+    def setup(self, world: World) -> None:
+        """Read the motion."""
         reads = [(VEHICLES, "gap"), (VEHICLES, "speed")]
-        super().__init__(reads, [(VEHICLES, "time_gap")], (len(string), 1))
-        self.speed_floor = speed_floor
+        self.wire(reads, [(VEHICLES, "time_gap")], (len(world.string), 1))
 
     def compute(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the time gap, ``[*batch, N, 1]``."""
@@ -71,15 +56,12 @@ class EnergyClasses(StepTransform):
 
     By the episode's seed, so that whoever drives meets the same vehicles; numbers are those of
     the fleet's models.
-
-    Args:
-        string: the string of vehicles.
-        energy: the classes and their shares.
     """
 
-    def __init__(self, string: VehicleString, energy: Fleet) -> None:
-        super().__init__([], [], constants=[CLASS], event_shape=(len(string), 1))
-        self.string, self.energy = string, energy
+    def setup(self, world: World) -> None:
+        """Take the classes and their shares from the world."""
+        self.wire([], [], (len(world.string), 1), constants=[CLASS])
+        self.string, self.energy = world.string, world.energy
         self.stream = stream_id("vehicles.energy_class")
 
     def compute(self) -> tuple[()]:
@@ -117,36 +99,26 @@ def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:
 class MotorPower(StepTransform):
     """Writes the power of the step just taken [W], from the speed at its start (A2 by default).
 
-    Args:
-        string: the string of vehicles.
-        vehicles: whose power: ``"vehicles"`` for all of them, or a role.
-        acceleration: entry of theirs that holds the acceleration; ``"predicted_acceleration"``
-            for what an automated vehicle believes of a human driver (A16).
-        power: entry of theirs that is written.
-        recuperation: count negative (braking) power.
-        energy: the energy models; None for that of the ALCC paper.
+    Of a predicted acceleration it is what an automated vehicle believes of a human driver (A16).
     """
 
-    def __init__(
-        self,
-        string: VehicleString,
-        vehicles: str = VEHICLES,
-        acceleration: str = "acceleration",
-        power: str = "power",
-        recuperation: bool = True,
-        energy: Fleet | EnergyModel | None = None,
-    ) -> None:
-        everybody = vehicles == VEHICLES
+    vehicles: str = VEHICLES  # whose power: "vehicles" for all of them, or a role
+    # Entry of theirs that holds the acceleration, or "predicted_acceleration".
+    acceleration: str = "acceleration"
+    power: str = "power"  # entry of theirs that is written
+    recuperation: bool = True  # braking feeds the battery
+
+    def setup(self, world: World) -> None:
+        """Read the motion of those vehicles, and the class of each where there are several."""
+        everybody, string = self.vehicles == VEHICLES, world.string
         speed = f"{VEHICLES}.speed" if everybody else "self.speed"
-        source = next_key((vehicles, acceleration))
-        self.energy = as_fleet(energy)
-        names = [speed, ".".join(source)]
+        names = [speed, ".".join(next_key((self.vehicles, self.acceleration)))]
+        self.energy = world.energy
         if len(self.energy.models) > 1:
             names.append(".".join(CLASS) if everybody else f"self.{CLASS[-1]}")
-        self.views = Views(string, vehicles, names)
-        count = len(string) if everybody else string.count(vehicles)
-        super().__init__(self.views.keys, [as_key((vehicles, power))], event_shape=(count, 1))
-        self.recuperation = recuperation
+        self.views = Views(string, self.vehicles, names)
+        count = len(string) if everybody else string.count(self.vehicles)
+        self.wire(self.views.keys, [(self.vehicles, self.power)], (count, 1))
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the power, ``[*batch, n, 1]``."""

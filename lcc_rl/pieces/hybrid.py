@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import torch
+from pydantic import InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.errors import ConfigError, require_in, require_positive
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Decision,
@@ -22,10 +24,11 @@ from lcc_rl.functional.hcfs import (
     jerk_interval,
     safe_acceleration,
 )
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.base import Key, Piece
-from lcc_rl.pieces.connected import Communication, check_leader, leader_names
+from lcc_rl.pieces.connected import Communication, Lookahead, check_leader, leader_names
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive
 
 HYBRID, COUNTERS = "hybrid", ("switches", "clamps", "cap_interventions")
 OWN = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
@@ -40,79 +43,46 @@ class HCFS(Controller):
     int64: ``winner`` (0 rule, 1 policy; −1 at reset) and since the start of the episode the
     numbers of ``switches``, ``clamps`` (the jerk bound cut a candidate) and
     ``cap_interventions``.
-
-    Args:
-        rule: the controller whose command is one candidate; of the same role.
-        time_step: duration of a step T [s].
-        max_acceleration: acceleration of action 1 [m/s²].
-        jerk_bound: J [m/s³]; the paper's 2 a_max/T = 30 never binds.
-        lookahead: how the leader's next speed is predicted: ``"causal"`` by v0 + a0 T, ``"hold"``
-            by v0; ``"oracle"`` knows it and serves as an upper bound only.
-        clamp: hold the candidates within the jerk bound; false is the literal rule, which
-            violates it.
-        safe_cap: hold the result below what braking allows; false is the literal rule, which in
-            long runs drives through the vehicle ahead: the paper's reward has no spacing term. It
-            brakes fully where a measurement, the action or the rule's command is no finite number.
-        braking: b of the safe cap [m/s²].
-        margin: gap that it keeps at standstill [m].
-        velocity_weight, speed_scale, jerk_weight, jerk_scale: of the reward compared, see
-            :class:`lcc_rl.functional.hcfs.PlatoonReward`.
-        spacing_weight, gap_scale, spacing_time: of its spacing term, likewise; with
-            weight 0 they have no effect, which is the paper's rule.
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is unknown or out of range.
     """
 
-    def __init__(
-        self,
-        rule: Controller,
-        time_step: float,
-        max_acceleration: float = 3.0,
-        jerk_bound: float = 30.0,
-        lookahead: str = "causal",
-        clamp: bool = True,
-        safe_cap: bool = True,
-        braking: float = 3.0,
-        margin: float = 0.5,
-        velocity_weight: float = 10.0,
-        speed_scale: float = 27.1,
-        jerk_weight: float = 0.036,
-        jerk_scale: float = 30.0,
-        spacing_weight: float = 0.0,
-        gap_scale: float = 1.0,
-        spacing_time: float = 0.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        where = f"scenario.controllers.{role}"
-        require_positive(where, max_acceleration=max_acceleration, jerk_bound=jerk_bound)
-        # More than the vehicles can brake would be no safe cap.
-        require_in(where, f"(0, {max_acceleration}]", braking=braking)
-        weights = {"velocity_weight": velocity_weight, "jerk_weight": jerk_weight}
-        weights |= {"spacing_weight": spacing_weight, "spacing_time": spacing_time}
-        require_in(where, "[0, inf)", margin=margin, **weights)
-        scales = {"speed_scale": speed_scale, "jerk_scale": jerk_scale, "gap_scale": gap_scale}
-        require_positive(where, **scales)
+    rule: InstanceOf[Controller]  # whose command is one candidate
+    max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
+    jerk_bound: Positive = 30.0  # J; the paper's 2 a_max/T = 30 never binds [m/s³]
+    lookahead: Lookahead = "causal"
+    clamp: bool = True  # hold the candidates within the jerk bound; false: the literal rule
+    # Hold the result below what braking allows; false is the literal rule, which in long runs
+    # drives through the vehicle ahead: the paper's reward has no spacing term. It brakes fully
+    # where a measurement, the action or the rule's command is no finite number.
+    safe_cap: bool = True
+    braking: Positive = 3.0  # b of the safe cap [m/s²]
+    margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
+    # Of the reward compared, see lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
+    # the paper's rule, gap_scale and spacing_time have no effect.
+    velocity_weight: NonNegative = 10.0
+    speed_scale: Positive = 27.1  # [m/s]
+    jerk_weight: NonNegative = 0.036
+    jerk_scale: Positive = 30.0  # [m/s³]
+    spacing_weight: NonNegative = 0.0
+    gap_scale: Positive = 1.0  # [m]
+    spacing_time: NonNegative = 0.0  # e_x counts so long after the step [s]
+
+    def __post_init__(self) -> None:
+        if self.braking > self.max_acceleration:  # more than vehicles can brake is no safe cap
+            raise ValueError(
+                f"braking must be at most max_acceleration={self.max_acceleration}, "
+                f"got {self.braking}"
+            )
+
+    def setup(self, world: World) -> None:
+        """Read what both candidates and the decision need."""
+        self.rule = rule = self.rule.bind(world, self.name)
         state = [(HYBRID, name) for name in ("winner", *COUNTERS)]
-        super().__init__(
-            string,
-            role,
-            [
-                f"{role}.action",
-                *(f"self.{name}" for name in OWN),
-                *leader_names(lookahead),
-                *(".".join(key) for key in state),
-                *rule.names,
-            ],
-            state,
-        )
-        self.rule, self.lookahead = rule, check_leader(lookahead, self)
-        self.time_step, self.max_acceleration = time_step, max_acceleration
-        self.jerk_bound, self.clamp, self.safe_cap = jerk_bound, clamp, safe_cap
-        self.braking, self.margin = braking, margin
-        self.reward = PlatoonReward(**weights, **scales)
+        reads = [f"{self.name}.action", *(f"self.{name}" for name in OWN)]
+        reads += [*leader_names(self.lookahead), *(".".join(key) for key in state), *rule.names]
+        self.drive(world, reads, state)
+        check_leader(self.lookahead, self)
+        own = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
+        self.reward = PlatoonReward(**own)
 
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""

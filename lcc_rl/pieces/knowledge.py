@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.data.profiles import Profiles
-from lcc_rl.errors import ConfigError, require_in
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import NEXT, SEED, STEP, Feature, Key, StepTransform
 from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative
 
-KINDS = ("filtered", "stacked")
-LONGEST = 3600  # what is remembered or known ahead [s]
+Seconds = Annotated[float, Field(ge=0.0, le=3600.0)]  # what is remembered or known ahead
+Times = Annotated[tuple[Seconds, ...], Field(strict=False, min_length=1)]
 
 
 class LeaderPreview(Feature):
@@ -27,39 +28,24 @@ class LeaderPreview(Feature):
     Writes ``("preview", "speed")`` [m/s], ``[*batch, 1, horizons]``: one row for all vehicles.
     Beyond the end of a record its last speed stands; a window cut from a longer record continues
     in it. Reading the record makes this an upper bound: no real message knows this much.
-
-    Args:
-        profiles: the leader's records.
-        time_step: duration of a step [s].
-        horizons: how far ahead, one or more [s].
-        noise: standard deviation of an error drawn anew for each step and horizon [m/s].
-        delay: age of the message: the speed of that long before is given instead [s].
-
-    Raises:
-        ConfigError: if there is no horizon, or a setting is out of range.
     """
 
-    speeds: Tensor
-    offsets: Tensor
-    last: Tensor
-    shift: Tensor
-    columns: Tensor
+    horizons: Times = (1.0, 2.0, 3.0, 4.0, 5.0)  # how far ahead [s]
+    noise: NonNegative = 0.0  # standard deviation of an error drawn anew for each speed [m/s]
+    delay: Seconds = 0.0  # age of the message: the speed of that long before is given instead [s]
 
-    def __init__(
-        self,
-        profiles: Profiles,
-        time_step: float,
-        horizons: Sequence[float] = (1.0, 2.0, 3.0, 4.0, 5.0),
-        noise: float = 0.0,
-        delay: float = 0.0,
-    ) -> None:
-        _check_seconds("preview.horizons", horizons, 0)
-        require_in("preview", "[0, inf)", noise=noise)
-        require_in("preview", f"[0, {LONGEST}]", delay=delay)
-        reads = [("leader", "profile"), ("leader", "start"), SEED, STEP]
-        super().__init__(reads, [("preview", "speed")], (1, len(horizons)))
-        self.noise, self.stream = noise, stream_id("preview.noise")
-        steps = [round((horizon - delay) / time_step) for horizon in horizons]
+    speeds: ClassVar[Tensor]
+    offsets: ClassVar[Tensor]
+    last: ClassVar[Tensor]
+    shift: ClassVar[Tensor]
+    columns: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        """Take the leader's records."""
+        reads, profiles = [("leader", "profile"), ("leader", "start"), SEED, STEP], world.profiles
+        self.wire(reads, [("preview", "speed")], (1, len(self.horizons)))
+        self.stream = stream_id("preview.noise")
+        steps = [round((horizon - self.delay) / world.time_step) for horizon in self.horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         known = profiles.lengths if profiles.reach is None else profiles.reach
@@ -84,52 +70,36 @@ class ObservationMemory(StepTransform):
     source and each number in ``seconds`` its exponential average with that time constant
     (``filtered``), or its value of that long ago (``stacked``, which also writes the
     ``("memory", "history")`` that it needs). Before the episode began nothing had changed.
-
-    Args:
-        time_step: duration of a step [s].
-        sources: what is remembered, views one number wide, dotted: ``"self.gap"``.
-        seconds: time constants or ages, one or more, positive [s].
-        kind: ``"filtered"`` or ``"stacked"``.
-        string: the string of vehicles; one automated vehicle where not given.
-
-    Raises:
-        ConfigError: if a setting is unknown, missing or out of range.
     """
 
-    shares: Tensor
-    places: Tensor
+    # What is remembered, views one number wide, dotted: "self.gap".
+    sources: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = ("ahead.speed",)
+    seconds: Times = (0.5, 1.0, 2.0, 5.0)  # time constants or ages, at least a step [s]
+    kind: Literal["filtered", "stacked"] = "filtered"
 
-    def __init__(
-        self,
-        time_step: float,
-        sources: Sequence[str] = ("ahead.speed",),
-        seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0),
-        kind: str = "filtered",
-        string: VehicleString | None = None,
-    ) -> None:
-        if kind not in KINDS:
-            raise ConfigError(f"memory.kind must be one of {', '.join(KINDS)}, got {kind!r}")
-        _check_seconds("memory.seconds", seconds, time_step)
-        if not sources:
-            raise ConfigError("memory.sources must name at least one entry, got none")
-        string = VehicleString() if string is None else string
-        ages = [round(age / time_step) for age in seconds]
-        self.stacked, self.depth = kind == "stacked", max(ages) + 1
-        kept = "history" if kind == "stacked" else "entries"
-        self.views = Views(
-            string, AUTOMATED, [f"memory.{kept}", *(f"{NEXT}.{source}" for source in sources)]
-        )
+    shares: ClassVar[Tensor]
+    places: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        """Find what is measured, and how much of it is kept."""
+        time_step, string = world.time_step, world.string
+        if min(self.seconds) < time_step:
+            raise ConfigError(
+                f"memory.seconds must be at least a step of {time_step} s, got {min(self.seconds)}"
+            )
+        ages = [round(age / time_step) for age in self.seconds]
+        self.stacked, self.depth = self.kind == "stacked", max(ages) + 1
+        kept = "history" if self.stacked else "entries"
+        reached = [f"{NEXT}.{source}" for source in self.sources]
+        self.views = Views(string, AUTOMATED, [f"memory.{kept}", *reached])
         # The same entries at reset, where there is no step before.
-        self.first = Views(string, AUTOMATED, sources)
+        self.first = Views(string, AUTOMATED, self.sources)
         writes = [("memory", "entries")] + ([("memory", "history")] if self.stacked else [])
-        self.sources_count, self.repeat = len(sources), len(seconds)
-        super().__init__(
-            self.views.keys,
-            writes,
-            event_shape=(string.count(AUTOMATED), len(sources) * len(seconds)),
-        )
-        shares = 1.0 - torch.exp(-time_step / torch.tensor(list(seconds)))
-        self.register_buffer("shares", shares.repeat(len(sources)))
+        self.counted, self.repeat = len(self.sources), len(self.seconds)
+        shape = (string.count(AUTOMATED), self.counted * self.repeat)
+        self.wire(self.views.keys, writes, shape)
+        shares = 1.0 - torch.exp(-time_step / torch.tensor(list(self.seconds)))
+        self.register_buffer("shares", shares.repeat(self.counted))
         self.register_buffer("places", torch.tensor(ages))
 
     def compute(self, *entries: Tensor) -> Tensor | tuple[Tensor, Tensor]:
@@ -138,13 +108,13 @@ class ObservationMemory(StepTransform):
         now = torch.cat(measured, -1)
         if not self.stacked:
             return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
-        past = kept.unflatten(-1, (self.sources_count, self.depth))
+        past = kept.unflatten(-1, (self.counted, self.depth))
         past = torch.cat([now.unsqueeze(-1), past[..., :-1]], -1)
         return past[..., self.places].flatten(-2), past.flatten(-2)
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         vehicles, width = self.event_shape
-        widths = (width, self.sources_count * self.depth)
+        widths = (width, self.counted * self.depth)
         return {
             key: Unbounded(shape=(*batch, vehicles, wide), device=device)
             for key, wide in zip(self.targets, widths, strict=False)
@@ -154,12 +124,3 @@ class ObservationMemory(StepTransform):
         now = torch.cat(self.first(*(start.get(key) for key in self.first.keys)), -1)
         for key, repeat in zip(self.targets, (self.repeat, self.depth), strict=False):
             start.set(key, now.repeat_interleave(repeat, -1))
-
-
-def _check_seconds(where: str, values: Sequence[float], least: float) -> None:
-    """Check that there are times, none below the least or too long to be kept [s]."""
-    if not values:
-        raise ConfigError(f"{where} must name at least one time, got none")
-    for value in values:
-        parent, _, name = where.rpartition(".")
-        require_in(parent, f"[{least}, {LONGEST}]", **{name: value})

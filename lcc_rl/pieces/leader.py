@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -12,10 +12,11 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.data.cycles import from_trajectories
-from lcc_rl.data.profiles import Profiles
-from lcc_rl.errors import ConfigError, require_in
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import choose, stream_id, uniform
 from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key, require_option
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative
 
 PROFILE, FIRST = ("leader", "profile"), ("leader", "start")
 SPEED, ACCELERATION, NEXT_SPEED = (
@@ -37,67 +38,44 @@ class NGSIMLeader(StepTransform):
     A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)): every episode has its own
     c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
 
-    Args:
-        profiles: the records to play; each must hold at least ``horizon`` steps. A random one
-            is drawn by their weights, where they have any.
-        horizon: steps per episode.
-        time_step: duration of a step [s].
-        start: ``"random"`` draws where in the record the window begins, ``"first"`` begins at
-            its first sample.
-        profile: the record to play in every episode; None draws one for each.
-        perturbation: p; evaluation takes 0, the record as it is.
-        foresight: write the next speed, too.
-        nominal: no perturbation, as in an evaluation.
-
-    Raises:
-        ConfigError: if a setting is unknown or out of range.
-        DataError: if no record is as long as the horizon.
-
     Examples:
         >>> leader = NGSIMLeader.from_file("trajectories.csv", horizon=300)  # doctest: +SKIP
     """
 
-    speeds: Tensor
-    offsets: Tensor
-    lengths: Tensor
-    starts: Tensor
-    shares: Tensor | None
+    start: Literal["random", "first"] = "random"  # sample of the record at which a window begins
+    profile: int | None = None  # the record to play in every episode; None: draws one for each
+    perturbation: NonNegative = 0.0  # p; evaluation takes 0, the record as it is
+    foresight: bool = False  # write the next speed, too
 
-    def __init__(
-        self,
-        profiles: Profiles,
-        horizon: int,
-        time_step: float,
-        start: str = "random",
-        profile: int | None = None,
-        perturbation: float = 0.0,
-        foresight: bool = False,
-        nominal: bool = False,
-    ) -> None:
-        if start not in ("random", "first"):
-            raise ConfigError(f"leader start must be 'random' or 'first', got {start!r}")
-        require_in("scenario.pieces.leader", "[0, inf)", perturbation=perturbation)
+    speeds: ClassVar[Tensor]
+    offsets: ClassVar[Tensor]
+    lengths: ClassVar[Tensor]
+    starts: ClassVar[Tensor]
+    shares: ClassVar[Tensor | None]
+
+    def setup(self, world: World) -> None:
+        """Take the records that are as long as the horizon, drawn by weights if they have any.
+
+        Raises:
+            DataError: if no record is as long as the horizon.
+        """
         chosen = [PROFILE, FIRST]
-        self.perturbation = 0.0 if nominal else perturbation
-        writes = [SPEED, ACCELERATION, *([NEXT_SPEED] if foresight else [])]
-        super().__init__(
-            reads=[*chosen, SPEED, next_key(STEP), SEED],
-            writes=writes,
-            constants=chosen,
-            reset_options=chosen,
-        )
-        profiles = profiles.at_least(horizon)
-        if profile is not None and not 0 <= profile < len(profiles):
-            raise ConfigError(f"leader.profile must lie in 0…{len(profiles) - 1}, got {profile}")
-        self.start, self.profile, self.time_step = start, profile, time_step
-        self.foresight, self.names = foresight, profiles.names
+        writes = [SPEED, ACCELERATION, *([NEXT_SPEED] if self.foresight else [])]
+        reads = [*chosen, SPEED, next_key(STEP), SEED]
+        self.wire(reads, writes, constants=chosen, reset_options=chosen)
+        self.perturbed = 0.0 if world.nominal else self.perturbation
+        profiles = world.profiles.at_least(world.horizon)
+        last = len(profiles) - 1
+        if self.profile is not None and not 0 <= self.profile <= last:
+            raise ConfigError(f"leader.profile must lie in 0…{last}, got {self.profile}")
+        self.time_step, self.names = world.time_step, profiles.names
         self.profile_stream = stream_id("leader.profile")
         self.start_stream = stream_id("leader.start")
         self.streams = [stream_id(f"leader.perturbation.{part}") for part in "cAtp"]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("lengths", profiles.lengths)
-        self.register_buffer("starts", profiles.lengths - horizon)
+        self.register_buffer("starts", profiles.lengths - world.horizon)
         shares = None  # cumulative, of the draws that each record and those before it take
         if profiles.weights is not None:
             shares = profiles.weights.cumsum(0) / profiles.weights.sum()
@@ -113,12 +91,16 @@ class NGSIMLeader(StepTransform):
             path: the file, plain or .gz, or a pattern of files.
             horizon: steps per episode; shorter records are left out.
             time_step: duration of a step [s].
-            **settings: further arguments of :class:`NGSIMLeader`.
+            **settings: those of the leader.
+
+        Returns:
+            The leader of a world with these records.
 
         Raises:
             DataError: naming the file, column or row at fault.
         """
-        return cls(from_trajectories(path, time_step), horizon, time_step, **settings)
+        profiles = from_trajectories(path, time_step)
+        return cls(**settings).bind(World(time_step=time_step, horizon=horizon, profiles=profiles))
 
     def compute(
         self, profile: Tensor, first: Tensor, speed: Tensor, step: Tensor, seed: Tensor
@@ -136,12 +118,12 @@ class NGSIMLeader(StepTransform):
         if self.foresight:
             sample = torch.minimum(sample, self.lengths[profile] - 1)
         speed = self.speeds[self.offsets[profile] + sample]
-        if not self.perturbation:
+        if not self.perturbed:
             return speed
         share, height, period, phase = (uniform(seed, 0, stream) for stream in self.streams)
         angle = 2 * math.pi * (step * self.time_step / (4.0 + 16.0 * period) + phase)
-        factor = 1.0 + self.perturbation * 0.4 * (share - 0.5)
-        return (factor * speed + self.perturbation * height * angle.sin()).clamp(min=0.0)
+        factor = 1.0 + self.perturbed * 0.4 * (share - 0.5)
+        return (factor * speed + self.perturbed * height * angle.sin()).clamp(min=0.0)
 
     def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         spec = Unbounded(shape=(*batch, 1), dtype=torch.int64, device=device)

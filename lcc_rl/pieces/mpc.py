@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import fields
 from importlib.util import find_spec
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, how_to_install, require_in, require_positive, require_whole
+from lcc_rl.errors import ConfigError, how_to_install
 from lcc_rl.functional.mpc import Array, FollowingProgram, MPCSettings
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.world import World
 
 LONGEST = 200.0  # gaps beyond it are planned for as this one [m]
-MOST_STEPS = 200  # of a plan
 
 
-class MPC(Controller):
+class MPC(MPCSettings, Controller):
     """Plans accelerations by a quadratic program every step and commands the first one.
 
     Little energy within limits of the gap and of the time-to-collision, see
@@ -27,30 +26,16 @@ class MPC(Controller):
     the same start every time, so that the command depends on what is read alone. Where OSQP finds
     no solution it brakes fully, and ``(role, "unsolved")``, ``[*batch, n, 1]``, is 1. It passes no
     gradient and is not compiled; rows that are alike are solved once.
-
-    Args:
-        settings: horizon, prediction, limits and prices.
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is out of range, or OSQP is not installed.
     """
 
-    Settings: ClassVar[type[MPCSettings]] = MPCSettings
     reads = ("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration")
 
-    def __init__(
-        self,
-        settings: MPCSettings | None = None,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
+    def setup(self, world: World) -> None:
+        """Set up the solver."""
         self.check_installed()
-        settings = MPCSettings() if settings is None else settings
-        _check(settings, f"scenario.controllers.{role}")
-        super().__init__(string, role, writes=[(role, "unsolved")])
-        self.settings = settings
-        self.solver = Solver(settings)
+        self.drive(world, self.reads, [(self.name, "unsolved")])
+        own = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
+        self.solver = Solver(MPCSettings(**own))
 
     @staticmethod
     def check_installed() -> None:
@@ -135,24 +120,3 @@ def _set_up(program: FollowingProgram) -> Any:
         check_termination=10,
     )
     return solver
-
-
-def _check(settings: MPCSettings, where: str) -> None:
-    """Check settings of the node ``where``."""
-    s = settings
-    require_positive(where, horizon=s.horizon, step=s.step, max_acceleration=s.max_acceleration)
-    values = asdict(s)
-    names = ["acceleration_time", "margin", "least_time_gap", "least_ttc"]
-    names += ["steady_price", "jerk_price"]
-    require_in(where, "[0, inf)", **{name: values[name] for name in names})
-    require_in(where, "(-inf, inf)", longest_gap=s.longest_gap)
-    prices = ("near_price", "far_price", "ttc_price")
-    require_positive(where, **{name: values[name] for name in prices})
-    require_in(where, f"({s.least_time_gap}, inf)", longest_time_gap=s.longest_time_gap)
-    require_in(where, "[1e-10, 0.1]", tolerance=s.tolerance)
-    require_whole(where, 1, 1_000_000, iterations=s.iterations)
-    steps = s.horizon / s.step
-    if not 1 <= round(steps) <= MOST_STEPS or abs(steps - round(steps)) > 1e-6:
-        raise ConfigError(
-            f"{where}.horizon must be 1 to {MOST_STEPS} times step={s.step:g}, got {s.horizon:g}"
-        )

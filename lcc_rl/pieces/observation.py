@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_in, require_whole
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.views import BEHIND, PRESENT, Views
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import Number
 
 OBSERVATION = "observation"
-WIDEST = 10_000  # entries of one view
+Width = Annotated[int, Field(ge=1, le=10_000)]  # entries of one view
 
 
 class Observation(Feature):
@@ -23,75 +27,61 @@ class Observation(Feature):
     fewer than ``visible`` vehicles behind, their entries are zero and one more entry per vehicle
     behind says whether it is there (1 or 0). HCFS observes the state H3, see
     ``conf/observation/platoon.yaml``.
-
-    Args:
-        scales: constant of each entry, nested by view (:mod:`lcc_rl.pieces.views`), in the order
-            of the observation, e.g. ``{"self": {"speed": 0.1}, "ahead": {"speed": 0.1}}``.
-        visible: how many vehicles behind are seen, the nearest first.
-        widths: for views whose entries are wider than one number their width, or a list as long
-            as they are wide, e.g. the horizons of a preview.
-        relative_to: for views whose entries are seen as differences, from what, dotted:
-            ``{"preview": "ahead.speed"}``, or one for each of as many equal parts; None: as they
-            are. What matters is then not hidden in a small difference of large numbers.
-        raw: take every entry times 1, in SI units, whatever its scale.
-        string: the string of vehicles; one automated vehicle where not given.
-
-    Raises:
-        ConfigError: if there is no entry, a scale is zero or not finite, a width out of range, or
-            a difference that of no entry.
     """
 
-    constants: Tensor
+    # Constant of each entry, nested by view (lcc_rl.pieces.views), in the order of the
+    # observation, e.g. {"self": {"speed": 0.1}, "ahead": {"speed": 0.1}}.
+    scales: Mapping[str, Mapping[str, Number]]
+    visible: Width = 1  # how many vehicles behind are seen, the nearest first
+    # Of views whose entries are wider than one number their width, or a list as long as they are
+    # wide, e.g. the horizons of a preview.
+    widths: Mapping[str, Width | Sequence[float]] | None = None
+    # Of views whose entries are seen as differences, from what, dotted: {"preview": "ahead.speed"},
+    # or one for each of as many equal parts; None: as they are. What matters is then not hidden in
+    # a small difference of large numbers.
+    relative_to: Mapping[str, str | Sequence[str] | None] | None = None
+    raw: bool = False  # take every entry times 1, in SI units, whatever its scale
 
-    def __init__(
-        self,
-        scales: Mapping[str, Mapping[str, float]],
-        visible: int = 1,
-        widths: Mapping[str, int | Sequence[float]] | None = None,
-        relative_to: Mapping[str, str | Sequence[str] | None] | None = None,
-        raw: bool = False,
-        string: VehicleString | None = None,
-    ) -> None:
-        string = VehicleString() if string is None else string
-        flat = {(view, name): x for view, names in scales.items() for name, x in names.items()}
-        require_in("observation.scales", "(-inf, inf)", **{".".join(k): x for k, x in flat.items()})
-        zeros = [".".join(key) for key, scale in flat.items() if not scale]
-        if not flat or zeros:
+    constants: ClassVar[Tensor]
+
+    def __post_init__(self) -> None:
+        zeros = [".".join(key) for key, scale in self._flat().items() if not scale]
+        if zeros or not self._flat():
             which = f"{zeros[0]} has scale 0" if zeros else "there is none"
-            raise ConfigError(f"observation.scales needs entries that are not 0, {which}")
-        require_whole("observation", 1, WIDEST, visible=visible)
+            raise ValueError(f"scales needs entries that are not 0, {which}")
+
+    def _flat(self) -> dict[tuple[str, str], float]:
+        return {(view, name): x for view, own in self.scales.items() for name, x in own.items()}
+
+    def setup(self, world: World) -> None:
+        """Find the entries and their columns."""
+        flat, string, visible = self._flat(), world.string, self.visible
         wide = {
             view: width if isinstance(width, int) else len(width)
-            for view, width in (widths or {}).items()
+            for view, width in (self.widths or {}).items()
         }
-        require_whole("observation.widths", 1, WIDEST, **wide)
         counts = [visible if view == BEHIND else wide.get(view, 1) for view, _ in flat]
-        bases = _bases(relative_to or {}, flat, counts)
+        bases = _bases(self.relative_to or {}, flat, counts)
         values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]
         seen = list(flat)
-        if BEHIND in scales and not Views(string, AUTOMATED, [], visible).sees_all_behind():
+        if BEHIND in self.scales and not Views(string, AUTOMATED, [], visible).sees_all_behind():
             seen.append((BEHIND, PRESENT))
             values += [1.0] * visible
             bases.append([])
             counts.append(visible)
         names = list(dict.fromkeys([*seen, *(key for keys in bases for key in keys)]))
         self.views = Views(string, AUTOMATED, [".".join(name) for name in names], visible)
-        super().__init__(
-            self.views.keys,
-            [(AUTOMATED, OBSERVATION)],
-            (string.count(AUTOMATED), len(values)),
-        )
+        shape = (string.count(AUTOMATED), len(values))
+        self.wire(self.views.keys, [(AUTOMATED, OBSERVATION)], shape)
         firsts = [sum(counts[:place]) for place in range(len(counts))]
         # Of entries seen as they are: the (first) column of each.
-        self.layout = {
-            ".".join(key): first
-            for key, first, base in zip(seen, firsts, bases, strict=True)
-            if not base
-        }
+        each = zip(seen, firsts, bases, strict=True)
+        self.layout = {".".join(key): first for key, first, base in each if not base}
         self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
-        self.register_buffer("constants", torch.tensor([1.0] * len(values) if raw else values))
+        constants = [1.0] * len(values) if self.raw else values
+        self.register_buffer("constants", torch.tensor(constants))
 
     def column(self, name: str) -> int:
         """Return the column of an entry, e.g. ``"self.gap"``.

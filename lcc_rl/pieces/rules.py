@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field, InstanceOf
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, require_in, require_positive
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.rules import follower_stopper_speed, pi_saturation_speed
 from lcc_rl.pieces.base import Key
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive
+
+Window = Annotated[float, Field(gt=0.0, le=3600.0)]
+Pair = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
+Three = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+ThreeTimes = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 
 
 class Averaging(Controller):
@@ -22,40 +29,28 @@ class Averaging(Controller):
 
     It is kept in ``(role, "speed_history")``, ``[*batch, n, samples]`` [m/s]; before the window
     is full, the mean is that since the episode began.
-
-    Args:
-        time_step: duration of a step T [s].
-        window: length of the mean [s]; None: none is kept.
-        max_acceleration, max_deceleration: limits of the command [m/s²].
-        reads: names of what the rule reads besides, in order.
-        writes: entries written besides the command and the history.
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is out of range.
     """
 
-    def __init__(
-        self,
-        time_step: float,
-        window: float | None,
-        max_acceleration: float,
-        max_deceleration: float,
-        reads: Sequence[str],
-        writes: Sequence[Key] = (),
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        where = f"scenario.controllers.{role}"
-        limits = {"max_acceleration": max_acceleration, "max_deceleration": max_deceleration}
-        require_positive(where, **limits)
-        if window is not None:
-            require_in(where, "(0, 3600]", window=window)
-        kept = [] if window is None else [(role, "speed_history")]
+    window: Window = 60.0  # length of the mean [s]
+    max_acceleration: Positive = 1.5  # of the command [m/s²]
+    max_deceleration: Positive = 3.0  # of the command [m/s²]
+
+    @property
+    def averages(self) -> bool:
+        """Whether the mean is kept."""
+        return True
+
+    def setup(self, world: World) -> None:
+        """Read what the rule reads, and the history."""
+        self.average(world, self.reads)
+
+    def average(self, world: World, reads: Sequence[str], writes: Sequence[NestedKey] = ()) -> None:
+        """Set what is read and written besides the history, where it is kept."""
+        kept = [(self.name, "speed_history")] if self.averages else []
         known = ["episode.step", *(".".join(key) for key in kept)] if kept else []
-        super().__init__(string, role, [*reads, *known], [*kept, *writes])
-        self.samples = 0 if window is None else max(round(window / time_step), 1)
-        self.time_step, self.limits = time_step, (-max_deceleration, max_acceleration)
+        self.drive(world, [*reads, *known], [*kept, *writes])
+        self.samples = max(round(self.window / world.time_step), 1) if kept else 0
+        self.limits = (-self.max_deceleration, self.max_acceleration)
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean [m/s], ``[*batch, n, 1]``, and the history with the present in it."""
@@ -81,58 +76,23 @@ class FollowerStopper(Averaging):
     :func:`lcc_rl.functional.rules.follower_stopper_speed`. The command is (v_cmd − v)/T within
     the limits. The desired speed is fixed, or the mean of the vehicle's own speed during the last
     ``window`` seconds, kept in ``(role, "speed_history")``, ``[*batch, n, samples]`` [m/s].
-
-    Args:
-        time_step: duration of a step T [s].
-        desired_speed: v_d; None: the vehicle's own mean [m/s].
-        window: length of that mean [s].
-        gaps: Δx⁰_k, gaps at standstill that bound the regions [m].
-        time_gaps: h_k; Δx⁰_k is at least h_k v; zeros for the original form [s].
-        decelerations: d_k, see the paper [m/s²].
-        max_acceleration, max_deceleration: limits of the command [m/s²].
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is out of range.
     """
 
-    def __init__(
-        self,
-        time_step: float,
-        desired_speed: float | None = None,
-        window: float = 60.0,
-        gaps: Sequence[float] = (4.5, 5.25, 6.0),
-        time_gaps: Sequence[float] = (0.4, 0.6, 0.8),
-        decelerations: Sequence[float] = (1.5, 1.0, 0.5),
-        max_acceleration: float = 1.5,
-        max_deceleration: float = 3.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        where = f"scenario.controllers.{role}"
-        lists = {"gaps": gaps, "time_gaps": time_gaps, "decelerations": decelerations}
-        for name, values in lists.items():
-            interval = "[0, inf)" if name == "time_gaps" else "(0, inf)"
-            require_in(where, interval, **{f"{name}[{i}]": x for i, x in enumerate(values)})
-            if len(values) != 3:
-                raise ConfigError(f"{where}.{name} must be three numbers, got {list(values)}")
-        if list(gaps) != sorted(gaps):
-            raise ConfigError(f"{where}.gaps must increase, got {list(gaps)}")
-        if desired_speed is not None:
-            require_positive(where, desired_speed=desired_speed)
-        require_in(where, "(0, 3600]", window=window)
-        super().__init__(
-            time_step,
-            window if desired_speed is None else None,
-            max_acceleration,
-            max_deceleration,
-            ("self.speed", "self.gap", "ahead.speed"),
-            (),
-            string,
-            role,
-        )
-        self.desired_speed = desired_speed
-        self.shape = tuple(gaps), tuple(time_gaps), tuple(decelerations)
+    desired_speed: Positive | None = None  # v_d; None: the vehicle's own mean [m/s]
+    gaps: Three = (4.5, 5.25, 6.0)  # Δx⁰_k, gaps at standstill that bound the regions [m]
+    time_gaps: ThreeTimes = (0.4, 0.6, 0.8)  # h_k; Δx⁰_k is at least h_k v; 0: original form [s]
+    decelerations: Three = (1.5, 1.0, 0.5)  # d_k, see the paper [m/s²]
+
+    reads = ("self.speed", "self.gap", "ahead.speed")
+
+    def __post_init__(self) -> None:
+        if list(self.gaps) != sorted(self.gaps):
+            raise ValueError(f"gaps must increase, got {list(self.gaps)}")
+
+    @property
+    def averages(self) -> bool:
+        """Whether the mean is kept: of use without a desired speed."""
+        return self.desired_speed is None
 
     def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *kept: Tensor) -> Any:
         """Return the commands, and the history where it is kept."""
@@ -142,7 +102,9 @@ class FollowerStopper(Averaging):
         return self._beside(speed, gap, ahead, mean), past
 
     def _beside(self, speed: Tensor, gap: Tensor, ahead: Tensor, desired: Tensor) -> Tensor:
-        wanted = follower_stopper_speed(speed, gap, ahead, desired, *self.shape)
+        wanted = follower_stopper_speed(
+            speed, gap, ahead, desired, self.gaps, self.time_gaps, self.decelerations
+        )
         return self.towards(wanted, speed)
 
 
@@ -152,46 +114,31 @@ class PISaturation(Averaging):
     Drives at the mean of its own speed, a little faster where the gap is large, and like the
     vehicle ahead where it is small; see :func:`lcc_rl.functional.rules.pi_saturation_speed`. The
     command before is kept in ``(role, "commanded_speed")``, ``[*batch, n, 1]`` [m/s].
-
-    Args:
-        time_step: duration of a step T [s].
-        window: length of the mean [s].
-        gaps: between which catching up sets in [m].
-        catch_up: by how much the target may exceed the mean [m/s].
-        least_gap: gap below which it drives like the vehicle ahead [m].
-        closing_time: how long closing in may take [s].
-        transition: range of gaps over which it changes from one to the other [m].
-        max_acceleration, max_deceleration: limits of the command [m/s²].
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if a setting is out of range.
     """
 
-    def __init__(
-        self,
-        time_step: float,
-        window: float = 38.0,
-        gaps: Sequence[float] = (7.0, 30.0),
-        catch_up: float = 1.0,
-        least_gap: float = 4.0,
-        closing_time: float = 2.0,
-        transition: float = 2.0,
-        max_acceleration: float = 1.5,
-        max_deceleration: float = 3.0,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        where = f"scenario.controllers.{role}"
-        if len(gaps) != 2 or not 0.0 <= gaps[0] < gaps[1]:
-            raise ConfigError(f"{where}.gaps must be two increasing numbers, got {list(gaps)}")
-        require_in(where, "[0, inf)", catch_up=catch_up, least_gap=least_gap)
-        require_positive(where, closing_time=closing_time, transition=transition)
-        limits = (max_acceleration, max_deceleration)
-        before = (role, "commanded_speed")
+    window: Window = 38.0  # length of the mean [s]
+    gaps: Pair = (7.0, 30.0)  # between which catching up sets in [m]
+    catch_up: NonNegative = 1.0  # by how much the target may exceed the mean [m/s]
+    least_gap: NonNegative = 4.0  # gap below which it drives like the vehicle ahead [m]
+    closing_time: Positive = 2.0  # how long closing in may take [s]
+    transition: Positive = 2.0  # range of gaps over which it changes from one to the other [m]
+
+    def __post_init__(self) -> None:
+        if self.gaps[0] >= self.gaps[1]:
+            raise ValueError(f"gaps must be two increasing numbers, got {list(self.gaps)}")
+
+    def setup(self, world: World) -> None:
+        """Keep the speed commanded before."""
+        before = (self.name, "commanded_speed")
         reads = ("self.speed", "self.gap", "ahead.speed", ".".join(before))
-        super().__init__(time_step, window, *limits, reads, [before], string, role)
-        self.shape = tuple(gaps), catch_up, least_gap, closing_time, transition
+        self.average(world, reads, [before])
+        self.shape = (
+            self.gaps,
+            self.catch_up,
+            self.least_gap,
+            self.closing_time,
+            self.transition,
+        )
 
     def command(
         self, speed: Tensor, gap: Tensor, ahead: Tensor, before: Tensor, *kept: Tensor
@@ -207,39 +154,24 @@ class Handover(Controller):
     """Lets one controller drive until a moment of the episode, and another one from then on.
 
     Both compute from the start, so that one which remembers is ready when its turn comes.
-
-    Args:
-        before: who drives first, a human driver say.
-        after: who drives from ``from_s`` on.
-        from_s: that moment [s].
-        time_step: duration of a step [s].
-        string, role: see :class:`lcc_rl.pieces.controllers.Controller`.
-
-    Raises:
-        ConfigError: if ``from_s`` is negative.
     """
 
-    def __init__(
-        self,
-        before: Controller,
-        after: Controller,
-        from_s: float,
-        time_step: float,
-        string: VehicleString | None = None,
-        role: str = AUTOMATED,
-    ) -> None:
-        require_in(f"scenario.controllers.{role}", "[0, inf)", from_s=from_s)
-        both = (before, after)
-        super().__init__(
-            string,
-            role,
-            ["episode.step", *before.names, *after.names],
+    before: InstanceOf[Controller]  # who drives first, a human driver say
+    after: InstanceOf[Controller]  # who drives from then on
+    from_s: NonNegative  # that moment [s]
+
+    def setup(self, world: World) -> None:
+        """Read and write what both do."""
+        both = [inner.bind(world, self.name) for inner in (self.before, self.after)]
+        self.before, self.after = both
+        self.drive(
+            world,
+            ["episode.step", *(name for inner in both for name in inner.names)],
             [key for inner in both for key in inner.targets[1:]],
-            [key for inner in both for key in inner.constants],
-            [key for inner in both for key in inner.reset_options],
+            constants=[key for inner in both for key in inner.constants],
+            reset_options=[key for inner in both for key in inner.reset_options],
         )
-        self.before, self.after = before, after
-        self.from_step = round(from_s / time_step)
+        self.from_step = round(self.from_s / world.time_step)
 
     def command(self, step: Tensor, *entries: Tensor) -> Any:
         """Return the commands of whoever drives, and what both write besides."""

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import LARGEST, ConfigError, require_in, require_positive
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import capped
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
-from lcc_rl.pieces.controllers import Population, stream_name
+from lcc_rl.pieces.controllers import stream_name
+from lcc_rl.pieces.world import Part, World
+from lcc_rl.settings import NonNegative, Positive
 
 GAP, SPEED = stream_id("platoon.gap"), stream_id("platoon.speed")
 
@@ -25,39 +28,27 @@ def draw(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
     return uniform(start.get(SEED).unsqueeze(-2), 0, stream + index)
 
 
-class TimeGapStart:
-    """A gap that grows with the speed: standstill gap + time gap · speed, at the leader's speed.
+class TimeGapStart(Part):
+    """A gap that grows with the speed: standstill gap + time gap · speed, at the leader's speed."""
 
-    Args:
-        standstill_gap: gap when standing [m].
-        time_gap: further time gap; the ALCC paper is silent on it [s].
-        gap_range: the gap is that times a factor drawn evenly from this range by the episode's
-            seed, so that training meets what good driving never does; evaluation takes 1.
-        nominal: take the factor 1, as an evaluation does.
-        role: whose vehicles start, by which random numbers are drawn.
+    standstill_gap: Positive = 2.0  # gap when standing [m]
+    time_gap: NonNegative = 1.5  # further time gap; the ALCC paper is silent on it [s]
+    # The gap is that times a factor drawn evenly from this range by the episode's seed, so that
+    # training meets what good driving never does; evaluation takes 1.
+    gap_range: Annotated[tuple[Positive, Positive], Field(strict=False)] = (0.1, 1.5)
 
-    Raises:
-        ConfigError: if ``standstill_gap`` or the range is not positive, or the time gap negative.
-    """
+    name = AUTOMATED
 
-    def __init__(
-        self,
-        standstill_gap: float = 2.0,
-        time_gap: float = 1.5,
-        gap_range: Sequence[float] = (0.1, 1.5),
-        nominal: bool = False,
-        role: str = AUTOMATED,
-    ) -> None:
-        require_positive("scenario.start", standstill_gap=standstill_gap)
-        require_in("scenario.start", "[0, inf)", time_gap=time_gap)
-        if len(gap_range) != 2 or not 0 < gap_range[0] <= gap_range[1] <= LARGEST:
-            raise ConfigError(
-                "scenario.start: gap_range must be two increasing positive factors, got "
-                f"{list(gap_range)}"
+    def __post_init__(self) -> None:
+        if self.gap_range[0] > self.gap_range[1]:
+            raise ValueError(
+                f"gap_range must be two increasing positive factors, got {list(self.gap_range)}"
             )
-        self.standstill_gap, self.time_gap = standstill_gap, time_gap
-        self.stream = stream_id(f"{stream_name(role)}.gap_factor")
-        self.lowest, self.highest = (1.0, 1.0) if nominal else map(float, gap_range)
+
+    def setup(self, world: World) -> None:
+        """Choose the range, and the random numbers of the role."""
+        self.stream = stream_id(f"{stream_name(self.name)}.gap_factor")
+        self.lowest, self.highest = (1.0, 1.0) if world.nominal else map(float, self.gap_range)
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
@@ -66,20 +57,18 @@ class TimeGapStart:
         return speed, factor * (self.standstill_gap + self.time_gap * speed)
 
 
-class EquilibriumStart:
+class EquilibriumStart(Part):
     """The gap at which the role's own drivers neither brake nor accelerate, at the leader's speed.
 
-    Args:
-        population: the drivers, for the parameters that they share.
-        cap_time_gap: bounds the gap, see :func:`lcc_rl.functional.idm.equilibrium_gap` [s].
-
-    Raises:
-        ConfigError: if ``cap_time_gap`` is not positive.
+    By the parameters that the drivers of the population share.
     """
 
-    def __init__(self, population: Population, cap_time_gap: float = 3.0) -> None:
-        require_positive("scenario.start", cap_time_gap=cap_time_gap)
-        self.drivers, self.cap_time_gap = population.constants.shared(), cap_time_gap
+    # Bounds the gap, see lcc_rl.functional.idm.equilibrium_gap [s].
+    cap_time_gap: Positive = 3.0
+
+    def setup(self, world: World) -> None:
+        """Take what the drivers share."""
+        self.drivers = world.population.constants.shared()
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
@@ -99,35 +88,25 @@ class EquilibriumStart:
         return speed, gap
 
 
-class HeadwayStart:
-    """A fixed gap at the leader's speed, in training with deviations from both (HCFS).
+class HeadwayStart(Part):
+    """A fixed gap at the leader's speed, in training with deviations from both (HCFS)."""
 
-    Args:
-        headway: h, the gap at equilibrium [m]; the paper is silent on it.
-        gap_spread: largest deviation of a gap from it [m].
-        speed_spread: largest deviation of a speed from the leader's [m/s].
-        nominal: no deviations, as in an evaluation.
+    headway: Positive = 5.0  # h, the gap at equilibrium; the paper is silent on it [m]
+    gap_spread: NonNegative = 2.0  # largest deviation of a gap from it; evaluation takes 0 [m]
+    speed_spread: NonNegative = 1.0  # … and of a speed from the leader's [m/s]
 
-    Raises:
-        ConfigError: if a setting is out of range.
-    """
+    def __post_init__(self) -> None:
+        if self.gap_spread >= self.headway:
+            raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")
 
-    def __init__(
-        self,
-        headway: float = 5.0,
-        gap_spread: float = 2.0,
-        speed_spread: float = 1.0,
-        nominal: bool = False,
-    ) -> None:
-        require_positive("scenario.start", headway=headway)
-        require_in("scenario.start", f"[0, {headway})", gap_spread=gap_spread)
-        require_in("scenario.start", "[0, inf)", speed_spread=speed_spread)
-        self.headway = headway
-        self.gap_spread, self.speed_spread = (0.0, 0.0) if nominal else (gap_spread, speed_spread)
+    def setup(self, world: World) -> None:
+        """Take no deviations in an evaluation."""
+        spreads = (self.gap_spread, self.speed_spread)
+        self.gaps, self.speeds = (0.0, 0.0) if world.nominal else spreads
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
         shift = 2.0 * draw(start, GAP, speed) - 1.0
-        gap = self.headway + self.gap_spread * shift
+        gap = self.headway + self.gaps * shift
         shift = 2.0 * draw(start, SPEED, speed) - 1.0
-        return (speed + self.speed_spread * shift).clamp(min=0.0), gap
+        return (speed + self.speeds * shift).clamp(min=0.0), gap

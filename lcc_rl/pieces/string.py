@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from dataclasses import field
+from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, require_in, require_positive
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
 from lcc_rl.pieces.base import SEED, Key, StepTransform, next_key
 from lcc_rl.pieces.views import LEADER, VEHICLES
+from lcc_rl.pieces.world import Part, World
+from lcc_rl.settings import NonNegative, Positive
 
 COMMAND = "command"
 LEADER_SPEED = (LEADER, "speed")
@@ -26,16 +29,15 @@ class Places(StepTransform):
 
     Of a string whose places are drawn, for every role and anew in every episode, by its seed;
     else for the automated vehicles alone. The places are constant within an episode.
-
-    Args:
-        string: the string of vehicles.
     """
 
-    index: Tensor
+    index: ClassVar[Tensor]
 
-    def __init__(self, string: VehicleString) -> None:
+    def setup(self, world: World) -> None:
+        """Choose the roles whose places are written."""
+        string = world.string
         roles = string.names if string.drawn else tuple({AUTOMATED} & set(string.names))
-        super().__init__([], [], constants=[(role, "index") for role in roles])
+        self.wire([], [], constants=[(role, "index") for role in roles])
         self.string, self.roles = string, roles
         self.stream = stream_id("string.places")
         self.register_buffer("index", torch.arange(len(string)))
@@ -85,46 +87,51 @@ class StringMotion(StepTransform):
     Writes under ``"vehicles"``, ``[*batch, N, 1]``: speed [m/s], gap to the vehicle ahead,
     bumper to bumper [m], relative_speed v_ahead − v [m/s], the executed acceleration [m/s²], its
     jerk [m/s³], and the command [m/s²].
-
-    Args:
-        string: the string of vehicles.
-        time_step: duration of a step [s].
-        start: how the vehicles of each role start.
-        circumference: of a ring road [m].
-        vehicle_length: length of every vehicle, of use on a ring road only [m].
-        initial_speed: speed of all vehicles at the start on a ring road, where there is no leader
-            to take it from [m/s].
-
-    Raises:
-        ConfigError: if a role has no start, or the ring is too short for its vehicles.
     """
 
-    def __init__(
-        self,
-        string: VehicleString,
-        time_step: float,
-        start: Mapping[str, Start],
-        circumference: float | None = None,
-        vehicle_length: float = 5.0,
-        initial_speed: float = 0.0,
-    ) -> None:
-        self.string, self.time_step, self.start = string, time_step, start
+    start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
+    circumference: Positive | None = None  # of a ring road [m]
+    vehicle_length: Positive = 5.0  # of every vehicle, of use on a ring road only [m]
+    # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
+    initial_speed: NonNegative = 0.0
+
+    def setup(self, world: World) -> None:
+        """Read the commands of all roles, and bind their starts.
+
+        Raises:
+            ConfigError: if a role has no start, or the ring is too short for its vehicles.
+        """
+        self.string, self.time_step = world.string, world.time_step
+        string = world.string
         commands = [next_key((COMMAND, role)) for role in string.names]
         own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
         leader = [] if string.ring else [LEADER_SPEED, next_key(LEADER_SPEED)]
         indices = [(role, "index") for role in string.names] if string.drawn else []
-        super().__init__(
-            [*own, *leader, *commands, *indices],
-            [(VEHICLES, name) for name in (*Motion._fields, COMMAND)],
-            event_shape=(len(string), 1),
-        )
-        self.ring_start: tuple[float, float] | None = None
-        if string.ring:
-            self.ring_start = _ring_start(string, circumference, vehicle_length, initial_speed)
-        elif missing := [role for role in string.names if role not in start]:
+        writes = [(VEHICLES, name) for name in (*Motion._fields, COMMAND)]
+        self.wire([*own, *leader, *commands, *indices], writes, (len(string), 1))
+        self.starts: dict[str, Any] = {
+            role: start.bind(world, role) if isinstance(start, Part) else start
+            for role, start in self.start.items()
+        }
+        self.ring_start = self._ring_start() if string.ring else None
+        missing = [role for role in string.names if role not in self.start]
+        if missing and not string.ring:
             raise ConfigError(f"scenario.start lacks {', '.join(missing)}: how do they start?")
         order = [place for role in string.names for place in string.places(role)]
         self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
+
+    def _ring_start(self) -> tuple[float, float]:
+        """Return speed and gap at which vehicles begin, evenly spread over a ring."""
+        if self.circumference is None:
+            raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
+        count, length = len(self.string), self.vehicle_length
+        gap = self.circumference / count - length
+        if gap <= 0:
+            raise ConfigError(
+                f"scenario.circumference={self.circumference} is too short for {count} vehicles "
+                f"of {length} m: it must exceed {count * length} m"
+            )
+        return self.initial_speed, gap
 
     def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
         """Return the motion at the moment reached, and the commands that led there."""
@@ -153,7 +160,7 @@ class StringMotion(StepTransform):
             leader = start.get(LEADER_SPEED)
             roles = self.string.names
             placed = [
-                self.start[role](start, role, _spread(leader, self.string.count(role)))
+                self.starts[role](start, role, _spread(leader, self.string.count(role)))
                 for role in roles
             ]
             indices = [start.get((role, "index")) for role in roles] if self.string.drawn else []
@@ -169,20 +176,3 @@ class StringMotion(StepTransform):
 
 def _spread(leader: Tensor, count: int) -> Tensor:
     return leader.unsqueeze(-2).expand(*leader.shape[:-1], count, 1)
-
-
-def _ring_start(
-    string: VehicleString, circumference: float | None, length: float, speed: float
-) -> tuple[float, float]:
-    """Return speed and gap at which vehicles begin, evenly spread over a ring."""
-    if circumference is None:
-        raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
-    require_positive("scenario", circumference=circumference, vehicle_length=length)
-    gap = circumference / len(string) - length
-    if gap <= 0:
-        raise ConfigError(
-            f"scenario.circumference={circumference} is too short for {len(string)} vehicles of "
-            f"{length} m: it must exceed {len(string) * length} m"
-        )
-    require_in("scenario", "[0, inf)", initial_speed=speed)
-    return speed, gap

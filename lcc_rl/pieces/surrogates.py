@@ -9,17 +9,18 @@ to be kept and not a price to be paid, ``missed`` says where it is not.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Literal
 
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lcc_rl.energy import EnergyModel, Fleet, as_fleet
-from lcc_rl.errors import ConfigError, require_in, require_positive
-from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Positive
 
 
 def excess(value: Tensor, width: float) -> Tensor:
@@ -37,52 +38,23 @@ class SmoothSafety(RewardTerm):
 
     Unlike the literal term it has a slope beyond the threshold, at contact and behind it, all of
     which lead back to safety.
-
-    Args:
-        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
-        threshold: time-to-collision that is safe enough [s].
-        width: range over which the logarithm bends.
-        margin: gap that counts as contact [m].
-        gap_width: range of gaps over which contact bends [m].
-        rate_width: range of approach rates over which closing begins [m/s].
-        limit: time-to-collision below which the limit is missed [s].
-
-    Raises:
-        ConfigError: if a threshold or width is not positive or the margin negative.
     """
 
-    reads = ("self.gap", "self.relative_speed")
+    weight: NonNegative = 0.5  # price of log(threshold / TTC)
+    threshold: Positive = 4.2  # time-to-collision that is safe enough; the term's is 4 [s]
+    width: Positive = 0.1  # range over which the logarithm bends
+    margin: NonNegative = 1.0  # gap that counts as contact, as for the term [m]
+    gap_width: Positive = 0.2  # range of gaps over which contact bends [m]
+    rate_width: Positive = 0.1  # range of approach rates over which closing begins [m/s]
+    limit: Positive = 4.0  # time-to-collision below which a limit is missed [s]
 
-    def __init__(
-        self,
-        name: str = "safety",
-        weight: float = 0.5,
-        threshold: float = 4.2,
-        width: float = 0.1,
-        margin: float = 1.0,
-        gap_width: float = 0.2,
-        rate_width: float = 0.1,
-        limit: float = 4.0,
-        string: VehicleString | None = None,
-    ) -> None:
-        require_positive(
-            f"agent.surrogates.{name}",
-            threshold=threshold,
-            width=width,
-            gap_width=gap_width,
-            rate_width=rate_width,
-            limit=limit,
-        )
-        require_in(f"agent.surrogates.{name}", "[0, inf)", margin=margin)
-        super().__init__(name, weight, string=string)
-        self.log_threshold, self.width, self.margin = math.log(threshold), width, margin
-        self.gap_width, self.rate_width, self.limit = gap_width, rate_width, limit
+    reads = ("self.gap", "self.relative_speed")
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the unweighted term."""
         room = _log_softplus((gap - self.margin) / self.gap_width) + math.log(self.gap_width)
         rate = _log_softplus(-relative_speed / self.rate_width) + math.log(self.rate_width)
-        return -excess(self.log_threshold + rate - room, self.width)
+        return -excess(math.log(self.threshold) + rate - room, self.width)
 
     def missed(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return where the limit is missed, ``[*batch, A, 1]``."""
@@ -90,41 +62,15 @@ class SmoothSafety(RewardTerm):
 
 
 class SmoothEfficiency(RewardTerm):
-    """−max(0, log(TG / threshold)), smooth (stands in for A12–A13).
+    """−max(0, log(TG / threshold)), smooth (stands in for A12–A13)."""
 
-    Args:
-        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
-        threshold: time gap that is too long [s].
-        width: range over which the logarithm bends.
-        speed_floor: speeds below this count as this [m/s].
-        limit: time gap above which the limit is missed, by vehicles faster than the floor [s].
-
-    Raises:
-        ConfigError: if a setting is not positive.
-    """
+    weight: NonNegative = 2.0  # price of log(TG / threshold)
+    threshold: Positive = 2.3  # time gap that is too long; the term's is 2.5 [s]
+    width: Positive = 0.05  # range over which the logarithm bends
+    speed_floor: Positive = 1.0  # speeds below this count as this [m/s]
+    limit: Positive = 2.5  # time gap above which a limit is missed, if faster than the floor [s]
 
     reads = ("self.gap", "self.speed")
-
-    def __init__(
-        self,
-        name: str = "efficiency",
-        weight: float = 2.0,
-        threshold: float = 2.3,
-        width: float = 0.05,
-        speed_floor: float = 1.0,
-        limit: float = 2.5,
-        string: VehicleString | None = None,
-    ) -> None:
-        require_positive(
-            f"agent.surrogates.{name}",
-            threshold=threshold,
-            width=width,
-            speed_floor=speed_floor,
-            limit=limit,
-        )
-        super().__init__(name, weight, string=string)
-        self.threshold, self.width = threshold, width
-        self.speed_floor, self.limit = speed_floor, limit
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the unweighted term."""
@@ -142,20 +88,11 @@ class Smoothness(RewardTerm):
 
     With a high gain on the gap a controlled car oscillates, and gradients through an oscillating
     car are long and say little.
-
-    Args:
-        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`; the price of 1 (m/s³)².
     """
 
-    reads = ("self.jerk",)
+    weight: NonNegative = 0.001  # price of 1 (m/s³)²
 
-    def __init__(
-        self,
-        name: str = "smoothness",
-        weight: float = 0.001,
-        string: VehicleString | None = None,
-    ) -> None:
-        super().__init__(name, weight, string=string)
+    reads = ("self.jerk",)
 
     def reward(self, jerk: Tensor) -> Tensor:
         """Return the unweighted term."""
@@ -165,22 +102,13 @@ class Smoothness(RewardTerm):
 class Correction(RewardTerm):
     """Minus the square of what the safety filter changes: draws a policy to the filter's limits.
 
-    Where the filter drives, a policy has no gradient, and one that starts there, braking always,
-    never learns anything. Only of use with a filter that writes the correction.
-
-    Args:
-        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`; the price of 1 (m/s²)².
+    When the filter overrides the policy, no gradient reaches it, so a policy that starts by
+    braking never learns. Only of use with a filter that writes the correction.
     """
 
-    reads = ("automated.correction",)
+    weight: NonNegative = 0.1  # price of 1 (m/s²)²
 
-    def __init__(
-        self,
-        name: str = "correction",
-        weight: float = 0.1,
-        string: VehicleString | None = None,
-    ) -> None:
-        super().__init__(name, weight, string=string)
+    reads = ("automated.correction",)
 
     def reward(self, correction: Tensor) -> Tensor:
         """Return the unweighted term."""
@@ -192,55 +120,33 @@ class PathEnergy(RewardTerm):
 
     Of A2's three parts (:func:`lcc_rl.functional.power.acceleration_loss`) the steady power of the
     speeds driven and what accelerating loses; of another model what is drawn less what the
-    kinetic energy is worth (:meth:`lcc_rl.energy.EnergyModel.path_power`). Who ends slower than he
-    began gains nothing by it.
-
-    Args:
-        time_step: duration of a step [s].
-        name, weight, string: see :class:`lcc_rl.pieces.rewards.RewardTerm`.
-        scale: power that costs 1 per second [W].
-        of: ``"self"``, or ``"behind"``: all vehicles behind, back to the next automated one.
-        distance_price: energy that a metre driven is worth [J/m]: at what a metre takes, the
-            objective is energy per distance, and falling behind gains nothing.
-        energy: the energy models; None for that of the ALCC paper.
-
-    Raises:
-        ConfigError: if the scale is not positive, or ``of`` is unknown.
+    kinetic energy is worth (:meth:`lcc_rl.energy.EnergyModel.path_power`). A vehicle that ends
+    slower than it began gains nothing by it.
     """
 
-    def __init__(
-        self,
-        time_step: float,
-        name: str = "energy",
-        weight: float = 1.0,
-        scale: float = 20000.0,
-        of: str = "self",
-        distance_price: float = 0.0,
-        string: VehicleString | None = None,
-        energy: Fleet | EnergyModel | None = None,
-    ) -> None:
-        require_positive(f"agent.surrogates.{name}", scale=scale)
-        require_in(f"agent.surrogates.{name}", "[0, inf)", distance_price=distance_price)
-        if of not in ("self", "behind"):
-            raise ConfigError(f"agent.surrogates.{name}.of must be self or behind, got {of!r}")
-        string = VehicleString() if string is None else string
-        self.sections, self.behind = Sections(string, VEHICLES), of == "behind"
-        space = VEHICLES if self.behind else "self"
+    scale: Positive = 20000.0  # power that costs 1 per second [W]
+    of: Literal["self", "behind"] = "self"  # behind: all back to the next automated vehicle
+    # Energy that a metre driven is worth: at what a metre takes, the objective is energy per
+    # distance, and falling behind gains nothing [J/m].
+    distance_price: NonNegative = 0.0
+
+    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
+        """Choose what is read by whose energy counts, and by which models."""
+        self.sections, self.energy = Sections(world.string, VEHICLES), world.energy
+        self.mixed, behind = len(world.energy.models) > 1, self.of == "behind"
+        space = VEHICLES if behind else "self"
         reads = [f"{space}.speed", f"{space}.acceleration"]
-        self.energy, self.distance_price = as_fleet(energy), distance_price
-        self.mixed = len(self.energy.models) > 1
-        if self.mixed:
-            reads.append(f"{space}.{CLASS[-1]}")
-        reads += [".".join(key) for key in self.sections.keys if self.behind]
-        super().__init__(name, weight, reads, string)
-        self.time_step, self.factor = time_step, time_step / scale
+        reads += [f"{space}.{CLASS[-1]}"] if self.mixed else []
+        reads += [".".join(key) for key in self.sections.keys if behind]
+        self.time_step, self.factor = world.time_step, world.time_step / self.scale
+        super().setup(world, reads)
 
     def reward(self, speed: Tensor, acceleration: Tensor, *more: Tensor) -> Tensor:
         """Return the unweighted term."""
         before = speed - acceleration * self.time_step
         kind, indices = (more[0], more[1:]) if self.mixed else (None, more)
         power = self.energy.path_power(before, acceleration, kind) - self.distance_price * before
-        if self.behind:
+        if self.of == "behind":
             power = self.sections.sum(power, *indices)
         return power * -self.factor
 

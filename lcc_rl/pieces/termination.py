@@ -8,6 +8,7 @@ from torchrl.data import Composite
 
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.views import VEHICLES
+from lcc_rl.pieces.world import World
 
 
 class Collision(Feature):
@@ -17,8 +18,9 @@ class Collision(Feature):
     evaluation.
     """
 
-    def __init__(self) -> None:
-        super().__init__(["done", "terminated", (VEHICLES, "gap")], ["done", "terminated"])
+    def setup(self, world: World) -> None:
+        """Read all gaps."""
+        self.wire(["done", "terminated", (VEHICLES, "gap")], ["done", "terminated"])
 
     def compute(self, done: Tensor, terminated: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
         """Return done and terminated, ``[*batch, 1]``."""

@@ -21,19 +21,26 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.string import entries_ahead, gather, selector
-from lcc_rl.pieces.base import NEXT, Key, as_key
 
+Key = tuple[str, ...]
+NEXT = "next"
 VEHICLES, LEADER, EPISODE = "vehicles", "leader", "episode"
 SELF, AHEAD, BEHIND = "self", "ahead", "behind"
 PRESENT, ACTION = "present", "action"
 
 
 Resolver = Callable[[Sequence[Tensor]], Tensor]
+
+
+def as_key(key: NestedKey) -> Key:
+    """Return a key as a tuple; a dotted string counts as nested (``"vehicles.gap"``)."""
+    return tuple(key.split(".")) if isinstance(key, str) else tuple(key)
 
 
 class Views:

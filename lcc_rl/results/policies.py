@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import plain
+from lcc_rl.config import complete, plain
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import read_torch, write_torch
@@ -84,6 +84,10 @@ def load_policy(
     for key in POLICY_KEYS:
         if not isinstance(OmegaConf.select(cfg, key), DictConfig):
             raise ResultsError(f"{path}: its configuration is damaged: {key} is missing")
+    try:
+        complete(cfg)
+    except ConfigError as error:
+        raise ResultsError(f"{path}: its configuration is damaged: {error}") from error
     return weights, cfg
 
 

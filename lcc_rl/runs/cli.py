@@ -21,8 +21,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config import explained, is_sweep, leave_out_foreign
-from lcc_rl.config_checks import check_ignored, lower_variants
+from lcc_rl.config import complete, explained, is_sweep, leave_out_foreign
+from lcc_rl.config_checks import as_meant, check_ignored
 from lcc_rl.config_errors import check_keys, refused_by_hydra
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.runs.interrupts import (
@@ -65,9 +65,10 @@ def entry_point(
             heed_logs()
             check_keys(config)
             typed = list(HydraConfig.get().overrides.task)
+            leave_out_foreign(config, typed)
+            complete(config)
             check_ignored(config, typed, is_sweep())
             check_ranges(config)
-            leave_out_foreign(config, typed)
             if not is_sweep():
                 with ending_quietly():
                     import_module(work)
@@ -147,7 +148,7 @@ def flags_first(words: Sequence[str]) -> list[str]:
     flags = list(words)
     for item in known.overrides:
         flags.remove(item)
-    return [*flags, *lower_variants(known.overrides)]
+    return [*flags, *as_meant(known.overrides)]
 
 
 def sweep(command: Callable[[], Any]) -> None:

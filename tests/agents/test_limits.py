@@ -92,7 +92,7 @@ def test_the_record_says_shares_and_prices(tmp_path) -> None:
 
 
 def test_path_energy_is_a2_without_what_the_motion_stores() -> None:
-    term = PathEnergy(time_step=0.1)
+    term = PathEnergy().bind()
     speed, acceleration = torch.tensor([[[10.0]]]), torch.tensor([[[1.0]]])
     before = speed - 0.1
     expected = steady_power(before) + acceleration_loss(before, acceleration)
@@ -106,4 +106,4 @@ def test_path_energy_is_a2_without_what_the_motion_stores() -> None:
 )
 def test_settings_of_path_energy(settings, words) -> None:
     with pytest.raises(ConfigError, match=words):
-        PathEnergy(0.1, **settings)
+        PathEnergy(**settings)

@@ -81,7 +81,10 @@ def test_a_node_of_the_wrong_kind_is_named(mine, tmp_path, node, target, words) 
         (["scenario.start.automated._target_=os.getcwd"], "start.automated: expected a start, str"),
         (["reward.terms.safety._target_=builtins.print"], "reward.terms.safety: expected a piece"),
         (["reward.terms.hdv_energy=null"], "got None; to leave it out, say ~reward.terms.hdv_e"),
-        (["reward.terms.safety.weight=-1"], "reward.terms.safety.weight must not be negative, got"),
+        (
+            ["reward.terms.safety.weight=-1"],
+            "reward.terms.safety.weight must be greater than or equal to 0, got",
+        ),
         (["scenario.pieces.ttc._target_=fractions.Fraction"], "pieces.ttc: expected a piece"),
         (["variant=cacc", "leader._target_=os.getcwd"], "leader: expected a source of leaders"),
     ],

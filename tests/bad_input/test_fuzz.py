@@ -54,7 +54,7 @@ FOUND = (
     ("logger=[nan,1]", r"logger=\[nan,1\]: argument of type 'int'"),
     ("evaluation.baselines.x=1", r"evaluation\.baselines\.x=1: invalid literal"),
     (f"data.seed=1{'0' * 400}", r"data\.seed must be a number of 63 bits, got one of 1329"),
-    ("reward.terms.safety.weight=${scenario.start}", "weight must be float"),
+    ("reward.terms.safety.weight=${scenario.start}", "weight must be a valid number"),
     ("+scenario.controllers.human.time_gap=${scenario}", "Interpolation to parent node"),
 )
 

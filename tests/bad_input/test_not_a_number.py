@@ -52,9 +52,6 @@ def lost(step, value, at=3):
 class LostControl(Controller):
     reads = ("self.speed", "episode.step")
 
-    def __init__(self, max_acceleration=3.0, lookahead="", string=None, role="automated"):
-        super().__init__(string, role)
-
     def command(self, speed, step):
         return lost(step, 0.0 * speed)
 
@@ -73,9 +70,9 @@ class LostPower(MotorPower):
         return super().compute(*entries) / 0.0
 
 class LostEntry(Feature):
-    def __init__(self, string):
+    def setup(self, world):
         reads = [("vehicles", "speed"), ("episode", "step")]
-        super().__init__(reads, [("vehicles", "lost")], (len(string), 1))
+        self.wire(reads, [("vehicles", "lost")], (len(world.string), 1))
 
     def compute(self, speed, step):
         return lost(step.unsqueeze(-2), speed, at=4)

@@ -102,11 +102,12 @@ def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
 class Remembering(Controller):
     """Sums up what it saw in ``self``, in one of several ways."""
 
+    how: str = ""
     reads = ("self.speed",)
 
-    def __init__(self, how="", string=None, role="automated") -> None:
-        super().__init__(string, role)
-        self.how, self.last, self.seen, self.table = how, None, deque(), {}
+    def setup(self, world) -> None:
+        super().setup(world)
+        self.last, self.seen, self.table = None, deque(), {}
         self.register_buffer("total", torch.zeros(()))
 
     def command(self, speed):
@@ -128,8 +129,9 @@ class Remembering(Controller):
 class RememberingFeature(Feature):
     """Keeps the last gap in an attribute."""
 
-    def __init__(self, string) -> None:
-        super().__init__([("vehicles", "gap")], [("vehicles", "change")], (len(string), 1))
+    def setup(self, world) -> None:
+        shape = (len(world.string), 1)
+        self.wire([("vehicles", "gap")], [("vehicles", "change")], shape)
         self.before = None
 
     def compute(self, gap):

@@ -21,6 +21,7 @@ from lcc_rl.envs.inputs import build_source
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.random import choose, stream_id
 from lcc_rl.pieces.leader import NGSIMLeader
+from lcc_rl.pieces.world import World
 from lcc_rl.results.savings import stratified
 from lcc_rl.results.tables import summary
 
@@ -57,14 +58,15 @@ def test_the_leaders_of_data_are_what_they_were() -> None:
 
 
 def test_without_weights_the_draw_is_what_it_was() -> None:
-    leader = NGSIMLeader(wavy_profiles(7), 100, 0.1)
+    leader = NGSIMLeader().bind(World(horizon=100, profiles=wavy_profiles(7)))
     seed = torch.arange(500).unsqueeze(-1)
     assert torch.equal(leader._drawn(seed), choose(seed, 7, stream_id("leader.profile")))
 
 
 def test_records_are_drawn_by_their_weights() -> None:
     weights = torch.tensor([1.0, 2.0, 0.5, 4.0], dtype=torch.float64)
-    leader = NGSIMLeader(replace(wavy_profiles(4), weights=weights), 100, 0.1)
+    profiles = replace(wavy_profiles(4), weights=weights)
+    leader = NGSIMLeader().bind(World(horizon=100, profiles=profiles))
     seed = torch.arange(40_000).unsqueeze(-1)
     drawn = leader._drawn(seed)
     found = drawn.flatten().bincount(minlength=4).double() / len(seed)

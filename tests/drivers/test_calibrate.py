@@ -19,6 +19,7 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.pieces import CalibratedDrivers
+from lcc_rl.pieces.world import World
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.runs.precision import prepare_torch
 
@@ -77,7 +78,7 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
         assert text in out.getvalue()
     population = bootstrap(tmp_path / "run" / "drivers.parquet", mode="global")
     assert set(population.parameters()) == set(LAWS[model].parameters)
-    driven = CalibratedDrivers(population, 0.1)
+    driven = CalibratedDrivers().bind(World(population=population))
     state = [torch.full((3, 1, 1), x) for x in (10.0, 20.0, 0.0, 25.0, 1.2)]
     assert driven.acceleration(*state, torch.arange(3).view(3, 1, 1)).isfinite().all()
 

@@ -40,6 +40,7 @@ from lcc_rl.pieces import (
     TimeGapStart,
     TimeToCollision,
 )
+from lcc_rl.pieces.world import World
 
 RING = ("scenario=ring", "scenario.horizon=20", "scenario.circumference=200")
 MIXTURES = {
@@ -152,13 +153,14 @@ def test_the_group_is_what_torchrls_multi_agent_tools_expect() -> None:
 
 # -- what is refused when an environment is built --------------------------------------------------
 
-STRING = parse_string("automated*4")
-START = {"automated": TimeGapStart()}
+PROFILES = wavy_profiles()
+WORLD = World(parse_string("automated*4"), horizon=20, profiles=PROFILES)
+MOTION = StringMotion(start={"automated": TimeGapStart()})
 
 
 def pieces(*more):
-    leader = NGSIMLeader(wavy_profiles(), 20, 0.1)
-    return [leader, Places(STRING), Action(string=STRING), StringMotion(STRING, 0.1, START), *more]
+    needed = (NGSIMLeader(), Places(), Action(), MOTION)
+    return [*(piece.bind(WORLD) for piece in needed), *more]
 
 
 def check(*more) -> None:
@@ -168,8 +170,8 @@ def check(*more) -> None:
 class Wide(Feature):
     """Writes a row per pair of vehicles where its spec says a row per vehicle."""
 
-    def __init__(self) -> None:
-        super().__init__([("vehicles", "gap")], [("vehicles", "wide")], (4, 1))
+    def setup(self, world: World) -> None:
+        self.wire([("vehicles", "gap")], [("vehicles", "wide")], (4, 1))
 
     def compute(self, gap: Tensor) -> Tensor:
         return gap.unsqueeze(-2).expand(*gap.shape[:-1], 4, 1)
@@ -178,8 +180,8 @@ class Wide(Feature):
 class Broken(Feature):
     """Cannot compute on such a string."""
 
-    def __init__(self) -> None:
-        super().__init__([("vehicles", "gap")], [("vehicles", "broken")], (4, 1))
+    def setup(self, world: World) -> None:
+        self.wire([("vehicles", "gap")], [("vehicles", "broken")], (4, 1))
 
     def compute(self, gap: Tensor) -> Tensor:
         return gap + torch.zeros(3, 1)
@@ -195,36 +197,36 @@ class Whole(Controller):
 
 
 def test_what_fits_is_accepted() -> None:
-    check(TimeGap(STRING))
+    check(TimeGap().bind(WORLD))
 
 
 @pytest.mark.parametrize(
     ("piece", "words"),
     [
-        (Wide, r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
-        (Broken, "Broken does not fit the string of vehicles"),
+        (Wide().bind(), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
+        (Broken().bind(), "Broken does not fit the string of vehicles"),
         (
-            lambda: StringMotion(STRING, 0.1, START),
+            MOTION.bind(WORLD),
             r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",
         ),
         (
-            lambda: TimeToCollision(parse_string("automated*3")),
+            TimeToCollision().bind(World(parse_string("automated*3"))),
             r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* expected \[3, 1\]",
         ),
         (
-            lambda: Action(string=parse_string("automated*4"), role="other"),
+            Action().bind(WORLD, "other"),
             r"Action reads other\.action, but only automated vehicles have an action",
         ),
     ],
 )
 def test_a_piece_that_does_not_fit_is_refused(piece, words) -> None:
     with pytest.raises(ConfigError, match=words):
-        check(piece())
+        check(piece)
 
 
 def test_a_command_of_another_type_is_refused() -> None:
     made = pieces()
-    made[2] = Whole(STRING)
+    made[2] = Whole().bind(WORLD)
     with pytest.raises(
         ConfigError, match=r"Whole writes command\.automated as \[4, 1\] torch.int6"
     ):

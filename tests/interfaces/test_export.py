@@ -15,6 +15,7 @@ from lcc_rl.evaluation.rollout import play
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy, main
 from lcc_rl.pieces import Action, Observation
+from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
 
 KEYS = [("vehicles", name) for name in ("speed", "gap", "acceleration")]
@@ -80,7 +81,8 @@ def test_with_nobody_behind_the_relative_speed_is_zero_as_in_the_environment() -
     scales = {"self": {"speed": 1.0}, "behind": {"speed": 1.0, "relative_speed": 0.1}}
     network = torch.nn.Linear(4, 1, bias=False)
     network.weight.data = torch.tensor([[0.0, 0.0, 1.0, 0.0]])
-    exported = ExportedPolicy(network, Observation(scales, string=string), Action(1.0), None)
+    observation = Observation(scales=scales).bind(World(string))
+    exported = ExportedPolicy(network, observation, Action(max_acceleration=1.0), None)
     assert exported.names == ["self.speed", "behind.speed", "behind.present"]
     state = torch.tensor([[10.0, 0.0, 0.0], [10.0, 8.0, 1.0]])
     torch.testing.assert_close(exported(state), torch.tensor([[0.0], [0.2]]))

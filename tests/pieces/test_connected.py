@@ -36,6 +36,7 @@ from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.cacc import Gains
 from lcc_rl.pieces import CACC, HCFS, Communication, DeadBeat, parse_string
+from lcc_rl.pieces.world import World
 from lcc_rl.policies import ControllerPolicy
 
 # -- dead-beat -------------------------------------------------------------------------------------
@@ -107,7 +108,7 @@ def test_cacc_closes_its_gaps() -> None:
 
 def test_unstable_gains_are_refused_by_the_controller() -> None:
     with pytest.raises(ConfigError, match=r"kv = k2 \+ k4 = 2\.6 must be below 2"):
-        CACC(T, A_MAX, k2=1.3)
+        CACC(k2=1.3).bind(World(time_step=T))
 
 
 @pytest.mark.parametrize(
@@ -300,7 +301,8 @@ def test_keeps_no_state_of_its_own() -> None:
 
 def test_any_two_controllers_make_a_hybrid() -> None:
     gains = composed("variant=cacc", "gains=paper_like").gains
-    other = ControllerPolicy(CACC(T, A_MAX, **gains, string=parse_string("automated*6")), A_MAX)
+    world = World(parse_string("automated*6"), T)
+    other = ControllerPolicy(CACC(max_acceleration=A_MAX, **gains).bind(world), A_MAX)
     series = play(ramps(), hcfs(other))
     parents = [play(ramps(), cacc(name))["reward"].sum() for name in ("tuned", "paper_like")]
     assert series["reward"].sum() >= max(parents) - 0.1 * abs(max(parents))
@@ -317,29 +319,25 @@ def test_the_hybrid_of_good_parents_is_about_as_good_as_the_better() -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("deployed.jerk_bound=0", "jerk_bound must be positive"),
-        ("deployed.lookahead=future", "causal, hold, oracle"),
-        ("deployed.braking=9", "braking must lie in"),
-        ("deployed.margin=-1", "margin"),
-        ("+deployed.mass=3", "mass"),
+        ("deployed.lookahead=future", "'causal', 'hold' or 'oracle'"),
+        ("deployed.braking=9", "braking must be at most max_acceleration"),
+        ("deployed.mass=3", "unknown setting of deployed .* 'mass'"),
         ("gains.k2=1.9", "unstable"),
     ],
 )
 def test_impossible_controllers(override, words) -> None:
-    cfg = deployed(composed("variant=hcfs", override))
     with pytest.raises(ConfigError, match=words):
-        build_env(cfg, ramps(), POPULATION, 1)
+        build_env(deployed(composed("variant=hcfs", override)), ramps(), POPULATION, 1)
 
 
 def test_a_controller_that_remembers_is_no_policy() -> None:
-    rule = CACC(T, string=parse_string("automated*2"))
+    world = World(parse_string("automated*2"), T)
     with pytest.raises(ConfigError, match="HCFS remembers entries of its own"):
-        ControllerPolicy(HCFS(rule, T, string=parse_string("automated*2")))
+        ControllerPolicy(HCFS(rule=CACC()).bind(world))
 
 
 def test_the_hybrid_brakes_where_what_it_measures_is_no_number() -> None:
-    string = parse_string("automated*2")
-    hybrid = HCFS(CACC(T, string=string), T, string=string)
+    hybrid = HCFS(rule=CACC()).bind(World(parse_string("automated*2"), T))
     measured = (
         "action",
         "speed",
@@ -402,7 +400,7 @@ MIXED = parse_string("automated*2 human automated*2")
 
 def heard(delay: float, leader_sends: bool = True):
     """What is heard in one mixed string; speeds, gaps and accelerations as written here."""
-    piece = Communication(MIXED, leader_sends=leader_sends, headway=5.0, delay=delay)
+    piece = Communication(leader_sends=leader_sends, delay=delay).bind(World(MIXED))
     speed = torch.tensor([10.0, 11.0, 8.0, 9.0, 12.0]).view(1, 5, 1)
     gap = torch.tensor([6.0, 4.0, 20.0, 7.0, 5.5]).view(1, 5, 1)
     acceleration = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]).view(1, 5, 1)
@@ -464,12 +462,12 @@ def test_cacc_in_a_mixed_string_obeys_the_law_by_hand() -> None:
 
 def test_on_a_ring_a_chain_needs_a_leader() -> None:
     with pytest.raises(ConfigError, match="a chain would have no leader"):
-        Communication(parse_string("automated*3", "ring"))
+        Communication().bind(World(parse_string("automated*3", "ring")))
 
 
 def test_no_oracle_behind_a_human_driver() -> None:
     with pytest.raises(ConfigError, match="oracle knows the recorded leader only"):
-        DeadBeat(T, lookahead="oracle", string=MIXED)
+        DeadBeat(lookahead="oracle").bind(World(MIXED, T))
 
 
 # -- the headway and the safe cap ------------------------------------------------------------------

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from importlib.util import find_spec
 
 import pytest
@@ -32,7 +33,6 @@ import lcc_rl.pieces as room
 from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet
 from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.envs.step import Pieces
-from lcc_rl.functional.mpc import MPCSettings
 from lcc_rl.pieces import (
     CACC,
     FVDM,
@@ -93,6 +93,7 @@ from lcc_rl.pieces import (
     VelocityReward,
 )
 from lcc_rl.pieces.base import as_key
+from lcc_rl.pieces.world import World
 from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, shared_policy
 
 HORIZON, T = 12, 0.1
@@ -135,135 +136,126 @@ BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, Dri
 STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
 
 
-def leading(string: VehicleString) -> dict[str, Callable[[], Piece]]:
+def leading() -> dict[str, Piece]:
     """The pieces that there are only behind a leader."""
-    if string.ring:
-        return {}
     return {
-        "NGSIMLeader": lambda: NGSIMLeader(
-            wavy_profiles(), HORIZON, T, perturbation=0.5, foresight=True
-        ),
-        "LeaderPreview": lambda: LeaderPreview(wavy_profiles(), T, [0.5, 3.0], noise=0.2),
+        "NGSIMLeader": NGSIMLeader(perturbation=0.5, foresight=True),
+        "LeaderPreview": LeaderPreview(horizons=[0.5, 3.0], noise=0.2),
     }
 
 
-def controllers(string: VehicleString) -> dict[str, Callable[[], Piece]]:
-    def human(role: str) -> IDM:
-        return IDM(POPULATION, T, noise=0.05, wiener=0.1, string=string, role=role)
+def driver(kind: type[DriverModel], delay: int) -> DriverModel:
+    return kind(wiener=0.1, delay=delay, parameters=kind.law.constants())
 
-    def driver(kind: type, role: str, delay: int) -> DriverModel:
-        own = kind.law.constants()
-        return kind(
-            POPULATION, T, wiener=0.1, delay=delay, parameters=own, string=string, role=role
-        )
 
-    def stopper(role: str, speed: float | None = None) -> FollowerStopper:
-        return FollowerStopper(T, speed, window=0.5, string=string, role=role)
-
-    own = {"string": string, "role": "planning"}
-    planning = {"MPC": lambda: MPC(MPCSettings(horizon=3.0), **own)}
-    if MISSING:
-        planning = {"LinearACC, planning": lambda: LinearACC(**own)}
+def controllers() -> dict[str, tuple[str, Piece]]:
+    """Every controller and filter, and the role that it drives."""
+    human, stopper = IDM(noise=0.05, wiener=0.1), FollowerStopper(window=0.5)
+    planning = {"LinearACC, planning": LinearACC()} if MISSING else {"MPC": MPC(horizon=3.0)}
+    cacc = CACC(k3=0.4)
     return {
-        **planning,
-        FILTERED: lambda: Action(string=string),
-        "Action": lambda: Action(string=string, role="plain"),
-        "IDM": lambda: human("human"),
-        "IDM, late": lambda: driver(IDM, "late", 3),
-        "OVM": lambda: driver(OVM, "optimal", 0),
-        "FVDM": lambda: driver(FVDM, "difference", 1),
-        "Gipps": lambda: driver(Gipps, "gipps", 2),
-        "CalibratedDrivers": lambda: CalibratedDrivers(
-            MIXED, T, wiener=0.1, delay=2, string=string, role="calibrated"
-        ),
-        "CACC": lambda: CACC(T, k3=0.4, string=string, role="cacc"),
-        "CACC, literal": lambda: CACC(T, literal=True, string=string, role="printed"),
-        "DeadBeat": lambda: DeadBeat(T, string=string, role="beat"),
-        "FollowerStopper": lambda: stopper("stopper"),
-        "PISaturation": lambda: PISaturation(T, 0.5, string=string, role="saturating"),
-        "Handover": lambda: Handover(
-            human("handover"), stopper("handover"), 0.5, T, string, "handover"
-        ),
-        "IDMACC": lambda: IDMACC(string=string, role="following"),
-        "LinearACC": lambda: LinearACC(string=string, role="cruising"),
-        "ConstantAcceleration": lambda: ConstantAcceleration(0.3, string, "constant"),
-        "HCFS": lambda: HCFS(
-            CACC(T, k3=0.4, string=string, role="hybrid"),
-            T,
-            spacing_weight=0.02,
-            spacing_time=1.0,
-            string=string,
-            role="hybrid",
-        ),
-        "CBFFilter": lambda: CBFFilter(T, string=string),
-        "Corrected": lambda: Corrected(3.0, string),
+        **{name: ("planning", piece) for name, piece in planning.items()},
+        FILTERED: ("automated", Action()),
+        "Action": ("plain", Action()),
+        "IDM": ("human", human),
+        "IDM, late": ("late", driver(IDM, 3)),
+        "OVM": ("optimal", driver(OVM, 0)),
+        "FVDM": ("difference", driver(FVDM, 1)),
+        "Gipps": ("gipps", driver(Gipps, 2)),
+        "CalibratedDrivers": ("calibrated", CalibratedDrivers(wiener=0.1, delay=2)),
+        "CACC": ("cacc", cacc),
+        "CACC, literal": ("printed", CACC(literal=True)),
+        "DeadBeat": ("beat", DeadBeat()),
+        "FollowerStopper": ("stopper", stopper),
+        "PISaturation": ("saturating", PISaturation(window=0.5)),
+        "Handover": ("handover", Handover(before=human, after=stopper, from_s=0.5)),
+        "IDMACC": ("following", IDMACC()),
+        "LinearACC": ("cruising", LinearACC()),
+        "ConstantAcceleration": ("constant", ConstantAcceleration(acceleration=0.3)),
+        "HCFS": ("hybrid", HCFS(rule=cacc, spacing_weight=0.02, spacing_time=1.0)),
+        "CBFFilter": ("automated", CBFFilter()),
+        "Corrected": ("automated", Corrected()),
     }
 
 
 def motion(string: VehicleString) -> StringMotion:
     start = {role: TimeGapStart() for role in string.names}
-    start |= {role: EquilibriumStart(POPULATION) for role in DRIVEN}
+    start |= {role: EquilibriumStart() for role in DRIVEN}
     start |= {role: HeadwayStart() for role in CONNECTED}
     length = 30.0 * len(string) if string.ring else None
-    return StringMotion(string, T, start, length, initial_speed=8.0)
+    return StringMotion(start=start, circumference=length, initial_speed=8.0)
 
 
-def rewards(string: VehicleString) -> dict[str, Callable[[], Piece]]:
-    own = {"string": string}
+def rewards() -> dict[str, tuple[str | None, Piece]]:
+    """Every reward term, and its name where there are several of a class."""
+    estimated = EnergyReward(of="behind", power="human.predicted_power")
     return {
-        "SafetyReward": lambda: SafetyReward(**own),
-        "EfficiencyReward": lambda: EfficiencyReward(**own),
-        "EnergyReward": lambda: EnergyReward(T, "self_energy", **own),
-        "EnergyReward, behind": lambda: EnergyReward(T, "behind_energy", of="behind", **own),
-        "EnergyReward, estimated": lambda: EnergyReward(
-            T, "estimated", of="behind", power="human.predicted_power", **own
-        ),
-        "EnergyReward, string": lambda: EnergyReward(T, "string_energy", of="string", **own),
-        "CollisionPenalty": lambda: CollisionPenalty(**own),
-        "RangeReward": lambda: RangeReward("longest", largest=9.0, **own),
-        "SmoothRange": lambda: SmoothRange("shortest", 1.0, "time_gap", least=1.2, **own),
-        "VelocityReward": lambda: VelocityReward(**own),
-        "JerkReward": lambda: JerkReward(**own),
-        "SpacingReward": lambda: SpacingReward(**own),
-        "SmoothSafety": lambda: SmoothSafety("smooth_safety", **own),
-        "SmoothEfficiency": lambda: SmoothEfficiency("smooth_efficiency", **own),
-        "Smoothness": lambda: Smoothness(**own),
-        "Correction": lambda: Correction(**own),
-        "PathEnergy": lambda: PathEnergy(T, "path_energy", **own),
-        "PathEnergy, mixed": lambda: PathEnergy(T, "path_mixed", energy=FLEET, **own),
-        "PathEnergy, behind": lambda: PathEnergy(T, "path_behind", of="behind", **own),
+        "SafetyReward": (None, SafetyReward()),
+        "EfficiencyReward": (None, EfficiencyReward()),
+        "EnergyReward": ("self_energy", EnergyReward()),
+        "EnergyReward, behind": ("behind_energy", EnergyReward(of="behind")),
+        "EnergyReward, estimated": ("estimated", estimated),
+        "EnergyReward, string": ("string_energy", EnergyReward(of="string")),
+        "CollisionPenalty": (None, CollisionPenalty()),
+        "RangeReward": ("longest", RangeReward(largest=9.0)),
+        "SmoothRange": ("shortest", SmoothRange(entry="time_gap", least=1.2)),
+        "VelocityReward": (None, VelocityReward()),
+        "JerkReward": (None, JerkReward()),
+        "SpacingReward": (None, SpacingReward()),
+        "SmoothSafety": (None, SmoothSafety()),
+        "SmoothEfficiency": (None, SmoothEfficiency()),
+        "Smoothness": (None, Smoothness()),
+        "Correction": (None, Correction()),
+        "PathEnergy": ("path_energy", PathEnergy()),
+        "PathEnergy, mixed": ("path_mixed", PathEnergy()),
+        "PathEnergy, behind": ("path_behind", PathEnergy(of="behind")),
     }
 
 
 def makers(road: str) -> dict[str, Callable[[], Piece]]:
     """Every piece, in the order in which a scenario needs them."""
     string = STRINGS[road]
-    own = {"string": string}
     kind = "stacked" if road == "drawn" else "filtered"
-    terms = rewards(string)
-    return {
-        "Places": lambda: Places(string),
-        **leading(string),
-        **controllers(string),
-        "StringMotion": lambda: motion(string),
-        "Communication": lambda: Communication(string, CONNECTED),
-        "DriverEstimator": lambda: DriverEstimator(POPULATION, T, learning_time=0.5, **own),
-        "TimeToCollision": lambda: TimeToCollision(string),
-        "TimeGap": lambda: TimeGap(string),
-        "EnergyClasses": lambda: EnergyClasses(string, FLEET),
-        "MotorPower": lambda: MotorPower(string),
-        "MotorPower, mixed": lambda: MotorPower(string, power="mixed_power", energy=FLEET),
-        "MotorPower, estimated": lambda: MotorPower(
-            string, "human", "predicted_acceleration", "predicted_power"
-        ),
-        "Collision": Collision,
-        "ObservationMemory": lambda: ObservationMemory(
-            T, ["ahead.speed", "self.gap"], [0.5, 1.0], kind, **own
-        ),
-        "Observation": lambda: Observation(SCALES, 2, {"memory": 4}, **own),
-        **terms,
-        "TotalReward": lambda: TotalReward([make().name for make in terms.values()], string),
+    believed = MotorPower(
+        vehicles="human", acceleration="predicted_acceleration", power="predicted_power"
+    )
+    memory = ObservationMemory(sources=["ahead.speed", "self.gap"], seconds=[0.5, 1.0], kind=kind)
+    terms = rewards()
+    listed = [name or piece.name for name, piece in terms.values()]
+    unnamed = {
+        "StringMotion": motion(string),
+        "Communication": Communication(connected=CONNECTED),
+        "DriverEstimator": DriverEstimator(learning_time=0.5),
+        "TimeToCollision": TimeToCollision(),
+        "TimeGap": TimeGap(),
+        "EnergyClasses": EnergyClasses(),
+        "MotorPower": MotorPower(),
+        "MotorPower, mixed": MotorPower(power="mixed_power"),
+        "MotorPower, estimated": believed,
+        "Collision": Collision(),
+        "ObservationMemory": memory,
+        "Observation": Observation(scales=SCALES, visible=2, widths={"memory": 4}),
     }
+    first = {"Places": Places(), **({} if string.ring else leading())}
+    pieces: dict[str, tuple[str | None, Piece]] = {
+        **{name: (None, piece) for name, piece in first.items()},
+        **controllers(),
+        **{name: (None, piece) for name, piece in unnamed.items()},
+        **terms,
+        "TotalReward": (None, TotalReward(terms=listed)),
+    }
+    return {
+        label: partial(piece.bind, world_of(road, label), name)
+        for label, (name, piece) in pieces.items()
+    }
+
+
+def world_of(road: str, label: str) -> World:
+    world = World(STRINGS[road], T, HORIZON, wavy_profiles(), POPULATION)
+    if label == "CalibratedDrivers":
+        return replace(world, population=MIXED)
+    mixed = label.endswith("mixed") or label == "EnergyClasses"
+    return replace(world, energy=FLEET) if mixed else world
 
 
 @cache
@@ -474,7 +466,7 @@ class Comfort(RewardTerm):
 
 def test_a_term_appended_to_an_environment_counts() -> None:
     plain, env = (small_env("alcc", 3, seed=2) for _ in range(2))
-    env.append_transform(Comfort("comfort", 0.5, string=made_string(env)))
+    env.append_transform(Comfort(weight=0.5))
     check_env_specs(env)
     # Appended after the checks, whose random actions draw from the environment's generator.
     one, two = (e.set_seed(7) and e.rollout(10, zero) for e in (plain, env))
@@ -488,24 +480,20 @@ def zero(td: TensorDictBase) -> TensorDictBase:
     return td.set(ACTION, torch.full((3, 1, 1), 0.2))
 
 
-def made_string(env: TransformedEnv) -> VehicleString:
-    return next(piece.string for piece in env.transform if isinstance(piece, StringMotion))
-
-
 # -- policies --------------------------------------------------------------------------------------
 
-PLATOON = VehicleString(("automated",) * 3)
+PLATOON = World(VehicleString(("automated",) * 3), 0.2)
+
+
+def policy_of(controller: Controller) -> ControllerPolicy:
+    return ControllerPolicy(controller.bind(PLATOON))
+
+
 POLICIES: dict[str, tuple[str, Callable]] = {
-    "CACC": ("ddpg", lambda: ControllerPolicy(CACC(0.2, string=PLATOON))),
-    "DeadBeat": ("ddpg", lambda: ControllerPolicy(DeadBeat(0.2, string=PLATOON))),
-    "FollowerStopper": (
-        "ddpg",
-        lambda: ControllerPolicy(FollowerStopper(0.2, 8.0, string=PLATOON)),
-    ),
-    "ConstantAcceleration": (
-        "ddpg",
-        lambda: ControllerPolicy(ConstantAcceleration(0.3, PLATOON)),
-    ),
+    "CACC": ("ddpg", lambda: policy_of(CACC())),
+    "DeadBeat": ("ddpg", lambda: policy_of(DeadBeat())),
+    "FollowerStopper": ("ddpg", lambda: policy_of(FollowerStopper(desired_speed=8.0))),
+    "ConstantAcceleration": ("ddpg", lambda: policy_of(ConstantAcceleration(acceleration=0.3))),
     "network": ("ddpg", lambda: shared_policy(make_actor(6, 1, (8,), 0))),
     "network that explores": (
         "ddpg",
@@ -563,8 +551,8 @@ def test_a_controller_drives_as_well_as_a_policy(variant) -> None:
     """The same motion, whether the controller commands or acts."""
     own = ["scenario.string=automated*3"]
     rule = small_env(variant, 3, own).rollout(20)
-    controller = {"cacc": CACC, "deadbeat": DeadBeat}[variant](0.2, string=PLATOON)
-    acting = small_env("ddpg", 3, own).rollout(20, ControllerPolicy(controller))
+    controller = {"cacc": CACC, "deadbeat": DeadBeat}[variant]()
+    acting = small_env("ddpg", 3, own).rollout(20, policy_of(controller))
     for name in ("speed", "gap", "command"):
         torch.testing.assert_close(
             acting["next", "vehicles", name], rule["next", "vehicles", name], rtol=1e-4, atol=1e-4

@@ -15,6 +15,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.functional.ovm import OVMConstants
 from lcc_rl.pieces import IDM, OVM, CalibratedDrivers
+from lcc_rl.pieces.world import World
 
 MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
 EACH = pytest.mark.parametrize("model", list(MODELS))
@@ -128,7 +129,7 @@ def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:
 
 
 def test_the_gradient_through_a_mixture_is_finite() -> None:
-    piece = CalibratedDrivers(MIXED, 0.1)
+    piece = CalibratedDrivers().bind(World(population=MIXED))
     shape = (8, 1, 1)
     motion = [torch.full(shape, x, requires_grad=True) for x in (10.0, 15.0, 1.0)]
     driver = torch.arange(8).view(shape)
@@ -177,9 +178,9 @@ def test_bad_settings_end_in_one_clear_error(controller, override, words) -> Non
 
 def test_parameters_of_another_model_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"parameters: expected IDMConstants, got OVMConstants"):
-        IDM(POPULATION, 0.1, parameters=OVMConstants())
+        IDM(parameters=OVMConstants()).bind(World(population=POPULATION))
     with pytest.raises(ConfigError, match=r"parameters: expected OVMConstants, got IDMConstants"):
-        OVM(POPULATION, 0.1)
+        OVM().bind(World(population=POPULATION))
 
 
 def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:

@@ -10,6 +10,7 @@ from helpers import ACTION, OBSERVATION, compose, network, small_env, steady, wa
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import LeaderPreview, Observation, ObservationMemory
+from lcc_rl.pieces.world import World
 
 FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1")
 
@@ -48,7 +49,7 @@ def test_a_delayed_preview_is_an_older_one() -> None:
 
 def test_beyond_the_record_its_last_speed_stands() -> None:
     profiles = wavy_profiles(samples=30)
-    piece = LeaderPreview(profiles, 0.1, [60.0])
+    piece = LeaderPreview(horizons=[60.0]).bind(World(profiles=profiles))
     zero = torch.zeros(1, dtype=torch.int64)
     assert piece.compute(zero, zero, zero, zero)[0, 0] == profiles.record(0)[-1]
 
@@ -56,7 +57,7 @@ def test_beyond_the_record_its_last_speed_stands() -> None:
 def test_a_window_goes_on_in_the_record_it_was_cut_from() -> None:
     whole = wavy_profiles(samples=301)
     cut = whole.windows(100)
-    piece = LeaderPreview(cut, 0.1, [5.0])
+    piece = LeaderPreview(horizons=[5.0]).bind(World(profiles=cut))
     at = torch.tensor([80])
     for window in (0, 1):  # of the first record: samples 0…100 and 101…201
         ahead = piece.compute(torch.tensor([window]), 0 * at, at, at)
@@ -68,7 +69,8 @@ def test_a_window_goes_on_in_the_record_it_was_cut_from() -> None:
 def test_noise_is_as_large_as_stated_and_repeats_with_the_seed() -> None:
     profiles, zero = wavy_profiles(), torch.zeros(20000, 1, dtype=torch.int64)
     seeds = torch.arange(20000).unsqueeze(-1)
-    exact, noisy = (LeaderPreview(profiles, 0.1, [1.0], noise=n) for n in (0.0, 0.3))
+    world = World(profiles=profiles)
+    exact, noisy = (LeaderPreview(horizons=[1.0], noise=n).bind(world) for n in (0.0, 0.3))
     error = noisy.compute(zero, zero, seeds, zero) - exact.compute(zero, zero, seeds, zero)
     assert error.std().item() == pytest.approx(0.3, rel=0.03)
     again = noisy.compute(zero, zero, seeds, zero) - exact.compute(zero, zero, seeds, zero)
@@ -119,24 +121,24 @@ def test_every_vehicle_of_a_string_remembers_what_it_saw() -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: LeaderPreview(wavy_profiles(), 0.1, []), "horizons"),
-        (lambda: LeaderPreview(wavy_profiles(), 0.1, [1.0], noise=-1.0), "noise"),
-        (lambda: LeaderPreview(wavy_profiles(), 0.1, [1.0], delay=-1.0), "delay"),
-        (lambda: LeaderPreview(wavy_profiles(), 0.1, ["a"]), "horizons must lie in"),  # type: ignore[list-item]
-        (lambda: ObservationMemory(0.1, seconds=["a"]), "seconds must lie in"),  # type: ignore[list-item]
-        (lambda: ObservationMemory(0.1, kind="remembered"), "remembered"),
+        (lambda: LeaderPreview(horizons=[]), "horizons"),
         (
-            lambda: ObservationMemory(0.1, seconds=[0.0]),
-            r"memory\.seconds must lie in \[0\.1, 3600\], got 0\.0",
+            lambda: ObservationMemory(seconds=[0.05]).bind(),
+            r"memory\.seconds must be at least a step of 0\.1 s, got 0\.05",
         ),
-        (lambda: ObservationMemory(0.1, sources=[]), "sources"),
-        (lambda: Observation({"self": {"gap": 1}}, relative_to={"ahead": "self.gap"}), "to.ahead"),
+        (lambda: ObservationMemory(sources=[]), "sources"),
         (
             lambda: Observation(
-                {"memory": {"entries": 1}},
+                scales={"self": {"gap": 1}}, relative_to={"ahead": "self.gap"}
+            ).bind(),
+            "to.ahead",
+        ),
+        (
+            lambda: Observation(
+                scales={"memory": {"entries": 1}},
                 widths={"memory": 3},
                 relative_to={"memory": ["self.gap", "self.speed"]},
-            ),
+            ).bind(),
             "2 entries do not divide its 3",
         ),
     ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_without_the_extra_one_error_says_how_to_install_it(monkeypatch, tmp_pat
     )
     expected = r"^controller=mpc needs osqp: pip install -e '\.\[mpc\]', or '<wheel>\[mpc\]' where"
     with pytest.raises(ConfigError, match=expected):
-        MPC()
+        MPC().bind()
     # Before any data are read: there is no such file.
     for words in (["compare=[mpc]"], ["evaluation.baselines=[mpc]"], [f"{PLACE}=mpc"]):
         more = ["variant=idm", "data=ngsim", "data.path=nowhere.csv", *words]
@@ -115,9 +115,10 @@ class TestWithOSQP:
         pytest.importorskip("osqp", reason="extra mpc")
 
     def test_commands_what_a_dense_solver_finds(self) -> None:
-        settings = replace(MPCSettings(), horizon=4.0, tolerance=1e-6, max_acceleration=2.5)
+        chosen = {"horizon": 4.0, "tolerance": 1e-6, "max_acceleration": 2.5}
+        settings = MPCSettings(**chosen)
         states = rows(10)
-        command, unsolved = MPC(settings).command(*states)
+        command, unsolved = MPC(**chosen).bind().command(*states)
         expected = [
             best_plan(settings, [float(x[row]) for x in states])[0] for row in range(len(command))
         ]
@@ -127,7 +128,7 @@ class TestWithOSQP:
         assert (command.abs() < 2.4).sum() >= 4, "plans inside of the limits are compared, too"
 
     def test_a_command_depends_on_its_own_row_alone(self) -> None:
-        piece, states = MPC(), rows()
+        piece, states = MPC().bind(), rows()
         command = piece.command(*states)[0]
         order = torch.randperm(len(command), generator=torch.Generator().manual_seed(1))
         assert torch.equal(piece.command(*(x[order] for x in states))[0], command[order])
@@ -138,25 +139,24 @@ class TestWithOSQP:
 
     def test_a_coarse_tolerance_changes_little(self) -> None:
         fine, coarse = (
-            MPC(replace(MPCSettings(), tolerance=x)).command(*rows())[0]
-            for x in (1e-7, MPCSettings().tolerance)
+            MPC(tolerance=x).bind().command(*rows())[0] for x in (1e-7, MPCSettings().tolerance)
         )
         assert (fine - coarse).abs().max() < 0.02
 
     def test_without_a_solution_it_brakes_and_says_so(self) -> None:
-        command, unsolved = MPC(replace(MPCSettings(), iterations=1)).command(*rows(4))
+        command, unsolved = MPC(iterations=1).bind().command(*rows(4))
         assert command.flatten().tolist() == [-3.0] * 4
         assert unsolved.flatten().tolist() == [1.0] * 4
 
     def test_what_is_no_number_stays_none(self) -> None:
         states = rows(3)
         states[1][1] = torch.nan
-        command, unsolved = MPC().command(*states)
+        command, unsolved = MPC().bind().command(*states)
         assert command.isnan().flatten().tolist() == [False, True, False]
         assert not unsolved.any()
 
     def test_compiled_code_calls_it_as_it_is(self) -> None:
-        piece, states = MPC(), rows(4)
+        piece, states = MPC().bind(), rows(4)
 
         def twice(*entries: torch.Tensor) -> torch.Tensor:
             return 2.0 * piece.command(*entries)[0]

@@ -15,6 +15,7 @@ from lcc_rl.pieces import (
     TotalReward,
     parse_string,
 )
+from lcc_rl.pieces.world import World
 
 
 def t(*values: float) -> torch.Tensor:
@@ -44,21 +45,21 @@ def test_efficiency() -> None:
 
 def test_energy() -> None:
     # −20 kW/20 kW · 0.1 s; recuperation earns.
-    got = EnergyReward(0.1).reward(t(20000.0, -5000.0))
+    got = EnergyReward().bind().reward(t(20000.0, -5000.0))
     torch.testing.assert_close(got, t(-0.1, 0.025))
 
 
 def test_spacing() -> None:
     # 0.02 (e/2 m)²; 1 m too near costs what 1 m too far does. It pulls back in proportion.
     error = t(2.0, -1.0, 0.0).requires_grad_()
-    got = SpacingReward(weight=0.02, gap_scale=2.0).compute(error)
+    got = SpacingReward(weight=0.02, gap_scale=2.0).bind().compute(error)
     torch.testing.assert_close(got.detach(), t(-0.02, -0.005, 0.0))
     got.sum().backward()
     torch.testing.assert_close(error.grad, t(-0.02, 0.01, 0.0))
 
 
 def test_weights() -> None:
-    torch.testing.assert_close(EfficiencyReward(weight=0.5).compute(t(3.0)), t(-0.5))
+    torch.testing.assert_close(EfficiencyReward(weight=0.5).bind().compute(t(3.0)), t(-0.5))
 
 
 # -- many automated vehicles -------------------------------------------------------------------
@@ -75,14 +76,14 @@ GAPS = torch.full((1, 6, 1), 5.0)
     [("self", (1.0, 2.0)), ("behind", (110.0, 220.0)), ("string", (333.0, 333.0))],
 )
 def test_whose_energy_counts(of, earned) -> None:
-    term = EnergyReward(0.1, of=of, scale=1000.0, string=STRING)
+    term = EnergyReward(of=of, scale=1000.0).bind(World(STRING))
     torch.testing.assert_close(term.compute(POWER), -0.1 * t(*earned).unsqueeze(0))
 
 
 def test_estimated_energy_of_the_human_drivers_behind() -> None:
     # The same section, of an entry that only human drivers have.
-    term = EnergyReward(
-        0.1, of="behind", scale=1000.0, power="human.predicted_power", string=STRING
+    term = EnergyReward(of="behind", scale=1000.0, power="human.predicted_power").bind(
+        World(STRING)
     )
     humans = POWER[:, [1, 2, 4, 5]]
     assert term.in_keys == [("human", "predicted_power")]
@@ -91,12 +92,12 @@ def test_estimated_energy_of_the_human_drivers_behind() -> None:
 
 def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
     string = parse_string("human (automated human)*2", "ring")
-    term = EnergyReward(0.1, of="behind", scale=1000.0, string=string)
+    term = EnergyReward(of="behind", scale=1000.0).bind(World(string))
     power = 1000.0 * torch.tensor([1.0, 10.0, 100.0, 2.0, 20.0]).view(1, 5, 1)
     torch.testing.assert_close(term.compute(power), -0.1 * t(100.0, 21.0).unsqueeze(0))
     assert torch.equal(
-        EnergyReward(0.1, of="behind", string=RING).compute(POWER),
-        EnergyReward(0.1, of="behind", string=STRING).compute(POWER),
+        EnergyReward(of="behind").bind(World(RING)).compute(POWER),
+        EnergyReward(of="behind").bind(World(STRING)).compute(POWER),
     )
 
 
@@ -117,19 +118,19 @@ def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
 def test_who_pays_for_a_collision(hit, behind, pays) -> None:
     gaps = GAPS.clone()
     gaps[:, list(hit)] = -0.1
-    term = CollisionPenalty(weight=100.0, behind=behind, string=STRING)
+    term = CollisionPenalty(weight=100.0, behind=behind).bind(World(STRING))
     entries = {("vehicles", "gap"): gaps}
     got = term.compute(*(entries[key] for key in term.in_keys))
     torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))
 
 
 def test_what_is_unknown_is_refused() -> None:
-    with pytest.raises(ConfigError, match="of must be self, behind or string, got 'all'"):
-        EnergyReward(0.1, of="all")
+    with pytest.raises(ConfigError, match="of must be 'self', 'behind' or 'string', got 'all'"):
+        EnergyReward(of="all")
 
 
 def test_sum() -> None:
-    torch.testing.assert_close(TotalReward(["a", "b"]).compute(t(1.0), t(-3.0)), t(-2.0))
+    torch.testing.assert_close(TotalReward(terms=["a", "b"]).compute(t(1.0), t(-3.0)), t(-2.0))
 
 
 @pytest.mark.parametrize("settings", [{"margin": -1.0}, {"floor": 5.0}, {"weight": math.nan}])

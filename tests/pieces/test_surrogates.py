@@ -45,7 +45,7 @@ def test_efficiency_begins_at_its_threshold_and_leads_back() -> None:
 
 
 def test_smoothness_is_the_square_of_the_jerk() -> None:
-    assert Smoothness(weight=0.5).compute(torch.tensor([[2.0]])).item() == -2.0
+    assert Smoothness(weight=0.5).bind().compute(torch.tensor([[2.0]])).item() == -2.0
 
 
 @pytest.mark.parametrize("setting", ["threshold", "width", "speed_floor"])

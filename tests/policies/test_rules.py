@@ -23,7 +23,7 @@ def seen(speed: float, gap: float, relative: float) -> torch.Tensor:
 
 def policy(kind: str, **settings):
     given = {"constants": None, "max_acceleration": 3.0} | settings
-    return make_policy(kind, Observation(SCALES), (8, 8), 0, **given).module
+    return make_policy(kind, Observation(scales=SCALES).bind(), (8, 8), 0, **given).module
 
 
 @pytest.mark.parametrize("state", [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)])
@@ -80,7 +80,7 @@ def test_what_no_rule_has_is_refused(kind, constants, words) -> None:
 def test_a_rule_must_see_what_it_needs() -> None:
     words = "a rule needs self.gap, which observation.scales does not name"
     with pytest.raises(ConfigError, match=words):
-        make_policy("idm", Observation({"self": {"speed": 0.1}}), (8,), 0, None, 3.0)
+        make_policy("idm", Observation(scales={"self": {"speed": 0.1}}).bind(), (8,), 0, None, 3.0)
 
 
 def test_the_agent_learns_the_constants_alone() -> None:

@@ -14,6 +14,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.entries import ENTRIES
+from lcc_rl.pieces.world import World
 
 # One process for all: to make the environments takes longer than to look at them.
 pytestmark = pytest.mark.xdist_group("entries")
@@ -42,8 +43,9 @@ def test_page_is_up_to_date(environments, monkeypatch, tmp_path, capsys) -> None
 
 
 class Colour(Feature):
-    def __init__(self, vehicles: int) -> None:
-        super().__init__([("vehicles", "gap")], [("vehicles", "colour")], (vehicles, 1))
+    def setup(self, world) -> None:
+        shape = (len(world.string), 1)
+        self.wire([("vehicles", "gap")], [("vehicles", "colour")], shape)
 
     def compute(self, gap):
         return gap
@@ -51,7 +53,7 @@ class Colour(Feature):
 
 def test_unknown_entry_is_refused(environments) -> None:
     env, string = environments[0]
-    env = TransformedEnv(env, Pieces(Colour(len(string))))
+    env = TransformedEnv(env, Pieces(Colour().bind(World(string))))
     with pytest.raises(ConfigError, match=r"vehicles\.colour"):
         tool.collect([(env, string)])
 

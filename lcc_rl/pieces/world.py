@@ -1,0 +1,59 @@
+"""What the pieces of an environment share, and how a piece is put into it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Self
+
+from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.settings import Settings, values
+
+
+@dataclass(frozen=True)
+class World:
+    """What the pieces of an environment share; by default one automated vehicle at 10 Hz.
+
+    Args:
+        string: the string of vehicles.
+        time_step: duration of a step [s].
+        horizon: steps of an episode.
+        profiles: speed profiles of the leader.
+        population: the human drivers.
+        energy: the energy models of the vehicles.
+        nominal: leaders and starts as in an evaluation, without the deviations of training.
+    """
+
+    string: VehicleString = field(default_factory=VehicleString)
+    time_step: float = 0.1
+    horizon: int = 300
+    profiles: Any = None
+    population: Any = None
+    energy: Fleet = field(default_factory=lambda: as_fleet(None))
+    nominal: bool = False
+
+
+class Part(Settings):
+    """Settings of a part of an environment, and what follows from them in a world."""
+
+    name: ClassVar[str] = ""  # by default; that of a part in an environment is its own
+
+    def bind(self, world: World | None = None, name: str | None = None) -> Self:
+        """Return the part with what depends on a world.
+
+        Args:
+            world: what the pieces of the environment share.
+            name: the role that it drives, or its key in the configuration.
+        """
+        bound = type(self).__new__(type(self))
+        bound.__dict__.update(values(self), name=name or self.name)
+        bound.settled()
+        bound.setup(world or World())
+        return bound
+
+    def setup(self, world: World) -> None:
+        """Derive from a world what depends on it.
+
+        Args:
+            world: what the pieces of the environment share.
+        """

@@ -1,0 +1,101 @@
+"""Settings of a class as annotated fields, each written once and checked where it comes in.
+
+A class that derives from :class:`Settings` is a pydantic dataclass: an annotated name in its body
+is a setting with type, range and default; names without annotation are plain class attributes::
+
+    class Comfort(RewardTerm):
+        limit: Positive = 2.0    # jerk that nobody feels [m/s³]
+        reads = ("self.jerk",)
+        def reward(self, jerk): return -(jerk.abs() - self.limit).clamp(min=0.0)
+
+Unknown names, values of another type, numbers outside their range or not finite are refused with
+one :class:`ConfigError` that names the setting.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from functools import wraps
+from typing import Annotated, Any, TypeVar, dataclass_transform
+
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
+
+from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
+Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
+
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+S = TypeVar("S", bound="Settings")
+
+
+@dataclass_transform(kw_only_default=True, eq_default=False)
+class Settings:
+    """Base of classes whose annotated fields are settings; see the module."""
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        if "__init__" in vars(cls):
+            raise TypeError(f"{cls.__name__}: settings are annotated fields, without __init__")
+        dataclass(cls, kw_only=True, eq=False, config=STRICT)
+        construct = cls.__init__
+
+        @wraps(construct)
+        def checked(self: Any, **given: Any) -> None:
+            try:
+                construct(self, **given)
+            except ValidationError as error:
+                raise refused(error, cls, cls.__name__) from error
+            self.settled()
+
+        cls.__init__ = checked  # type: ignore[method-assign]
+
+    def settled(self) -> None:
+        """Do what has to be done once all settings are there."""
+
+
+def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
+    """Construct a class from settings that came in.
+
+    Args:
+        kind: the class.
+        given: its settings by name.
+        where: their place in the configuration, for messages.
+
+    Raises:
+        ConfigError: naming the first setting that is unknown or wrong.
+    """
+    try:
+        return kind(**{key: value for key, value in given.items() if value != "???"})
+    except ConfigError as error:
+        if isinstance(error.__cause__, ValidationError):
+            raise refused(error.__cause__, kind, where) from error
+        raise
+
+
+def refused(error: ValidationError, kind: type[Settings], where: str) -> ConfigError:
+    """Return the one-line error for the first setting that pydantic refused."""
+    first = error.errors()[0]
+    if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
+        known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        return unknown_name(f"setting of {where} ({kind.__name__})", str(first["loc"][-1]), known)
+    key = where + "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
+    if first["type"] == "missing" and len(first["loc"]) == 1:
+        return ConfigError(f"{key} is required: say {key}=…")
+    if first["type"] == "value_error":
+        return ConfigError(f"{key}: {first['ctx']['error']}")
+    return ConfigError(
+        f"{key} {first['msg'].replace('Input should', 'must')}, got {first['input']!r}"
+    )
+
+
+def values(settings: Settings) -> dict[str, Any]:
+    """Return the settings of an object by name."""
+    names = (field.name for field in dataclasses.fields(settings))  # type: ignore[arg-type]
+    return {name: getattr(settings, name) for name in names}
