@@ -222,7 +222,7 @@ def build(node: Any, where: str, **resources: Any) -> Any:
     target = find_target(str(settings[TARGET]), where)
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
     if inspect.isclass(target) and issubclass(target, Settings):
-        return _bound(parse(target, given, where), resources)
+        return _bound(parse(target, _nested(given, where, resources), where), resources)
     own = getattr(target, "Settings", None)
     if own is None:
         return _construct(target, given, where, resources)
@@ -234,6 +234,8 @@ def build(node: Any, where: str, **resources: Any) -> Any:
 
 def _bound(made: Any, resources: Mapping[str, Any]) -> Any:
     """Put what was built into the world that the caller has to offer."""
+    if not hasattr(made, "bind"):
+        return made
     from lcc_rl.pieces.world import World
 
     names = {field.name for field in fields(World)}
@@ -270,15 +272,8 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
         if key not in signature and not takes_any:
             own = set(signature) - set(resources) - INTERNAL
             raise unknown_name(f"setting of {where} ({called})", key, own)
-        if given[key] == "???":
-            raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
     offered = {k: v for k, v in resources.items() if k in signature and k not in given}
-    arguments = {
-        key: build(value, f"{where}.{key}", **resources)
-        if isinstance(value, Mapping) and TARGET in value
-        else value
-        for key, value in given.items()
-    }
+    arguments = _nested(given, where, resources)
     check_types(target, arguments, where)
     required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}
     missing = sorted(required - set(arguments) - set(offered))
@@ -291,6 +286,19 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
     except Exception as error:  # whatever a constructor of the user's own raises
         words = f"{type(error).__name__}: {error}"
         raise ConfigError(f"{where}: {called} cannot be built: {words}") from error
+
+
+def _nested(given: Mapping[str, Any], where: str, resources: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with the objects that nested nodes describe in their places."""
+    for key, value in given.items():
+        if value == "???":
+            raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
+    return {
+        key: build(value, f"{where}.{key}", **resources)
+        if isinstance(value, Mapping) and TARGET in value
+        else value
+        for key, value in given.items()
+    }
 
 
 def short_name(target: object) -> str:
