@@ -255,6 +255,8 @@ def _made(settings: Mapping[str, Any], where: str, resources: dict[str, Any]) ->
     target = find_target(str(settings[TARGET]), where)
     given = {key: value for key, value in settings.items() if not key.startswith("_")}
     for key, value in given.items():
+        if value == "???":
+            raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
         if isinstance(value, Mapping) and TARGET in value:
             given[key] = build(value, f"{where}.{key}", **resources)
     if inspect.isclass(target) and issubclass(target, Settings):
@@ -301,8 +303,6 @@ def _construct(target: Any, given: dict[str, Any], where: str, resources: dict[s
         if key not in signature and not takes_any:
             own = set(signature) - set(resources) - INTERNAL
             raise unknown_name(f"setting of {where} ({called})", key, own)
-        if given[key] == "???":
-            raise ConfigError(f"{where}.{key} is required: say {where}.{key}=…")
     offered = {k: v for k, v in resources.items() if k in signature and k not in given}
     check_types(target, given, where)
     required = {k for k, p in signature.items() if p.default is p.empty and p.kind not in (2, 4)}

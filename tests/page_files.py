@@ -52,7 +52,7 @@ def portal(path: Path) -> None:
 def pairs(path: Path) -> None:
     """The pairs of both recordings."""
     official(path.with_suffix(".csv"))
-    write_episodes(NgsimSource(str(path.with_suffix(".csv"))).load().episodes, path)
+    write_episodes(NgsimSource(path=str(path.with_suffix(".csv"))).load().episodes, path)
 
 
 def wide(path: Path) -> None:

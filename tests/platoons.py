@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from lcc_rl.data.cycles import Case, RecordLeaders, join, stretch
-from lcc_rl.data.profiles import Profiles, from_records
+from lcc_rl.data.leaders import Case, RecordLeaders, stretch
+from lcc_rl.data.profiles import Profiles, from_records, join
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.evaluation.cases import drive
 from lcc_rl.evaluation.strategies import Strategy, deployed

@@ -23,7 +23,9 @@ from lcc_rl.synthetic.stream import StreamSource
 
 def read_real(path: str) -> pd.DataFrame:
     """Episodes of a parquet table or of an NGSIM file."""
-    source = EpisodesSource(path) if Path(path).suffix == ".parquet" else NgsimSource(path)
+    source = (
+        EpisodesSource(path=path) if Path(path).suffix == ".parquet" else NgsimSource(path=path)
+    )
     return source.load().episodes
 
 

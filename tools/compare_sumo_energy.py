@@ -24,7 +24,8 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from lcc_rl.config import build
-from lcc_rl.data.speed_records import read_speed_record, resample
+from lcc_rl.data.profiles import resample
+from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.energy import CirclesFuel, EnergyModel
 from lcc_rl.interfaces.sumo import load_sumo
 from lcc_rl.interfaces.sumo_ring import write_network

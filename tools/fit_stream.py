@@ -23,10 +23,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution, minimize
 
-from lcc_rl.data.drive_tables import COLUMNS, read_drives
-from lcc_rl.data.drives import DriveLeaders, hashed
+from lcc_rl.data.leaders import DriveLeaders, hashed
+from lcc_rl.data.speed_records import COLUMNS, read_drives
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
-from lcc_rl.data.units import FRAME
+from lcc_rl.data.trajectories import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 from lcc_rl.synthetic.stream import StreamSource
@@ -112,7 +112,7 @@ def polish(distance: Distance, start: NDArray[np.float64]) -> NDArray[np.float64
 def training_drives(path: str) -> pd.DataFrame:
     """Speed records of a table that are not held out, as episodes."""
     profiles, _ = read_drives(path, COLUMNS, FRAME)
-    share = DriveLeaders(path).evaluation_share
+    share = DriveLeaders(path=path).evaluation_share
     parts = [
         pd.DataFrame({"episode": i, "leader_speed_mps": profiles.record(i).numpy()})
         for i, name in enumerate(profiles.names)

@@ -20,7 +20,7 @@ from limit_results import figure_of_limits
 from matplotlib.figure import Figure
 
 from lcc_rl.config import build, load, require
-from lcc_rl.data.cycles import stretch
+from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.drawing import save

@@ -89,7 +89,7 @@ def calibrate(options: Namespace) -> list[Row]:
     evaluations, and is one compiled function. Ours is the default search, compiled in the untimed
     run before.
     """
-    source = EpisodesSource(options.episodes) if options.episodes else stream(options.quick)
+    source = EpisodesSource(path=options.episodes) if options.episodes else stream(options.quick)
     observed = observe(source.load().episodes)
     found: dict[str, Any] = {}
     few = np.linspace(0, observed.count - 1, 2 if options.quick else 6).round().astype(int)

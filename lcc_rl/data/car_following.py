@@ -9,72 +9,42 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import Field
 
-from lcc_rl.data.places import find_leaders
-from lcc_rl.data.trajectories import Trajectories
-from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError, DataError, require_in
+from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
+from lcc_rl.errors import LARGEST, ConfigError, DataError
+from lcc_rl.settings import NonNegative, Number, Settings
 
 PASSENGER_CAR = 2
-LANE_CHANGES = ("split", "reject")
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Criteria:
-    """Criteria of a car-following episode.
+class Criteria(Settings):
+    """Criteria of a car-following episode; None stands for no limit.
 
-    Args:
-        min_duration_s: shortest episode [s].
-        max_duration_s: longest episode [s]; None for no limit. Longer ones are removed, not cut.
-        min_gap_m: smallest gap at any time [m], bumper to bumper; None for no limit.
-        max_gap_m: largest gap at any time [m], beyond which a driver does not follow; None for no
-            limit.
-        passenger_cars_only: both vehicles are of class 2 throughout. Where no vehicle has a class
-            this criterion is skipped, with a note in the report.
-        lane_changes: both vehicles share one lane throughout. ``split`` cuts a candidate where
-            they do not and judges the parts; ``reject`` removes a candidate with any lane change.
-
-    Raises:
-        ConfigError: if a limit is negative, not a number, or a lower one above an upper one.
+    Gaps are bumper to bumper, at any time. ``passenger_cars_only``: both vehicles are of class 2
+    throughout; where no vehicle has a class this is skipped, with a note in the report. Both
+    vehicles share one lane throughout: ``split`` cuts a candidate where they do not and judges the
+    parts; ``reject`` removes a candidate with any lane change.
     """
 
-    min_duration_s: float = 15.0
-    max_duration_s: float | None = None
-    min_gap_m: float | None = 0.0
-    max_gap_m: float | None = 120.0
+    min_duration_s: Annotated[float, Field(ge=FRAME, le=LARGEST)] = 15.0
+    max_duration_s: NonNegative | None = None  # longer ones are removed, not cut
+    min_gap_m: Number | None = 0.0
+    max_gap_m: NonNegative | None = 120.0  # beyond it, a driver does not follow
     passenger_cars_only: bool = True
-    lane_changes: str = "split"
+    lane_changes: Literal["split", "reject"] = "split"
 
-    def __post_init__(self) -> None:
-        for name in ("min_duration_s", "max_duration_s", "max_gap_m"):
-            value = getattr(self, name)
-            if value is not None or name == "min_duration_s":
-                require_in("criteria", "[0, inf)", **{name: value})
-        if self.min_gap_m is not None:
-            require_in("criteria", "(-inf, inf)", min_gap_m=self.min_gap_m)
-        if self.min_duration_s < FRAME:
-            raise ConfigError(
-                f"criteria: 'min_duration_s' must be at least {FRAME:g} s, two samples, got "
-                f"{self.min_duration_s}"
-            )
+    def settled(self) -> None:
         for quantity in ("duration_s", "gap_m"):
             low, high = (getattr(self, f"{end}_{quantity}") for end in ("min", "max"))
-            if low is not None and high is not None and not low <= high:
-                raise ConfigError(
-                    f"criteria: 'min_{quantity}' ({low}) must not be above "
-                    f"'max_{quantity}' ({high})"
-                )
-        if self.lane_changes not in LANE_CHANGES:
-            raise ConfigError(
-                f"criteria: 'lane_changes' must be one of {', '.join(LANE_CHANGES)}, got "
-                f"{self.lane_changes!r}"
-            )
+            if low is not None and high is not None and low > high:
+                raise ConfigError(f"criteria: min_{quantity}={low} is above max_{quantity}={high}")
 
 
 @dataclass

@@ -8,15 +8,99 @@ are kept, in compact types, so that the whole portal export fits in a few gigaby
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from lcc_rl.data.ngsim_blocks import read_blocks
-from lcc_rl.data.ngsim_columns import CollectedRows
-from lcc_rl.data.ngsim_table import sorted_table
-from lcc_rl.data.trajectories import ReadReport, Trajectories
-from lcc_rl.data.units import check_units, factor
-from lcc_rl.errors import DataError
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from lcc_rl.data.ngsim_recordings import Group, name_recordings
+from lcc_rl.data.tables import (
+    LARGEST_ID,
+    Column,
+    cells_of,
+    checked,
+    is_text,
+    lacking,
+    parse_text,
+    reading,
+    single_spaces,
+)
+from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
+from lcc_rl.errors import DataError, unknown_name
+
+HEADER = (
+    "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,"
+    "v_Width,v_Class,v_Vel,v_Acc,Lane_ID,Preceding,Following,Space_Headway,Time_Headway"
+)
+OFFICIAL = HEADER.split(",")
+# Other spellings in the documents of the four sites, in lower case without separators.
+ALIASES = {
+    "spacehdwy": "Space_Headway",
+    "spacing": "Space_Headway",
+    "preceeding": "Preceding",
+    "precedingvehicle": "Preceding",
+    "vehiclelength": "v_Length",
+    "vehicleclass": "v_Class",
+    "vehiclevelocity": "v_Vel",
+    "vehicleacceleration": "v_Acc",
+    "laneidentification": "Lane_ID",
+}
+INT32, INT16, INT8, REAL = 2**31 - 1, 2**15 - 1, 2**7 - 1, 1e9
+
+
+class Field(NamedTuple):
+    """A column of NGSIM files: what it is here, its type, and what it may hold."""
+
+    own: str
+    kind: type
+    column: Column
+
+
+def _field(
+    name: str, own: str, kind: type, least: float = -REAL, most: float = REAL, **more: Any
+) -> Field:
+    whole = issubclass(kind, np.integer)
+    return Field(own, kind, Column(name, least=least, most=most, whole=whole, **more))
+
+
+FIELDS = [
+    _field("Vehicle_ID", "vehicle", np.int64, 1, LARGEST_ID),
+    _field("Frame_ID", "frame", np.int32, 0, INT32),
+    _field("Local_Y", "position_m", np.float32),
+    _field("Lane_ID", "lane", np.int16, -INT16, INT16),
+    _field("v_Length", "length_m", np.float32),
+    _field("v_Class", "vehicle_class", np.int8, -1, INT8, blank=True),
+    _field("v_Vel", "speed_mps", np.float32),
+    _field("v_Acc", "acceleration_mps2", np.float32),
+    _field("Preceding", "preceding", np.int64, -LARGEST_ID, LARGEST_ID, blank=True),
+    _field("Space_Headway", "space_headway_m", np.float32, blank=True, required=False),
+    _field("Global_Time", "clock", np.float64, -1e300, 1e300, blank=True, required=False),
+]
+KNOWN = [item.column.key for item in FIELDS] + ["Location"]
+# What follows from a column that is all zero or blank.
+CONSEQUENCES = {
+    "Global_Time": "recordings are told apart by file",
+    "v_Length": "gaps are front to front, not bumper to bumper",
+    "v_Class": "nothing to filter vehicle classes on",
+    "v_Vel": "nothing to learn from it",
+    "v_Acc": "nothing to learn from it",
+    "Lane_ID": "nothing to learn from it",
+    "Preceding": "no vehicle follows another",
+    "Space_Headway": "space headways are derived from positions",
+}
+METRES = {"feet": FOOT, "metres": 1.0}
+CAR = (2.0, 12.0)  # m; between them lies the median length of vehicles on any road
+JAM = 3.0  # m; front to front, no two cars are closer in a queue
+EXACT = "exact duplicate (vehicle, frame)"
+CONFLICTING = "conflicting duplicate (vehicle, frame)"
+BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24
+Columns = dict[str, NDArray]
 
 
 def read_ngsim(
@@ -43,26 +127,361 @@ def read_ngsim(
         units: what the files are in: ``feet``, as published, or ``metres``.
 
     Raises:
-        DataError: if a file is missing, damaged, of no known layout, or a needed cell is blank or
-            not a valid number; it names the file, the line and the column. Or if the vehicles
-            are too short or long for these units.
+        DataError: naming the file, the line and the column at fault, or if the vehicles are too
+            short or long for these units.
         ConfigError: if the units are unknown.
     """
     paths = [path] if isinstance(path, (str, Path)) else list(path)
     if not paths:
         raise DataError("no NGSIM file was named; expected at least one path")
-    factor(units)
-    rows = CollectedRows(ReadReport(files=[str(name) for name in paths]), units)
+    if units not in METRES:
+        raise unknown_name("setting of data.units", str(units), METRES)
+    rows = _Rows(ReadReport(files=[str(name) for name in paths]), METRES[units])
     wanted = None if location is None else location.strip().lower()
     for name in paths:
-        for block in read_blocks(name):
+        for block in _blocks(str(name)):
             rows.add(block, wanted)
     if not rows.chunks:
         found = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())
         raise DataError(
             f"{', '.join(rows.report.files)}: no row has Location {location!r}; "
-            f"the locations found are {found}"
+            f"the locations found are {found or 'none'}"
         )
-    samples = sorted_table(rows)
-    check_units(samples, units, rows.report.files)
+    samples = _sorted(rows)
+    _check_units(samples, units, rows.report.files)
     return Trajectories(samples, rows.report)
+
+
+# -- blocks of rows --------------------------------------------------------------------------------
+
+
+@dataclass
+class _Layout:
+    """Number of columns, the place of every known one, and how columns are separated."""
+
+    width: int
+    places: dict[str, int]
+    header: bool
+    separator: str
+
+
+class _Block:
+    """Consecutive rows of a file as text columns, converted and checked on access."""
+
+    def __init__(self, path: str, lines: bytes, first_line: int, layout: _Layout) -> None:
+        self.path, self.lines, self.first_line = path, lines, first_line
+        if not is_text(lines):
+            raise DataError(f"{path}: a line from {first_line} on is not text; expected UTF-8")
+        names = {str(place): name for name, place in layout.places.items()}
+        table = parse_text(lines, layout.width, layout.separator, [*names], path, first_line)
+        self.table = table.rename_columns([names[place] for place in table.column_names])
+        self.row = np.arange(len(self))
+
+    def __len__(self) -> int:
+        return int(self.table.num_rows)
+
+    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
+        """Names in the Location column (lower case, '' where blank) and each row's index of it."""
+        if "Location" not in self.table.column_names:
+            return [""], np.zeros(len(self), dtype=np.int64)
+        encoded = self.table["Location"].combine_chunks().dictionary_encode()
+        if isinstance(encoded, pa.ChunkedArray):
+            encoded = encoded.combine_chunks()
+        names = [str(name).strip().lower() for name in encoded.dictionary.to_pylist()]
+        codes = encoded.indices.fill_null(len(names)).to_numpy(zero_copy_only=False)
+        return [*names, ""], codes.astype(np.int64)
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Keep only the rows where ``mask`` holds; messages still name lines of the file."""
+        self.row, self.table = self.row[mask], self.table.filter(pa.array(mask))
+
+    def values(self, column: Column) -> NDArray[np.float64]:
+        """Read a column of numbers; NaN where a cell is blank, or the file has no such column."""
+        if column.key not in self.table.column_names:
+            return np.full(len(self), np.nan)
+
+        def fault(row: int, words: str) -> DataError:
+            lines = enumerate(self.lines.split(b"\n"), self.first_line)  # blank ones hold no row
+            line = [number for number, text in lines if text.strip(b"\r")][self.row[row]]
+            return DataError(f"{self.path}: line {line}, column {column.key!r} {words}")
+
+        return checked(self.table[column.key], column, fault)
+
+
+def _blocks(name: str) -> Iterator[_Block]:
+    """Read a file in blocks of rows, in the order of the file."""
+    layout: _Layout | None = None
+    first_line = 1
+    empty = True
+    for raw in _line_chunks(name):
+        lines = raw
+        if layout is None:
+            lines = lines.removeprefix(b"\xef\xbb\xbf")
+            bare = lines.lstrip(b" \t\r\n")
+            if not bare:
+                first_line += raw.count(b"\n")
+                continue
+            first_line += lines[: len(lines) - len(bare)].count(b"\n")
+            layout, lines = _detect(name, bare)
+            first_line += layout.header
+        if layout.separator == " ":
+            lines = single_spaces(lines)
+        if lines.strip(b"\r\n"):
+            empty = False
+            yield _Block(name, lines, first_line, layout)
+        first_line += lines.count(b"\n")
+    if empty:
+        raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
+
+
+def _line_chunks(name: str) -> Iterator[bytes]:
+    """Whole lines of the decompressed file, some megabytes at a time."""
+    rest = b""
+    with reading(name) as file:
+        while data := file.read(BLOCK_BYTES):
+            cut = data.rfind(b"\n") + 1
+            if cut:
+                yield rest + data[:cut]
+            rest = data[cut:] if cut else rest + data
+            if len(rest) > LONGEST_LINE:
+                raise DataError(f"{name}: is not a text table; expected lines of 18 columns")
+    if rest:
+        yield rest
+
+
+def _detect(name: str, lines: bytes) -> tuple[_Layout, bytes]:
+    """Detect the layout from the first line; returns it and the lines that hold rows."""
+    first, _, rest = lines.partition(b"\n")
+    if not is_text(first):
+        raise DataError(f"{name}: is not UTF-8 text; expected an NGSIM table, plain or .gz")
+    separator = "," if b"," in first else " "
+    cells = cells_of(single_spaces(first) if separator == " " else first, separator)
+    if cells and re.match(r"\s*-?[0-9.,]+([eE][+-]?[0-9]+)?\s*$", cells[0]):
+        if len(cells) != len(OFFICIAL):
+            raise DataError(
+                f"{name}: the first line has {len(cells)} columns and no header; expected the "
+                f"{len(OFFICIAL)} columns of the native layout"
+            )
+        places = {column: place for place, column in enumerate(OFFICIAL) if column in KNOWN}
+        return _Layout(len(OFFICIAL), places, header=False, separator=separator), lines
+    known = {_folded(column): column for column in KNOWN} | ALIASES
+    places = {}
+    for place, cell in enumerate(cells):
+        column = known.get(_folded(cell))
+        if column in places:
+            raise DataError(f"{name}: the header has column {column!r} twice; expected it once")
+        if column is not None:
+            places[column] = place
+    missing = [f.column.key for f in FIELDS if f.column.required and f.column.key not in places]
+    if missing:
+        raise lacking(name, missing, cells, "")
+    return _Layout(len(cells), places, header=True, separator=separator), rest
+
+
+def _folded(cell: str) -> str:
+    return re.sub(r"[\s_]+", "", cell).lower()
+
+
+# -- compact columns -------------------------------------------------------------------------------
+
+
+@dataclass
+class _Rows:
+    """Rows read so far.
+
+    Args:
+        report: counts, updated with every block.
+        metres: size of the unit that lengths, speeds and accelerations are in.
+        chunks: the columns of each block; ``group`` is an index into ``groups``.
+        groups: index of every (file, location, time of frame 0).
+        rows_of: rows of each group.
+        locations: rows of each location met.
+        filled: columns that held anything but blanks and zeros.
+        blank_classes: rows without a vehicle class.
+    """
+
+    report: ReadReport
+    metres: float
+    chunks: list[Columns] = field(default_factory=list)
+    groups: dict[Group, int] = field(default_factory=dict)
+    rows_of: dict[Group, int] = field(default_factory=dict)
+    locations: dict[str, int] = field(default_factory=dict)
+    filled: set[str] = field(default_factory=set)
+    blank_classes: int = 0
+
+    def add(self, block: _Block, wanted: str | None) -> None:
+        """Add the rows of a block; with ``wanted``, those of that location only."""
+        self.report.rows_read += len(block)
+        names, places = block.locations()
+        for name, rows in zip(names, np.bincount(places, minlength=len(names)), strict=True):
+            if rows:
+                self.locations[name] = self.locations.get(name, 0) + int(rows)
+        if wanted is not None:
+            mask = np.array([name == wanted for name in names])[places]
+            self.report.drop("other location", int((~mask).sum()))
+            block.keep(mask)
+            places = places[mask]
+        if not len(block):
+            return
+        columns: Columns = {}
+        for own, kind, column in FIELDS:
+            values = block.values(column)
+            if column.key == "v_Class":
+                values = np.where(np.isnan(values), -1.0, values)
+                self.blank_classes += int((values < 0).sum())
+                values = np.maximum(values, 0.0)
+            if column.blank:
+                values = np.nan_to_num(values, nan=0.0)
+            columns[own] = (values * self.metres if kind is np.float32 else values).astype(kind)
+        preceding = columns["preceding"]
+        preceding[(preceding < 0) | (preceding == columns["vehicle"])] = 0
+        self.filled |= {f.column.key for f in FIELDS if columns[f.own].any()}
+        group = self._groups(block.path, columns.pop("clock"), columns["frame"], names, places)
+        self.chunks.append({"group": group} | columns)
+
+    def _groups(
+        self, path: str, clock: NDArray, frame: NDArray, names: list[str], places: NDArray
+    ) -> NDArray[np.int32]:
+        """Index of each row's (file, location, time of frame 0)."""
+        distinct, which = np.unique(_frame_zero(clock, frame), return_inverse=True)
+        pairs, inverse = np.unique(which * len(names) + places, return_inverse=True)
+        codes = []
+        for pair, rows in zip(pairs, np.bincount(inverse), strict=True):
+            start, place = divmod(int(pair), len(names))
+            group = Group(path, names[place], int(distinct[start]))
+            codes.append(self.groups.setdefault(group, len(self.groups)))
+            self.rows_of[group] = self.rows_of.get(group, 0) + int(rows)
+        return np.array(codes, dtype=np.int32)[inverse]
+
+
+def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Time of frame 0 by each row's clock [ms]; 0 where the clock cannot be an epoch."""
+    plausible = (clock >= 1e8) & (clock < 1e14)
+    starts = np.rint(np.where(plausible, clock, 0.0)).astype(np.int64) - 100 * frame.astype("i8")
+    return np.where(plausible & (starts > 0), starts, 0)
+
+
+# -- sorted samples --------------------------------------------------------------------------------
+
+
+def _sorted(read: _Rows) -> pd.DataFrame:
+    """Samples of all collected rows, sorted, without duplicates, with segments and headways."""
+    # A block's part is freed as soon as it is copied.
+    columns = {
+        name: np.concatenate([chunk.pop(name) for chunk in read.chunks])
+        for name in list(read.chunks[0])
+    }
+    columns["recording"], names = _recordings(read, columns.pop("group"))
+    places = Places(columns["recording"], columns["vehicle"], columns["frame"])
+    key = places.keys(columns["recording"], columns["vehicle"], columns["frame"])
+    order, key = _kept_order(read.report, columns, key)
+    for name in list(columns):  # one column at a time, to hold only one extra copy
+        columns[name] = columns[name][order]
+    read.report.rows_kept = len(order)
+    segment = _segments(read.report, columns, names, key)
+    _fill_headways(read.report, columns, places, key)
+    report = read.report
+    report.empty_columns = [name for name in CONSEQUENCES if name not in read.filled]
+    report.notes += [f"{x} is all zero or blank: {CONSEQUENCES[x]}" for x in report.empty_columns]
+    if read.blank_classes and "v_Class" in read.filled:
+        report.notes.append(f"v_Class is blank in {read.blank_classes:,} rows: class unknown")
+    recording = pd.Categorical.from_codes(columns.pop("recording"), categories=pd.Index(names))
+    vehicle, frame = columns.pop("vehicle"), columns.pop("frame")
+    # Division rounds correctly where the product 0.1·frame does not.
+    time = {"time_s": frame / round(1 / FRAME)}
+    identity = {"recording": recording, "vehicle": vehicle, "frame": frame, "segment": segment}
+    return pd.DataFrame(identity | time | columns, copy=False)
+
+
+def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16], list[str]]:
+    """Recording code of every row and the sorted names of the recordings."""
+    named, notes = name_recordings(read.rows_of)
+    read.report.notes += notes
+    names = sorted(set(named.values()))
+    if len(names) > INT16:
+        raise DataError(
+            f"{', '.join(read.report.files)}: {len(names):,} recordings; expected a handful. "
+            "Global_Time does not run 100 ms a frame"
+        )
+    place = {name: code for code, name in enumerate(names)}
+    return np.array([place[named[key]] for key in read.groups], dtype=np.int16)[group], names
+
+
+def _kept_order(
+    report: ReadReport, columns: Columns, key: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Rows to keep in sorted order, and their keys; duplicates are counted by kind."""
+    order = np.argsort(key, kind="stable")  # stable: the first in the files stays
+    key = key[order]
+    repeated = np.append(False, key[1:] == key[:-1])
+    if not repeated.any():
+        return order, key
+    first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(key))))
+    again, kept = order[repeated], order[first[repeated]]
+    same = np.logical_and.reduce([values[again] == values[kept] for values in columns.values()])
+    report.drop(EXACT, int(same.sum()))
+    report.drop(CONFLICTING, int((~same).sum()))
+    if not same.all():
+        report.notes.append(
+            "rows that disagree on the same vehicle and frame: the first in the files was kept; "
+            "the files may mix recordings that Global_Time cannot tell apart"
+        )
+    return order[~repeated], key[~repeated]
+
+
+def _segments(
+    report: ReadReport, columns: Columns, names: list[str], key: NDArray[np.int64]
+) -> NDArray[np.int32]:
+    """Segment of each sorted row; counts recordings, vehicles and segments."""
+    recording, vehicle = columns["recording"], columns["vehicle"]
+    changes = (vehicle[1:] != vehicle[:-1]) | (recording[1:] != recording[:-1])
+    # Keys of one vehicle's consecutive frames differ by one, but so may two vehicles' keys.
+    segment = np.cumsum(np.append(False, changes | (np.diff(key) != 1)), dtype=np.int32)
+    rows = np.bincount(recording, minlength=len(names))
+    report.recordings = {name: int(count) for name, count in zip(names, rows, strict=True)}
+    report.vehicles = 1 + int(changes.sum())
+    report.segments = int(segment[-1]) + 1
+    return segment
+
+
+def _fill_headways(
+    report: ReadReport, columns: Columns, places: Places, key: NDArray[np.int64]
+) -> None:
+    """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
+    headway, preceding = columns["space_headway_m"], columns["preceding"]
+    follows = preceding > 0
+    given = follows & (headway != 0)
+    headway[~given] = np.nan
+    rows = np.flatnonzero(follows & ~given)
+    wanted = places.keys(columns["recording"][rows], preceding[rows], columns["frame"][rows])
+    leader = find(wanted, key)
+    rows, leader = rows[leader >= 0], leader[leader >= 0]
+    position = columns["position_m"]
+    headway[rows] = position[leader] - position[rows]
+    report.headways_given, report.headways_derived = int(given.sum()), len(rows)
+    report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
+
+
+def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:
+    """Check that the vehicles of every recording are as long as vehicles are.
+
+    Where a file gives no lengths, the shortest headways (1 % quantile) are looked at instead.
+    """
+    for name, part in samples.groupby("recording", observed=True):
+        lengths = part.groupby("vehicle")["length_m"].first()
+        lengths = lengths[lengths > 0]
+        headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
+        if len(lengths):
+            what, found, (low, high) = "the median length of vehicles", float(lengths.median()), CAR
+        elif len(headways):
+            what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
+            low, high = JAM, float("inf")
+        else:
+            continue
+        if not low <= found <= high:
+            other = "feet" if units == "metres" else "metres"
+            raise DataError(
+                f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "
+                f"{units}; expected {low:g} to {high:g} m; is the file in {other}? say "
+                f"data.units={other}"
+            )

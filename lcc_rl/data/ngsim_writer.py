@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
-from lcc_rl.data.units import FOOT
+from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import DataError
 from lcc_rl.io.atomic import atomic_path
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import Field
 
-from lcc_rl.data.gap_rates import gap_rate
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.data.trajectories import starts_of
+from lcc_rl.errors import LARGEST, DataError
+from lcc_rl.settings import NonNegative, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
+WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
+LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
+OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Floats = NDArray[np.float64]
 
 
@@ -35,42 +39,22 @@ class Fault(NamedTuple):
     wrong: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Plausible:
+class Plausible(Settings):
     """Thresholds of recorded motion; a record with a sample outside of one is left out.
 
-    Args:
-        max_speed: [m/s]; beyond it, a column is in km/h or ft/s rather than driven that fast.
-        max_acceleration: change of speed between consecutive samples, either sign [m/s²].
-        min_length, max_length: length of a vehicle [m]; 0 counts as not given.
-        max_gap: gap between bumpers [m].
-        max_step: time between consecutive samples [s].
-        max_share: share of the records that may be left out, 0…1; beyond, the data are refused.
-        max_mismatch: factor, either way, between what gaps change by and what the speeds say
-            (:func:`lcc_rl.data.gap_rates.gap_rate`); beyond, the data are refused.
-
-    Raises:
-        ConfigError: if a threshold is not positive, the share is not in 0…1 or the factor is
-            below 1.
+    The data are refused where more than ``max_share`` of the records would be left out, or where
+    gaps change by a factor of more than ``max_mismatch``, either way, of what the speeds say
+    (:func:`gap_rate`).
     """
 
-    max_speed: float = 70.0
-    max_acceleration: float = 10.0
-    min_length: float = 2.0
-    max_length: float = 30.0
-    max_gap: float = 500.0
-    max_step: float = 10.0
-    max_share: float = 0.1
-    max_mismatch: float = 1.5
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0 and not (name in ("min_length", "max_share") and value == 0):
-                raise ConfigError(f"plausible.{name} must be positive, got {value}")
-        if not self.max_share <= 1:
-            raise ConfigError(f"plausible.max_share must be 0 to 1, got {self.max_share}")
-        if not self.max_mismatch >= 1:
-            raise ConfigError(f"plausible.max_mismatch must be at least 1, got {self.max_mismatch}")
+    max_speed: Positive = 70.0  # beyond it, a column is rather in km/h or ft/s [m/s]
+    max_acceleration: Positive = 10.0  # change of speed between samples, either sign [m/s²]
+    min_length: NonNegative = 2.0  # length of a vehicle [m]; 0 counts as not given
+    max_length: Positive = 30.0
+    max_gap: Positive = 500.0  # between bumpers [m]
+    max_step: Positive = 10.0  # time between consecutive samples [s]
+    max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
+    max_mismatch: Annotated[float, Field(ge=1.0, le=LARGEST)] = 1.5
 
     def select(
         self,
@@ -97,8 +81,8 @@ class Plausible:
             DataError: if more than ``max_share`` of the records, or all, would be left out, or
                 gaps and speeds contradict each other.
         """
-        first = table["episode"].ne(table["episode"].shift()).to_numpy()
-        starts = np.flatnonzero(first)
+        starts = starts_of(table["episode"].to_numpy())
+        first = np.isin(np.arange(len(table)), starts)
         lengths = np.diff([*starts, len(table)])
         keep, lines, told = np.ones(len(starts), dtype=bool), [], ""
         for fault in self.faults(table, first):
@@ -112,30 +96,21 @@ class Plausible:
             more = remedy if fault.setting == "max_acceleration" else ""
             told = told or f"{said}; mend the file{more}, or raise that threshold"
             keep &= ~bad
-        self._check_share(keep, f"{setting}.max_share={self.max_share:g}", source, told)
+        if not keep.any() or np.mean(~keep) > self.max_share:
+            raise DataError(
+                f"{source}: {int((~keep).sum()):,} of {len(keep):,} records are implausible (at "
+                f"most {setting}.max_share={self.max_share:g} of them may be left out), the first: "
+                f"{told}"
+            )
         kept = table if keep.all() else table[np.repeat(keep, lengths)].reset_index(drop=True)
-        self._check_gaps(kept, f"{setting}.max_mismatch={self.max_mismatch:g}", source)
+        rate = gap_rate(kept)
+        if rate is not None and not 1 / self.max_mismatch <= rate <= self.max_mismatch:
+            raise DataError(
+                f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower "
+                f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; are speeds in km/h, mph "
+                "or ft/s, gaps in feet, or leader and follower exchanged?"
+            )
         return kept, lines
-
-    def _check_gaps(self, table: pd.DataFrame, limit: str, source: str) -> None:
-        """Refuse data whose gaps do not change as the speeds of leader and follower say."""
-        rate = gap_rate(table)
-        if rate is None or 1 / self.max_mismatch <= rate <= self.max_mismatch:
-            return
-        raise DataError(
-            f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower say "
-            f"1 m, {limit}; are speeds in km/h, mph or ft/s, gaps in feet, or leader and follower "
-            "exchanged?"
-        )
-
-    def _check_share(self, keep: NDArray[np.bool_], limit: str, source: str, told: str) -> None:
-        """Refuse data of which too many records are left out."""
-        if keep.any() and np.mean(~keep) <= self.max_share:
-            return
-        raise DataError(
-            f"{source}: {int((~keep).sum()):,} of {len(keep):,} records are implausible (at most "
-            f"{limit} of them may be left out), the first: {told}"
-        )
 
     def faults(self, table: pd.DataFrame, first: NDArray[np.bool_]) -> Iterator[Fault]:
         """Yield what is outside of the thresholds; ``first`` marks the first row of each record."""
@@ -173,3 +148,45 @@ def pair_place(episodes: pd.DataFrame) -> Callable[[int, str], str]:
         return f"row {row} ({where}, {entry['time_s']:g} s), column {column!r}"
 
     return place
+
+
+def gap_rate(episodes: pd.DataFrame) -> float | None:
+    """Return by how much gaps change where the speeds say 1.
+
+    The slope of a least-squares fit of changes of the gap over windows of 5 s on the integral of
+    the relative speed, both without their mean over the episode, which a calibration error of
+    speedometers may be.
+
+    Args:
+        episodes: rows of an episode lie together, in order of time: episode, time_s, gap_m,
+            follower_speed_mps, leader_speed_mps.
+
+    Returns:
+        The slope, 1 for consistent data; None where a column is missing or too little changes.
+    """
+    if not set(episodes.columns) >= OF_PAIRS or episodes.empty:
+        return None
+    episode = episodes["episode"].to_numpy()
+    first = np.append(True, episode[1:] != episode[:-1])
+    time, gap, leader, follower = (
+        episodes[name].to_numpy(np.float64)
+        for name in ("time_s", "gap_m", "leader_speed_mps", "follower_speed_mps")
+    )
+    relative = leader - follower
+    step = np.where(first, 0.0, np.diff(time, prepend=time[0]))
+    way = np.cumsum(step * (relative + np.roll(relative, 1)) / 2)
+    number = np.cumsum(first) - 1
+    window = np.floor((time - time[first][number]) / WINDOW)
+    marks = np.flatnonzero(first | (np.diff(window, prepend=0.0) != 0))
+    same = np.diff(number[marks]) == 0
+    group = number[marks][1:][same]
+    said = _centred(np.diff(way[marks])[same], group)
+    seen = _centred(np.diff(gap[marks])[same], group)
+    enough = len(said) >= LEAST_WINDOWS and np.sqrt(np.mean(said**2)) >= LEAST_CHANGE
+    return float(said @ seen / (said @ said)) if enough else None
+
+
+def _centred(values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Values without the mean of their group."""
+    count = np.maximum(np.bincount(group), 1)
+    return values - (np.bincount(group, values) / count)[group]

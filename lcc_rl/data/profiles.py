@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.data.speed_records import resample
-from lcc_rl.errors import ConfigError, DataError, require_in
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.settings import Settings
 
+EvaluationShare = Annotated[float, Field(gt=0.0, le=1.0)]
 NONE_LEFT = "no speed profile left: at least one leader's record is needed"
 
 
@@ -168,6 +171,21 @@ def nothing(time_step: float) -> Profiles:
     return Profiles(torch.zeros(0), none, none, (), (), time_step)
 
 
+def join(parts: Sequence[Profiles]) -> Profiles:
+    """Put several profiles of one step into one collection."""
+    sizes = [len(part.speeds) for part in parts]
+    known = [part.lengths if part.reach is None else part.reach for part in parts]
+    return Profiles(
+        speeds=torch.cat([part.speeds for part in parts]),
+        offsets=torch.cat([part.offsets + sum(sizes[:i]) for i, part in enumerate(parts)]),
+        lengths=torch.cat([part.lengths for part in parts]),
+        names=tuple(name for part in parts for name in part.names),
+        recordings=tuple(name for part in parts for name in part.recordings),
+        time_step=parts[0].time_step,
+        reach=None if all(part.reach is None for part in parts) else torch.cat(known),
+    )
+
+
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
     """Take the leader's speed record of every episode.
 
@@ -193,6 +211,34 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
     return from_records(records, names, recordings, time_step)
 
 
+def resample(
+    time: np.ndarray,
+    speed: np.ndarray,
+    time_step: float,
+    begin: float | None = None,
+    end: float | None = None,
+) -> Tensor:
+    """Interpolate a record to another step, monotonically between samples (PCHIP).
+
+    The interpolant never overshoots its samples, so no speed becomes negative and no peak grows.
+
+    Args:
+        time: increasing [s].
+        speed: [m/s].
+        time_step: step wanted [s].
+        begin, end: part of the record wanted [s]; None for all of it.
+
+    Returns:
+        Speeds, ``[steps]``, float32 [m/s].
+    """
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
+    begin, end = time[0] if begin is None else begin, time[-1] if end is None else end
+    steps = int(np.floor((end - begin) / time_step + 1e-6)) + 1
+    grid = np.minimum(begin + time_step * np.arange(steps), time[-1])
+    return torch.tensor(PchipInterpolator(time, speed)(grid).clip(min=0.0), dtype=torch.float32)
+
+
 def at_step(profiles: Profiles, time_step: float) -> Profiles:
     """Interpolate every record to another step [s]."""
     if time_step == profiles.time_step:
@@ -204,30 +250,19 @@ def at_step(profiles: Profiles, time_step: float) -> Profiles:
     return from_records(records, profiles.names, profiles.recordings, time_step)
 
 
-@dataclass(frozen=True)
-class Split:
+class Split(Settings):
     """Split into training and evaluation profiles that share no recording or vehicle.
 
-    Args:
-        by: ``"recording"`` holds out whole recordings (no shared traffic wave at all);
-            ``"vehicle"`` holds out leaders within every recording.
-        evaluation_share: share of the recordings or vehicles held out, 0…1; 1 evaluates on all
-            and leaves nothing to train on.
-        tuning: for choosing settings: leave the evaluation profiles out and split the training
-            profiles once more, by the same rule.
-
-    Raises:
-        ConfigError: if a setting is unknown or out of range.
+    ``recording`` holds out whole recordings (no shared traffic wave at all); ``vehicle`` holds out
+    leaders within every recording. An ``evaluation_share`` of 1 evaluates on all and leaves
+    nothing to train on.
     """
 
-    by: str = "recording"
-    evaluation_share: float = 0.34
+    by: Literal["recording", "vehicle"] = "recording"
+    evaluation_share: EvaluationShare = 0.34  # of the recordings or vehicles
+    # For choosing settings: leave the evaluation profiles out and split the training profiles
+    # once more, by the same rule.
     tuning: bool = False
-
-    def __post_init__(self) -> None:
-        if self.by not in ("recording", "vehicle"):
-            raise ConfigError(f"split.by must be 'recording' or 'vehicle', got {self.by!r}")
-        require_in("split", "(0, 1]", evaluation_share=self.evaluation_share)
 
     def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
         """Return the training and the evaluation profiles.
@@ -264,18 +299,13 @@ class Split:
         return profiles.select(outside), profiles.select(inside)
 
 
-@dataclass(frozen=True)
-class SingleProfile:
-    """Train on one profile only, as the ALCC paper probably did.
+class SingleProfile(Settings):
+    """Train on one profile only, as the ALCC paper probably did."""
 
-    Args:
-        profile: its number; without ``held_out`` among all profiles long enough, with it among
-            those that ``held_out`` leaves for training.
-        held_out: the split whose evaluation profiles are kept; None evaluates on the training
-            profile itself.
-    """
-
+    # Its number; without ``held_out`` among all profiles long enough, with it among those that
+    # ``held_out`` leaves for training.
     profile: int = 0
+    # The split whose evaluation profiles are kept; None evaluates on the training profile itself.
     held_out: Split | None = None
 
     def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:

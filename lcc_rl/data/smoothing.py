@@ -13,17 +13,18 @@ not whole are therefore left out, 0.7 s (1.7 s) at each end by default; shorter 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.ndimage import correlate1d
 from scipy.signal import savgol_filter
 
-from lcc_rl.data.places import find_leaders
-from lcc_rl.data.trajectories import Trajectories
-from lcc_rl.data.units import FRAME
-from lcc_rl.errors import ConfigError, DataError, require_whole
+from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders, stretches
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.settings import Settings
 
 Array = NDArray[np.float64]
 
@@ -91,26 +92,17 @@ class Smoothing(ABC):
         """
 
 
-@dataclass(frozen=True)
-class SavitzkyGolay(Smoothing):
-    """Local polynomial fits; speed and acceleration are the derivatives of the polynomial.
+class SavitzkyGolay(Smoothing, Settings):
+    """Local polynomial fits; speed and acceleration are the derivatives of the polynomial."""
 
-    Args:
-        window_s: length of the window [s]; an odd number of frames is taken, at least this long.
-        order: order of the polynomial, at least 2 for an acceleration.
+    # Length of the window [s]; an odd number of frames is taken, at least this long.
+    window_s: Annotated[float, Field(gt=0.0, lt=600.0)] = 1.5
+    order: Annotated[int, Field(ge=2, le=100)] = 3  # of the polynomial
 
-    Raises:
-        ConfigError: if the window holds no more samples than the polynomial has coefficients.
-    """
-
-    window_s: float = 1.5
-    order: int = 3
-
-    def __post_init__(self) -> None:
-        require_whole("smoothing", 2, order=self.order)
-        if not FRAME * (self.order + 1) <= self.window_s < 600.0:
+    def settled(self) -> None:
+        if self.window_s < FRAME * (self.order + 1):
             raise ConfigError(
-                f"smoothing: 'window_s' must be {FRAME * (self.order + 1):g} to 600 s for order "
+                f"smoothing.window_s must be at least {FRAME * (self.order + 1):g} s for order "
                 f"{self.order}, got {self.window_s}"
             )
 
@@ -131,25 +123,14 @@ class SavitzkyGolay(Smoothing):
         return smoothed, speed, acceleration
 
 
-@dataclass(frozen=True)
-class ExponentialAverage(Smoothing):
+class ExponentialAverage(Smoothing, Settings):
     """Symmetric exponential moving average of Thiemann, Treiber and Kesting (2008).
 
     A sample k frames away weighs exp(−k·0.1 s/width), up to three widths away. Speed and
     acceleration are central differences of the smoothed positions and of these speeds.
-
-    Args:
-        width_s: width of the kernel [s]; the authors take 0.5 s for positions.
-
-    Raises:
-        ConfigError: if the width is not positive.
     """
 
-    width_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.width_s < 100.0:
-            raise ConfigError(f"smoothing: 'width_s' must be 0 to 100 s, got {self.width_s}")
+    width_s: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.5  # the authors' for positions [s]
 
     @property
     def reach(self) -> int:
@@ -166,9 +147,3 @@ class ExponentialAverage(Smoothing):
         central = np.array([-0.5, 0.0, 0.5]) / FRAME
         speed = correlate1d(smoothed, central, mode="nearest")
         return smoothed, speed, correlate1d(speed, central, mode="nearest")
-
-
-def stretches(segment: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First row and number of rows of each stretch of equal values."""
-    starts = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))
-    return starts, np.diff(np.append(starts, len(segment)))

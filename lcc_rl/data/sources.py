@@ -6,17 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from glob import glob, has_magic
 from pathlib import Path
+from typing import Literal
 
 import pandas as pd
 
 from lcc_rl.data.car_following import Criteria, extract
-from lcc_rl.data.delimited import TAKEN, unpacked_size
-from lcc_rl.data.episodes import load_episodes
+from lcc_rl.data.episodes import DERIVED, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
+from lcc_rl.data.tables import TEXT_TAKES, unpacked_size
 from lcc_rl.data.trajectories import Trajectories
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
+from lcc_rl.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -36,25 +38,18 @@ class LoadedEpisodes:
         return self
 
 
-@dataclass(frozen=True)
-class NgsimSource:
+class NgsimSource(Settings):
     """Episodes extracted from NGSIM files of any published layout.
 
-    Args:
-        path: a file, several files, or a pattern such as ``data/*.csv.gz``.
-        location: keep only this Location (``i-80``, ``us-101`` …) of a file that has several.
-        smoothing: applied to the trajectories, see :mod:`lcc_rl.data.smoothing`; None for none.
-        criteria: what counts as an episode; None for the defaults.
-        units: what the files are in, ``feet`` or ``metres``.
-        plausible: thresholds of what is left out; None for the defaults.
+    ``smoothing`` is applied to the trajectories, see :mod:`lcc_rl.data.smoothing`.
     """
 
-    path: str | Path | Sequence[str]
-    location: str | None = None
-    smoothing: Callable[[Trajectories], Trajectories] | None = None
-    criteria: Criteria | None = None
-    units: str = "feet"
-    plausible: Plausible | None = None
+    path: str | Path | Sequence[str]  # a file, several, or a pattern such as data/*.csv.gz
+    location: str | None = None  # keep only i-80, us-101 … of a file that has several
+    smoothing: Callable | None = None
+    criteria: Criteria | None = None  # None for the defaults
+    units: Literal["feet", "metres"] = "feet"
+    plausible: Plausible | None = None  # None for the defaults
 
     def load(self) -> LoadedEpisodes:
         """Read, smooth where asked, and extract.
@@ -63,37 +58,21 @@ class NgsimSource:
             DataError: if a file is missing or not what was expected, no episode is left, or more
                 are implausible than ``plausible`` allows.
         """
-        if self.smoothing is not None and not callable(self.smoothing):
-            raise ConfigError(
-                f"data.smoothing must be null or a node with _target_, got {self.smoothing!r}"
-            )
         files = find_files(self.path)
         if self.location is None:  # of one location of several, nobody knows how much there is
-            require_memory({f"reading {name}": TAKEN * unpacked_size(name) for name in files})
+            require_memory({f"reading {name}": TEXT_TAKES * unpacked_size(name) for name in files})
         trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
-        source = ", ".join(files)
-        try:
-            episodes, report = extract(trajectories, self.criteria or Criteria())
-        except DataError as error:
-            raise DataError(f"{source}: {error}") from error
         remedy = "" if self.smoothing else f", smooth it ({SMOOTHING})"
-        lines = [*trajectories.report.lines(), *report.lines()]
-        return plausible_episodes(self.plausible, episodes, source, lines, remedy)
+        return episodes_of(trajectories, self.criteria, self.plausible, remedy)
 
 
-@dataclass(frozen=True)
-class EpisodesSource:
-    """Episodes from a parquet or CSV file.
-
-    Args:
-        path: see :func:`lcc_rl.data.episodes.read_episodes`.
-        plausible: thresholds of what is left out; None for the defaults.
-    """
+class EpisodesSource(Settings):
+    """Episodes from a parquet or CSV file, see :func:`lcc_rl.data.episodes.read_episodes`."""
 
     path: str
-    plausible: Plausible | None = None
+    plausible: Plausible | None = None  # None for the defaults
 
     def load(self) -> LoadedEpisodes:
         """Read and validate.
@@ -106,10 +85,34 @@ class EpisodesSource:
         episodes, notes = load_episodes(path)
         count = episodes["episode"].nunique()
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}", *notes]
-        return plausible_episodes(self.plausible, episodes, str(path), lines)
+        return _plausible(self.plausible, episodes, str(path), lines)
 
 
-def plausible_episodes(
+def episodes_of(
+    trajectories: Trajectories,
+    criteria: Criteria | None,
+    plausible: Plausible | None,
+    remedy: str = "",
+) -> LoadedEpisodes:
+    """Extract episodes; positions that no file gives are derived from speeds and gaps.
+
+    Raises:
+        DataError: naming the files, if there is none, or too many are implausible.
+    """
+    report = trajectories.report
+    source = ", ".join(report.files)
+    try:
+        episodes, extraction = extract(trajectories, criteria or Criteria())
+    except DataError as error:
+        raise DataError(f"{source}: {error}") from error
+    lines = [*report.lines(), *extraction.lines()]
+    if not trajectories.samples["position_m"].to_numpy().any():
+        derive_positions(episodes)
+        lines.append(DERIVED)
+    return _plausible(plausible, episodes, source, lines, remedy)
+
+
+def _plausible(
     limits: Plausible | None,
     episodes: pd.DataFrame,
     source: str,

@@ -1,216 +1,494 @@
-"""Tables of measurements in files: CSV with any usual separator, plain or gzipped, and parquet."""
+"""Tables of measurements in files, CSV or parquet: opened, parsed and checked in one place.
+
+Each reader lists its columns as :class:`Column`, and :meth:`TableFile.read` checks every cell of
+them: numbers that are finite, in SI and within the range of their quantity.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import csv
+import gzip
+import os
+import re
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import NoReturn
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from lcc_rl.data.delimited import Delimited
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.data.trajectories import FOOT
+from lcc_rl.errors import ConfigError, DataError, unknown_name
 from lcc_rl.io.memory import require_memory
 
 PARQUET = (".parquet", ".pq")
-UNPACKED = 8  # bytes of memory that reading a byte of parquet takes
+BLANK = ["", "NA", "N/A", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
+TEXT_TAKES, PARQUET_TAKES = 3, 8  # bytes of memory that reading a byte of a file takes
 LARGEST = 1e12  # in SI: beyond any time or place, and within every type
-SHOWN = 40  # names of columns that a message lists
+LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
+THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
+NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
+NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
+SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
+# Units by quantity, and their size in SI.
+UNITS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
+    "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
+    "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
+}
 
 
-@dataclass
-class Table:
-    """Columns of one file, converted and checked on access.
+@dataclass(frozen=True)
+class Column:
+    """What a column of a table has to hold.
 
     Args:
-        file: its name, for messages.
-        header: names of all of its columns.
-        columns: what the columns in use are called there, by their key here.
-        content: those columns, by key.
-        option: the option that says what the columns are called, for messages.
-        preamble: lines before the header, by their first cell.
-        notes: lines on what was found, such as the separator.
+        key: its name in the program.
+        quantity: ``time``, ``speed``, ``length``, ``number`` or ``text``.
+        least, most: range of its numbers, in SI.
+        whole: whether its numbers are whole.
+        blank: whether cells may be blank: NaN, or ``""`` of text.
+        required: whether a table must have it.
     """
 
-    file: str
-    header: list[str]
-    columns: dict[str, str]
-    content: dict[str, pa.ChunkedArray]
-    option: str
-    preamble: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    decimal_comma: bool = False
-
-    def __len__(self) -> int:
-        return len(next(iter(self.content.values())))
-
-    def numbers(self, key: str, factor: float = 1.0, blank: bool = False) -> NDArray[np.float64]:
-        """Return a column of finite numbers, times a factor.
-
-        Args:
-            key: of the column.
-            factor: to SI.
-            blank: whether cells may be blank or NaN; they are NaN in the result.
-
-        Raises:
-            DataError: naming the first row at fault.
-        """
-        column = self.content[key]
-        try:
-            numbers = self._cast(column)
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-            self._not_a_number(key, error)
-        values = np.asarray(numbers.to_numpy(), dtype=np.float64)
-        wrong = np.isinf(values) if blank else ~np.isfinite(values)
-        self.refuse(wrong, key, "is not a number")
-        values = values * factor
-        self.refuse(np.abs(values) > LARGEST, key, f"is beyond {LARGEST:g}")
-        return values
-
-    def texts(self, key: str, blank: bool = False) -> NDArray:
-        """Return a column as text, ``""`` for blank; refused unless ``blank``.
-
-        Raises:
-            DataError: naming the first row at fault.
-        """
-        column = pc.utf8_trim_whitespace(pc.cast(self.content[key], pa.string()))
-        values = pc.fill_null(column, "").to_numpy().astype(str)
-        if not blank:
-            self.refuse(values == "", key, "is empty")
-        return values
-
-    def refuse(self, wrong: NDArray[np.bool_], key: str, words: str) -> None:
-        """Raise a DataError that names the first row at fault and its cell, if there is one."""
-        if not np.any(wrong):
-            return
-        row = int(np.argmax(wrong))
-        cell = self.content[key][row].as_py() if key in self.content else None
-        shown = "blank" if cell is None else repr(cell)[:40]
-        place = f"data row {row + 1}, column {self.columns.get(key, key)!r}"
-        raise DataError(f"{self.file}: {place} {words}: {shown}")
-
-    def _cast(self, column: pa.ChunkedArray) -> pa.ChunkedArray:
-        if pa.types.is_boolean(column.type) or pa.types.is_temporal(column.type):
-            raise pa.ArrowInvalid(f"the column holds {column.type}")
-        if not pa.types.is_string(column.type):
-            return pc.cast(column, pa.float64())
-        if self.decimal_comma:
-            column = pc.replace_substring(column, ",", ".")
-        try:
-            return pc.cast(column, pa.float64())
-        except pa.ArrowInvalid:
-            return pc.cast(pc.utf8_trim_whitespace(column), pa.float64())
-
-    def _not_a_number(self, key: str, error: Exception) -> NoReturn:
-        """Name the first cell that is no number, found by bisection."""
-        column, low = self.content[key], 0
-        high = len(column)
-        while high - low > 1:
-            middle = (low + high) // 2
-            try:
-                self._cast(column[low:middle])
-                low = middle
-            except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
-                high = middle
-        self.refuse(np.arange(len(column)) == low, key, "is not a number")
-        raise DataError(f"{self.file}: column {self.columns[key]!r}: {error}") from error
+    key: str
+    quantity: str = "number"
+    least: float = -LARGEST
+    most: float = LARGEST
+    whole: bool = False
+    blank: bool = False
+    required: bool = True
 
 
-def read_table(
-    path: str | Path, columns: Mapping[str, str | None], option: str, only: bool = True
-) -> Table:
-    """Read columns of a table.
+def factors(
+    units: Mapping[str, str], columns: Iterable[Column], option: str = "units"
+) -> dict[str, float]:
+    """Return the factor to SI of every column that has a unit.
 
-    Of text, the separator is detected: comma, semicolon, tab, bar or spaces. Where it is the
-    semicolon, numbers may have a decimal comma. The lines before the header of a native OpenACC
-    file are kept apart.
+    Args:
+        units: the unit by the column's key; SI for those that are not named.
+        columns: those that there may be.
+        option: where the configuration has the units, for messages.
+
+    Raises:
+        ConfigError: if a key or a unit is unknown.
+    """
+    sizes = {column.key: UNITS[column.quantity] for column in columns if column.quantity in UNITS}
+    for key, unit in units.items():
+        if key not in sizes:
+            raise unknown_name(f"key of {option}", str(key), sizes)
+        if unit not in sizes[key]:
+            raise unknown_name(f"unit in {option}.{key}:", str(unit), sizes[key])
+    return {key: known[units[key]] if key in units else 1.0 for key, known in sizes.items()}
+
+
+def check_names(names: Mapping[str, Any], columns: Iterable[Column], option: str) -> None:
+    """Check what a configuration says that columns are called in a file.
+
+    Raises:
+        ConfigError: naming a key that is unknown, or a required column without name.
+    """
+    known = {column.key: column for column in columns}
+    for key, name in names.items():
+        if key not in known:
+            raise unknown_name(f"key of {option}", str(key), known)
+        if not (isinstance(name, str) or (name is None and not known[key].required)):
+            raise ConfigError(f"{option}.{key} must name a column, got {name!r}")
+
+
+class TableFile:
+    """A table in a file; its columns are read when asked.
+
+    Of text, the separator is the one that divides the header and the row after it alike: comma,
+    semicolon, tab, bar or spaces. Where it is the semicolon, numbers may have a decimal comma. The
+    lines before the header of a native OpenACC file are kept in ``preamble``.
 
     Args:
         path: a .csv file or the like, gzipped or not, or a .parquet file.
-        columns: what they are called in the file, by their key; None for one that there is not.
-        option: where the configuration has these names, for messages.
-        only: read these columns only; otherwise the others, too, under their own names.
 
     Raises:
-        DataError: if the file is missing, damaged or no table, or lacks a column.
+        DataError: if the file is missing, damaged or no table.
         ConfigError: if it does not fit into memory.
     """
-    file = Path(path).expanduser()
-    if not file.is_file():
-        raise DataError(f"{file}: no such file; expected a table, .csv or .parquet")
-    wanted = {key: name for key, name in columns.items() if name is not None}
-    twice = {name for name in wanted.values() if [*wanted.values()].count(name) > 1}
-    if twice:
-        raise ConfigError(f"{option} names the column {sorted(twice)[0]!r} twice")
-    read = _read_parquet if file.suffix in PARQUET else _read_text
-    return read(file, wanted, option, only)
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path).expanduser()
+        self.preamble: dict[str, str] = {}
+        self.notes: list[str] = []
+        self.decimal_comma = False
+        self.cells: dict[str, pa.ChunkedArray] = {}
+        if not self.path.is_file():
+            raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
+        self.parquet = self.path.suffix in PARQUET
+        if self.parquet:
+            require_memory({f"reading {self.path}": PARQUET_TAKES * self.path.stat().st_size})
+            with _readable(self.path):
+                self.header = [*pq.read_schema(self.path).names]
+        else:
+            self._open_text(unpacked(self.path))
+
+    def read(
+        self,
+        columns: Iterable[Column],
+        names: Mapping[str, str | None],
+        scale: Mapping[str, float] | None = None,
+        option: str = "",
+    ) -> dict[str, NDArray]:
+        """Read columns and check every cell.
+
+        Args:
+            columns: those wanted.
+            names: what they are called in the file, by key; None for one that there is not.
+            scale: factors to SI by key.
+            option: where the configuration has the names, for messages.
+
+        Raises:
+            DataError: if a column is missing, or naming the row and column of a cell at fault.
+            ConfigError: if two columns have one name.
+        """
+        named = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
+        self._check_header(list(named.values()), option)
+        read = self._parquet_cells if self.parquet else self._text_cells
+        cells = read(list(dict.fromkeys(named.values())))
+        self.cells = {key: cells[name] for key, name in named.items()}
+        self.names = named
+        return {
+            c.key: checked(
+                self.cells[c.key],
+                c,
+                lambda row, words, c=c: self.fault(row, c.key, words),
+                (scale or {}).get(c.key, 1.0),
+                self.decimal_comma,
+            )
+            for c in columns
+            if c.key in named
+        }
+
+    def fault(self, row: int, key: str, words: str) -> DataError:
+        """Return the error about a cell."""
+        return DataError(
+            f"{self.path}: data row {row + 1}, column {self.names.get(key, key)!r} {words}"
+        )
+
+    def refuse(self, wrong: NDArray[np.bool_], key: str, words: str) -> None:
+        """Raise a DataError that names the first row at fault, if there is one."""
+        if np.any(wrong):
+            raise self.fault(int(np.argmax(wrong)), key, words)
+
+    def _check_header(self, wanted: list[str], option: str) -> None:
+        twice = [name for name in wanted if wanted.count(name) > 1]
+        if twice:
+            raise ConfigError(f"{option} names the column {twice[0]!r} twice")
+        missing = [name for name in wanted if name not in self.header]
+        if missing:
+            raise lacking(str(self.path), missing, self.header, option)
+        for name in wanted:
+            if self.header.count(name) > 1:
+                raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
+
+    def _parquet_cells(self, names: list[str]) -> dict[str, pa.ChunkedArray]:
+        with _readable(self.path):
+            table = pq.read_table(self.path, columns=names)
+            table.validate(full=True)  # damaged text would fail only when used
+        return {name: table[name] for name in names}
+
+    def _open_text(self, content: bytes) -> None:
+        content = content.removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
+        if not is_text(content):
+            raise DataError(f"{self.path}: is not text; expected a table in UTF-8")
+        self.preamble, content = _preamble(content)
+        self.separator = _separator(content)
+        if self.separator == " ":
+            content = single_spaces(content)
+        first, _, self.rows = content.partition(b"\n")
+        self.header = [name.strip() for name in cells_of(first, self.separator)]
+        if not self.header:
+            raise DataError(f"{self.path}: not a readable table: empty, or names no columns")
+        self.decimal_comma = self.separator == ";" and b"," in self.rows and b"." not in self.rows
+        if self.separator != ",":
+            words = f"columns are separated by {SEPARATORS[self.separator]}"
+            self.notes.append(f"{self.path}: {words}")
+        if self.decimal_comma:
+            self.notes.append(f"{self.path}: numbers have a decimal comma")
+
+    def _text_cells(self, names: list[str]) -> dict[str, pa.ChunkedArray]:
+        if not self.rows.strip():
+            return {name: pa.chunked_array([], pa.string()) for name in names}
+        places = {name: str(self.header.index(name)) for name in names}
+        table = parse_text(
+            self.rows, len(self.header), self.separator, [*places.values()], str(self.path)
+        )
+        return {name: table[place] for name, place in places.items()}
 
 
-def _chosen(table: Table, wanted: dict[str, str], only: bool) -> dict[str, str]:
-    """Check that a header has what is wanted; return the name of each column to read by key."""
-    missing = [name for name in wanted.values() if name not in table.header]
-    if missing:
-        raise DataError(_lacking(table, missing))
-    for name in wanted.values():
-        if table.header.count(name) > 1:
-            raise DataError(f"{table.file}: has column {name!r} twice; expected it once")
-    others = () if only else (name for name in table.header if name not in wanted.values())
-    return {**wanted, **{name: name for name in others}}
+def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
+    """Return the error about columns that a table lacks."""
+    folded = {name.lower(): name for name in header}
+    near = get_close_matches(missing[0].lower(), folded, n=1)
+    hint = f" (is it {folded[near[0]]!r}?)" if near else ""
+    how = f"; say which is which by {option}={{…}}" if option else ""
+    shown = ", ".join(header)[:400]
+    return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{how}")
 
 
-def _lacking(table: Table, missing: list[str]) -> str:
-    """Say which columns a file lacks, which it has, and what to do."""
-    folded = {name.lower(): name for name in table.header}
-    near = [
-        f"{folded[found]!r} for {name!r}?"
-        for name in missing
-        for found in get_close_matches(name.lower(), folded, n=1)
-    ]
-    has = ", ".join(table.header[:SHOWN]) + (", …" if len(table.header) > SHOWN else "")
-    hint = f" ({' '.join(near)})" if near else ""
-    words = f"{table.file}: lacks the column {', '.join(missing)}; it has {has}{hint}"
-    numbers = all(cell.replace(".", "").replace("-", "").isdigit() for cell in table.header)
-    if numbers:
-        words += "; its first line holds numbers, expected the names of the columns"
-    return f"{words}; say which is which by {table.option}={{…}}"
+# -- cells -----------------------------------------------------------------------------------------
 
 
-# -- parquet ---------------------------------------------------------------------------------------
+def checked(
+    cells: pa.ChunkedArray | pa.Array,
+    column: Column,
+    fault: Any,
+    scale: float = 1.0,
+    decimal_comma: bool = False,
+) -> NDArray:
+    """Return the values of a column, checked.
+
+    Args:
+        cells: as they were read.
+        column: what they have to be.
+        fault: returns the error for a row and words.
+        scale: factor to SI.
+        decimal_comma: whether numbers are written with one.
+
+    Raises:
+        DataError: for the first cell at fault.
+    """
+    if column.quantity == "text":
+        texts = pc.utf8_trim_whitespace(pc.cast(cells, pa.string()))
+        found = np.asarray(pc.fill_null(texts, "")).astype(str)
+        if not column.blank and (found == "").any():
+            raise fault(int(np.argmax(found == "")), "is blank")
+        return found
+    values = numbers_of(cells, fault, decimal_comma) * scale
+    wrong = np.isinf(values) if column.blank else ~np.isfinite(values)
+    wrong |= (values < column.least) | (values > column.most)
+    if column.whole:
+        wrong |= (values != np.rint(values)) & ~np.isnan(values)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        kind = "a whole number" if column.whole else "a number"
+        unit = {"time": " s", "speed": " m/s", "length": " m"}.get(column.quantity, "")
+        expected = f"{kind} from {column.least:g} to {column.most:g}{unit}"
+        raise fault(row, f"holds {shown(cells[row])}; expected {expected}")
+    return values
 
 
-def _read_parquet(file: Path, wanted: dict[str, str], option: str, only: bool) -> Table:
-    require_memory({f"reading {file}": UNPACKED * file.stat().st_size})
+def shown(cell: pa.Scalar) -> str:
+    """Return a cell for a message."""
+    value = cell.as_py()
+    return "nothing" if value is None else repr(value)[:40]
+
+
+def numbers_of(
+    cells: pa.ChunkedArray | pa.Array, fault: Any, decimal_comma: bool = False
+) -> NDArray[np.float64]:
+    """Return cells as numbers, NaN for blank ones; numbers may have thousands separators.
+
+    Raises:
+        DataError: for the first cell that is no number.
+    """
+    if pa.types.is_dictionary(cells.type):
+        cells = pc.cast(cells, cells.type.value_type)
+    text = pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type)
+    if text:
+        if decimal_comma:
+            cells = pc.replace_substring(cells, ",", ".")
+        with suppress(pa.ArrowInvalid):
+            return np.asarray(pc.cast(cells, pa.float64()), dtype=np.float64)
+        cells = pc.utf8_trim_whitespace(cells)
+        # Only true thousands: a comma anywhere else would silently change the number.
+        grouped = pc.match_substring_regex(cells, THOUSANDS)
+        cells = pc.if_else(grouped, pc.replace_substring(cells, ",", ""), cells)
+        cells = pc.if_else(pc.equal(cells, ""), pa.scalar(None, cells.type), cells)
+        sound = np.asarray(pc.fill_null(pc.match_substring_regex(cells, NUMBER), True))
+        if not sound.all():
+            row = int(np.argmin(sound))
+            raise fault(row, f"holds {shown(cells[row])}; expected a number")
+    elif not any(kind(cells.type) for kind in NUMERIC):
+        raise fault(0, f"is of type {cells.type}; expected numbers")
+    return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)
+
+
+def parse_text(
+    rows: bytes, width: int, separator: str, places: Sequence[str], source: str, first: int = 0
+) -> pa.Table:
+    """Parse rows of text into columns of text, each named by its place, from 0.
+
+    Args:
+        rows: the lines, without header.
+        width: columns of every row.
+        separator: between columns.
+        places: those wanted.
+        source: the file, for messages.
+        first: number of the first line in the file; 0 to count data rows.
+
+    Raises:
+        DataError: if a row has more or fewer columns, or a quote is not closed.
+    """
+    odd: list[pa_csv.InvalidRow] = []
+
+    def note(row: pa_csv.InvalidRow) -> str:
+        odd.append(row)
+        return "error"
+
     try:
-        table = Table(str(file), list(pq.read_schema(file).names), wanted, {}, option)
-        table.columns = _chosen(table, wanted, only)
-        frame = pq.read_table(file, columns=[*table.columns.values()])
-        frame.validate(full=True)  # damaged text would fail only when used
-    except DataError:
-        raise
-    except Exception as error:  # a damaged parquet file raises errors of many kinds
-        raise DataError(f"{file}: not a readable table: {error}") from error
-    for key, name in table.columns.items():
-        column = frame[name]
-        kind = column.type
-        if pa.types.is_dictionary(kind):
-            column = pc.cast(column, kind.value_type)
-        if pa.types.is_large_string(column.type):
-            column = pc.cast(column, pa.string())
-        table.content[key] = column
+        table = pa_csv.read_csv(
+            pa.BufferReader(rows),
+            pa_csv.ReadOptions(
+                use_threads=False,
+                column_names=[str(place) for place in range(width)],
+                block_size=min(len(rows) + 1, 1 << 30),
+            ),
+            pa_csv.ParseOptions(delimiter=separator, invalid_row_handler=note),
+            pa_csv.ConvertOptions(
+                include_columns=list(places),
+                column_types=dict.fromkeys(places, pa.string()),
+                null_values=BLANK,
+                strings_can_be_null=True,
+            ),
+        )
+    except pa.ArrowException as error:
+        if not odd:
+            reason = str(error).splitlines()[0]
+            raise DataError(f"{source}: not a readable table: {reason}") from error
+        text = odd[0].text.encode()
+        row = next((n for n, x in enumerate(rows.split(b"\n")) if x.rstrip(b"\r") == text), 0)
+        place = f"line {row + first}" if first else f"data row {row + 1}"
+        raise DataError(
+            f"{source}: {place} has {odd[0].actual_columns} columns; expected {width}"
+        ) from error
+    # An unclosed quote merges lines without an error.
+    lines = rows.count(b"\n") + (not rows.endswith(b"\n"))
+    if table.num_rows != lines and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):
+        place = f", from line {first} on" if first else ""
+        raise DataError(f"{source}: a quote is not closed, or a line end is stray{place}")
     return table
 
 
-def _read_text(file: Path, wanted: dict[str, str], option: str, only: bool) -> Table:
-    text = Delimited(file)
-    table = Table(str(file), text.header, wanted, {}, option, text.preamble, text.notes)
-    table.columns, table.decimal_comma = _chosen(table, wanted, only), text.decimal_comma
-    places = {key: text.header.index(name) for key, name in table.columns.items()}
-    parsed = text.parse([*places.values()])
-    table.content = {key: parsed[str(place)] for key, place in places.items()}
-    return table
+# -- files -----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _readable(path: Path) -> Any:
+    """Turn what a damaged parquet file raises, errors of many kinds, into a DataError."""
+    try:
+        yield
+    except Exception as error:
+        raise DataError(f"{path}: not a readable table: {error}") from error
+
+
+def opened(name: str | Path) -> IO[bytes]:
+    """Open a file, decompressed where its first bytes are those of gzip."""
+    if Path(name).exists() and not Path(name).is_file():  # a pipe would be waited for
+        raise DataError(f"{name}: cannot be read: a folder, pipe or device; expected a file")
+    with open(name, "rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    return gzip.open(name, "rb") if packed else open(name, "rb")  # type: ignore[return-value]
+
+
+@contextmanager
+def reading(name: str | Path) -> Any:
+    """Turn errors of reading a plain or gzipped file into a DataError."""
+    try:
+        with opened(name) as file:
+            yield file
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
+    except OSError as error:
+        raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
+
+
+def unpacked_size(name: str | Path) -> int:
+    """Return the bytes of a file, of a compressed one those of its content; 0 for none."""
+    if not Path(name).is_file():  # a pipe would be waited for; who reads it says so
+        return 0
+    with suppress(OSError), open(name, "rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+        size = file.seek(0, os.SEEK_END)
+        if not packed:
+            return size
+        file.seek(max(0, size - 4))
+        # Of the content, modulo 4 GiB, which is never less than the file itself.
+        return max(size, int.from_bytes(file.read(4), "little"))
+    return 0
+
+
+def unpacked(path: Path) -> bytes:
+    """Return the content of a plain or gzipped file.
+
+    Raises:
+        DataError: if it cannot be read or is damaged.
+        ConfigError: if it does not fit into memory.
+    """
+    require_memory({f"reading {path}": TEXT_TAKES * unpacked_size(path)})
+    with reading(path) as file:
+        return bytes(file.read())
+
+
+def is_text(content: bytes) -> bool:
+    """Return whether bytes are UTF-8 text."""
+    try:
+        return b"\0" not in content and (content.isascii() or bool(content.decode("utf-8")))
+    except UnicodeDecodeError:
+        return False
+
+
+def single_spaces(lines: bytes) -> bytes:
+    """Lines with one space between columns and none around the row."""
+    lines = re.sub(rb" {2,}", b" ", lines.replace(b"\t", b" "))
+    lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n").replace(b"\n ", b"\n")
+    return lines.strip(b" ")
+
+
+def cells_of(line: bytes, separator: str) -> list[str]:
+    """Cells of a line; none of one that cannot be divided, as with a stray line end in it."""
+    with suppress(csv.Error):
+        return next(csv.reader([line.decode().rstrip("\r\n")], delimiter=separator), [])
+    return []
+
+
+def _preamble(content: bytes) -> tuple[dict[str, str], bytes]:
+    """Lines before the header of a native OpenACC file, by their first cell, and what follows."""
+    lines: list[bytes] = []
+    rest = content
+    for _ in range(PREAMBLE):
+        line, found, after = rest.partition(b"\n")
+        if line.startswith(b"Time,") and b",Speed1," in line:
+            cells = (text.decode().strip("\r, ").partition(",") for text in lines)
+            return {name: value for name, _, value in cells}, rest
+        if not found:
+            break
+        lines.append(line)
+        rest = after
+    return {}, content
+
+
+def _separator(content: bytes) -> str:
+    """The separator that divides the header and the row after it alike, into most cells."""
+    first, second = [*content.split(b"\n", 2)[:2], b""][:2]
+    best, most = ",", 1
+    for separator in SEPARATORS:
+        lines = first, second
+        if separator == " ":
+            if most > 1:  # names may hold spaces
+                break
+            lines = single_spaces(first), single_spaces(second)
+        counts = [len(cells_of(line, separator)) for line in lines]
+        if counts[0] > most and (counts[0] == counts[1] or not second.strip()):
+            best, most = separator, counts[0]
+    return best
+
+
+def stem(file: str | Path) -> str:
+    """Return the name of a file without folder and endings, ``a`` of ``x/a.csv.gz``."""
+    return Path(Path(file).name.removesuffix(".gz")).stem

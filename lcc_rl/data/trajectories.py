@@ -1,10 +1,15 @@
-"""Vehicle trajectories in SI units and the report on reading them."""
+"""Vehicle trajectories in SI units, the report on reading them, and who is ahead of whom."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+
+FOOT = 0.3048  # m
+FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
 
 
 @dataclass
@@ -43,6 +48,11 @@ class ReadReport:
     def __str__(self) -> str:
         return "\n".join(self.lines())
 
+    def drop(self, reason: str, count: int) -> None:
+        """Count dropped rows."""
+        if count:
+            self.dropped[reason] = self.dropped.get(reason, 0) + count
+
     def lines(self) -> list[str]:
         """The report as plain lines."""
         recordings = ", ".join(f"{name} ({rows:,} rows)" for name, rows in self.recordings.items())
@@ -74,3 +84,62 @@ class Trajectories:
 
     samples: pd.DataFrame
     report: ReadReport
+
+
+class Places:
+    """One number per (recording, vehicle, frame), ascending in that order.
+
+    Args:
+        recording, vehicle, frame: of every row; vehicles are positive, frames from 0.
+    """
+
+    def __init__(self, recording: NDArray, vehicle: NDArray, frame: NDArray) -> None:
+        self.frames = int(frame.max()) + 1
+        self.ids: NDArray | None = None
+        self.vehicles = int(vehicle.max()) + 1
+        if (int(recording.max()) + 1) * self.vehicles * self.frames >= 2**62:
+            self.ids = np.unique(vehicle)  # ids too far apart to pack: use their ranks
+            self.vehicles = len(self.ids)
+
+    def keys(self, recording: NDArray, vehicle: NDArray, frame: NDArray) -> NDArray[np.int64]:
+        """Keys of places; −1 for a vehicle or frame that no row has."""
+        rank, known = vehicle, (vehicle > 0) & (vehicle < self.vehicles)
+        if self.ids is not None:
+            rank = np.minimum(np.searchsorted(self.ids, vehicle), len(self.ids) - 1)
+            known = self.ids[rank] == vehicle
+        known &= frame < self.frames
+        key = (recording.astype(np.int64) * self.vehicles + rank) * self.frames + frame
+        return np.where(known, key, -1)
+
+
+def find(wanted: NDArray[np.int64], ascending: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Row of each wanted key among ascending keys; −1 where it is not there."""
+    row = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
+    return np.where(ascending[row] == wanted, row, -1)
+
+
+def find_leaders(
+    recording: NDArray, vehicle: NDArray, frame: NDArray, preceding: NDArray
+) -> NDArray[np.int64]:
+    """Row of each row's preceding vehicle in the same frame.
+
+    Args:
+        recording, vehicle, frame: the rows, sorted by them.
+        preceding: id of the vehicle ahead of every row; 0 where there is none.
+
+    Returns:
+        Row numbers; −1 where there is no vehicle ahead or it has no row in that frame.
+    """
+    places = Places(recording, vehicle, frame)
+    return find(places.keys(recording, preceding, frame), places.keys(recording, vehicle, frame))
+
+
+def starts_of(values: NDArray) -> NDArray[np.intp]:
+    """First row of each stretch of equal values."""
+    return np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
+
+
+def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First row and number of rows of each stretch of equal values."""
+    starts = starts_of(values)
+    return starts, np.diff(np.append(starts, len(values)))

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import CALLED, build_as, is_sweep, plain
 from lcc_rl.config_checks import string_of_scenario
-from lcc_rl.data.cycles import Case, TrajectoryLeaders
+from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
 from lcc_rl.errors import ConfigError, DataError
@@ -127,7 +127,9 @@ def _source_of_leaders(cfg: DictConfig, episodes: Any) -> Any:
     loaded = _load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
     split = build_as("a split", CALLED, cfg.split, "split")
     # All windows count: what is left out of them is for platoons, whose errors are shares.
-    return TrajectoryLeaders(loaded, split, cfg.scenario.time_step, least_variation=0.0)
+    return TrajectoryLeaders(
+        source=loaded, split=split, source_step=cfg.scenario.time_step, least_variation=0.0
+    )
 
 
 def constant_profiles(

@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from lcc_rl.data.cycles import Case
+from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import build_pieces
 from lcc_rl.envs.inputs import Inputs, string_of

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.data.cycles import from_trajectories
+from lcc_rl.data.leaders import from_trajectories
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import choose, stream_id, uniform
 from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key, require_option

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from lcc_rl.data.cycles import Case
+from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import INK, in_file, in_words, legend_above, new_figure, save, unbox

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lcc_rl.data.units import FRAME
+from lcc_rl.data.trajectories import FRAME
 from lcc_rl.drivers.parameters import COLUMNS, fitted
 from lcc_rl.drivers.population import DriverPopulation
 from lcc_rl.errors import ConfigError

@@ -23,7 +23,7 @@ import pandas as pd
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
-from lcc_rl.data.units import FRAME
+from lcc_rl.data.trajectories import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
 from lcc_rl.io.atomic import atomic_path
@@ -141,7 +141,7 @@ class StreamSource:
             kept = Path(self.keep or "stream.csv").expanduser()
             path = Path(folder) / kept.name
             self.write(path)
-            loaded = NgsimSource(str(path), criteria=self.criteria).load()
+            loaded = NgsimSource(path=str(path), criteria=self.criteria).load()
             if self.keep is not None:
                 keep_files({path: kept, truth_path(path): truth_path(kept)})
         size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"

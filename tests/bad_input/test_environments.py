@@ -6,7 +6,7 @@ import pytest
 import torch
 from commands import DATA
 
-from lcc_rl.data.cycles import stretch
+from lcc_rl.data.leaders import stretch
 from lcc_rl.envs import make_env
 from lcc_rl.errors import ConfigError
 

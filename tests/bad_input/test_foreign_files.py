@@ -247,7 +247,7 @@ def test_pipes_are_not_waited_for(tmp_path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     with pytest.raises(DataError, match=r"pipe: cannot be read: a folder, pipe or device"):
-        NgsimSource(str(pipe)).load()
+        NgsimSource(path=str(pipe)).load()
     for read in (read_text, read_json, read_torch, read_parquet):
         with pytest.raises(ResultsError, match=r"pipe: (not a file|no such file)"):
             read(pipe)

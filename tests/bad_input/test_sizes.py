@@ -18,8 +18,8 @@ from table_text import long_table
 
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
-from lcc_rl.data.delimited import unpacked_size
 from lcc_rl.data.table_source import TableSource
+from lcc_rl.data.tables import unpacked_size
 from lcc_rl.drivers.genetic import GeneticSettings, minimise
 from lcc_rl.errors import ConfigError
 from lcc_rl.io import memory
@@ -242,7 +242,9 @@ def test_files_larger_than_memory(tmp_path, monkeypatch) -> None:
 def test_tables_larger_than_memory(tmp_path, monkeypatch, name) -> None:
     frame, path = long_table(rows=200), tmp_path / name
     frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
-    source = TableSource(str(path), {"vehicle": "id", "time": "t", "speed": "v", **BY_GAP})
+    source = TableSource(
+        path=str(path), columns={"vehicle": "id", "time": "t", "speed": "v", **BY_GAP}
+    )
     source.load()
     monkeypatch.setattr(memory, "available", lambda device: 29_000)
     with pytest.raises(ConfigError, match=rf"reading .*{name} needs about"):

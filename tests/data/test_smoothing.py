@@ -171,10 +171,10 @@ def test_ripple_at_standstill_becomes_zero_and_is_counted(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: SavitzkyGolay(window_s=0.3, order=3), "'window_s' must be 0.4 to 600"),
-        (lambda: SavitzkyGolay(window_s=float("nan")), "'window_s'"),
-        (lambda: SavitzkyGolay(order=1), "order must be a whole number from 2"),
-        (lambda: ExponentialAverage(width_s=0.0), "'width_s' must be 0 to 100"),
+        (lambda: SavitzkyGolay(window_s=0.3, order=3), "window_s must be at least 0.4"),
+        (lambda: SavitzkyGolay(window_s=float("nan")), "window_s"),
+        (lambda: SavitzkyGolay(order=1), "order"),
+        (lambda: ExponentialAverage(width_s=0.0), "width_s"),
     ],
 )
 def test_impossible_settings(make: object, message: str) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 from ngsim_text import START_MS, cells, csv_text, pair
 
 import lcc_rl.conf
+from lcc_rl.config import build
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource, NgsimSource, find_files
 from lcc_rl.errors import DataError
@@ -19,7 +19,7 @@ from lcc_rl.errors import DataError
 def configured(name: str, *overrides: str) -> NgsimSource | EpisodesSource:
     with initialize_config_module("lcc_rl.conf", version_base="1.3"):
         config = compose(f"data/{name}", overrides=list(overrides))
-    return instantiate(config.data)
+    return build(config.data, "data")
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_files_of_a_path(tmp_path: Path) -> None:
 
 
 def test_episodes_configuration(file: Path, tmp_path: Path) -> None:
-    table = NgsimSource(str(file)).load().episodes
+    table = NgsimSource(path=str(file)).load().episodes
     write_episodes(table, tmp_path / "pairs.parquet")
     loaded = configured("episodes", f"data.path={tmp_path / 'pairs.parquet'}").load()
     assert loaded.episodes.equals(table)

@@ -19,12 +19,12 @@ from table_text import long_table, openacc_text
 
 from lcc_rl.config import config_hash, identity, load, plain
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.drive_tables import COLUMNS as COLUMNS_OF_DRIVES
-from lcc_rl.data.drive_tables import read_drives
 from lcc_rl.data.episodes import COLUMNS, read_episodes, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource
+from lcc_rl.data.speed_records import COLUMNS as COLUMNS_OF_DRIVES
+from lcc_rl.data.speed_records import read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError, LccError
 from lcc_rl.io.files import read_parquet, write_parquet
@@ -108,10 +108,10 @@ def rows_of(path: Path, layout: str) -> pd.DataFrame:
         assert not any("\n" in line for line in report)
         return pd.DataFrame({"leader_speed_mps": profiles.speeds.numpy()})
     source = {
-        "by gap": TableSource(str(path), BY_GAP, criteria=SHORT),
-        "by lane": TableSource(str(path), BY_LANE, vehicle_length=5.0, criteria=SHORT),
-        "openacc": OpenAccSource(str(path), SHORT),
-        "episodes": EpisodesSource(str(path)),
+        "by gap": TableSource(path=str(path), columns=BY_GAP, criteria=SHORT),
+        "by lane": TableSource(path=str(path), columns=BY_LANE, vehicle_length=5.0, criteria=SHORT),
+        "openacc": OpenAccSource(path=str(path), criteria=SHORT),
+        "episodes": EpisodesSource(path=str(path)),
     }[layout]
     loaded = source.load()
     validate_episodes(loaded.episodes, "what was read")
@@ -211,7 +211,7 @@ def test_a_mutated_episode_table_is_accepted_or_refused_by_name(column, row, val
 def test_a_negative_gap_is_refused() -> None:
     frame = pair_table()
     frame.loc[3, "gap_m"] = -0.5
-    with pytest.raises(DataError, match="row 3, column 'gap_m' is negative"):
+    with pytest.raises(DataError, match=r"row 4, column 'gap_m' holds -0\.5"):
         validate_episodes(frame, "table")
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from study_frames import episodes, training
 
 from lcc_rl.config import identity, load
-from lcc_rl.data.cycles import Case, stretch
+from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results import drawing, training_figures

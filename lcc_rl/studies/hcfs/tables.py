@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from lcc_rl.data.cycles import WHOLE
+from lcc_rl.data.leaders import WHOLE
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import intervals

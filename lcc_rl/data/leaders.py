@@ -1,0 +1,443 @@
+"""Leaders of a study: stretches of speed records, tables of drives, recorded traffic, mixtures."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from lcc_rl.data.plausible import Plausible
+from lcc_rl.data.profiles import (
+    EvaluationShare,
+    Profiles,
+    at_step,
+    from_records,
+    join,
+    leader_profiles,
+    nothing,
+    resample,
+)
+from lcc_rl.data.sources import NgsimSource
+from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
+from lcc_rl.data.tables import check_names, factors
+from lcc_rl.data.trajectories import FRAME
+from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
+from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
+
+WHOLE = "full length"  # a case that is a whole record, before the record's name
+
+
+@dataclass(frozen=True)
+class Case:
+    """Evaluation run of a platoon behind a given stretch of a record.
+
+    Args:
+        name: name in tables and figures.
+        profile: speed of the leader, one record.
+        followers: number of vehicles behind the leader.
+    """
+
+    name: str
+    profile: Profiles
+    followers: int
+
+    @property
+    def horizon(self) -> int:
+        """Steps of the run."""
+        return int(self.profile.lengths[0]) - 1
+
+
+@dataclass(frozen=True)
+class Leaders:
+    """Speed profiles of leaders, for training and for evaluation.
+
+    Args:
+        training: records to draw windows from.
+        windows: held-out windows of one horizon.
+        cases: named evaluation cases.
+        full_length: whole held-out records.
+        report: lines on what was read.
+    """
+
+    training: Profiles
+    windows: Profiles
+    cases: tuple[Case, ...] = ()
+    full_length: tuple[Case, ...] = ()
+    report: tuple[str, ...] = ()
+
+
+class Stretch(Settings):
+    """A part of a speed record."""
+
+    path: str | None = None  # see lcc_rl.data.speed_records.read_speed_record
+    scale: Positive = 1.0  # factor of the speeds (the paper drives its record "twice as slow", 0.5)
+    from_s: Number | None = None  # beginning, by the record's own time [s]; None for its start
+    to_s: Number | None = None  # end [s]; None for its end
+
+
+class CaseSettings(Settings):
+    """An evaluation case: a part of a speed record that lasts one horizon."""
+
+    path: str | None = None
+    scale: Positive = 1.0
+    start_s: NonNegative = 0.0
+    followers: Count = 6
+
+
+def stretch(
+    path: str,
+    time_step: float,
+    scale: float = 1.0,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    plausible: Plausible | None = None,
+) -> Profiles:
+    """Cut a stretch out of a record, as one profile.
+
+    Args:
+        path: see :func:`lcc_rl.data.speed_records.read_speed_record`.
+        time_step: step of the scenario [s].
+        scale, from_s, to_s: see :class:`Stretch`.
+        plausible: thresholds of every sample, of its speed also after scaling.
+
+    Raises:
+        DataError: if the record cannot be read or does not cover the stretch.
+        ConfigError: if the leader is implausibly fast or the stretch empty.
+    """
+    time, speed = read_speed_record(path, plausible)
+    begin = time[0] if from_s is None else float(from_s)
+    end = time[-1] if to_s is None else float(to_s)
+    if not begin < end:
+        raise ConfigError(f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
+    if begin < time[0] or end > time[-1] + 1e-6:
+        raise DataError(
+            f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s; "
+            "leader=record takes a record of any length"
+        )
+    limit = (plausible or Plausible()).max_speed
+    if scale * speed.max() > limit:
+        raise ConfigError(
+            f"leader: {path} at scale={scale:g} drives up to {scale * speed.max():.3g} m/s, "
+            f"leader.plausible.max_speed={limit:g}"
+        )
+    stem = Path(path).stem
+    speeds = resample(time, scale * speed, time_step, begin, end)
+    return from_records([speeds], [f"{stem}@{begin:g}s"], [stem], time_step)
+
+
+class RecordLeaders(Settings):
+    """Leaders that drive speed records or drive cycles from files."""
+
+    training: Mapping[str, Any]  # stretches by name, see Stretch
+    held_out: Mapping[str, Any]  # stretches that windows for evaluation are cut from
+    cases: Mapping[str, Any] = Field(default_factory=dict)  # ``case_1`` for "case 1", CaseSettings
+    full_length: Mapping[str, Any] | None = None  # stretches driven from end to end
+    # Evaluation windows whose total speed change is below this are left out [m/s].
+    least_variation: NonNegative = 2.0
+    path: str | None = None  # of stretches that name none
+    plausible: Plausible | None = None  # None for the defaults
+
+    def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
+        """Read everything.
+
+        Args:
+            time_step: step of the scenario [s].
+            horizon: steps of a window and of a case.
+            followers: vehicles behind a whole record; None reads neither these nor the cases.
+
+        Raises:
+            DataError: if a record cannot be used, naming the file.
+            ConfigError: if an option is unknown or impossible, naming it.
+        """
+        training = join(self._stretches("training", self.training, time_step))
+        held_out = join(self._stretches("held_out", self.held_out, time_step))
+        windows = varying(held_out.windows(horizon), self.least_variation)
+        report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"]
+        for group, profiles in (("training", training), ("held_out", held_out)):
+            for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True):
+                report.append(f"{group}: {name}, {length * time_step:g} s")
+        if followers is None:
+            return Leaders(training, windows, report=tuple(report))
+        wholes = self.full_length or {}
+        whole = self._stretches("full_length", wholes, time_step) if wholes else []
+        return Leaders(
+            training,
+            windows,
+            tuple(self._case(name, node, time_step, horizon) for name, node in self.cases.items()),
+            tuple(
+                Case(f"{WHOLE} {name}", profile, followers)
+                for name, profile in zip(wholes, whole, strict=True)
+            ),
+            tuple(report),
+        )
+
+    def _stretches(self, group: str, nodes: Mapping[str, Any], time_step: float) -> list[Profiles]:
+        if not nodes:
+            raise ConfigError(f"leader.{group} names no record")
+        parts = []
+        for name, node in nodes.items():
+            x = self._parsed(Stretch, node, f"leader.{group}.{name}")
+            parts.append(stretch(x.path, time_step, x.scale, x.from_s, x.to_s, self.plausible))
+        return parts
+
+    def _case(self, name: str, node: Any, time_step: float, horizon: int) -> Case:
+        x = self._parsed(CaseSettings, node, f"leader.cases.{name}")
+        end = x.start_s + horizon * time_step
+        profile = stretch(x.path, time_step, x.scale, x.start_s, end, self.plausible)
+        return Case(name.replace("_", " "), profile, x.followers)
+
+    def _parsed(self, kind: type[Settings], node: Any, where: str) -> Any:
+        """Settings of a stretch or case; it or ``self`` has a path."""
+        if not isinstance(node, Mapping | None):
+            raise ConfigError(f"{where} must be a mapping, got {node!r}")
+        settings: Any = parse(kind, node or {}, where)
+        settings.path = settings.path or self.path
+        if not settings.path:
+            raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
+        return settings
+
+
+def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Profiles:
+    """Read the speed profiles of the leaders in car-following episodes of NGSIM files.
+
+    Args:
+        path: one or several files of any published NGSIM layout, or a pattern; see
+            :class:`lcc_rl.data.sources.NgsimSource`, whose default criteria apply.
+        time_step: step of the profiles [s]; the records are interpolated to it.
+
+    Raises:
+        DataError: if a file cannot be read or holds no car-following episode.
+    """
+    require_positive("profiles", time_step=time_step)
+    episodes = NgsimSource(path=path).load().episodes
+    return at_step(leader_profiles(episodes, FRAME), time_step)
+
+
+class TrajectoryLeaders(Settings):
+    """Leaders recorded in traffic: those of car-following episodes, such as NGSIM's."""
+
+    source: Any  # where the episodes come from, like the nodes of ``data``
+    split: Callable  # how they are divided, like the nodes of ``split``
+    source_step: Positive = 0.1  # step of the episodes [s]
+    least_variation: NonNegative = 2.0  # see RecordLeaders
+
+    def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
+        """Read everything; see :meth:`RecordLeaders.load`."""
+        loaded = self.source.load()
+        profiles = at_step(leader_profiles(loaded.episodes, self.source_step), time_step)
+        training, held_out = self.split(profiles.at_least(horizon))
+        windows = varying(held_out.windows(horizon), self.least_variation)
+        return Leaders(training, windows, report=tuple(loaded.report))
+
+
+class DriveLeaders(Settings):
+    """Leaders that drive the speed records of a table.
+
+    Several drives are divided by name: whether a drive is held out depends on a SHA-256 hash of
+    its name alone, or of the part that drives of one day share, so that it is on the same side in
+    every file. Of a single record the end is held out.
+    """
+
+    # A .csv or .parquet file, of drives also several or a pattern. A native OpenACC file is the
+    # drive of its first car, named after the file.
+    path: str | Sequence[str]
+    # What its columns are called: ``drive``, the name of the record, null for a table that holds
+    # one record; ``time``, even in a record; ``speed``.
+    columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(COLUMNS))
+    units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
+    evaluation_share: EvaluationShare = 1 / 3  # of the names, or of the single record
+    # Regular expression; drives whose names begin with the same match are on the same side.
+    together: str | None = None
+    tuning: bool = False  # leave the evaluation's part out and divide the rest again
+    least_variation: NonNegative = 2.0  # see RecordLeaders
+    fastest: Positive | None = None  # highest mean speed of the leader in held-out windows [m/s]
+    plausible: Plausible | None = None  # None for the defaults
+
+    def settled(self) -> None:
+        check_names(self.columns, FIELDS, "leader.columns")
+        factors(self.units, FIELDS, "leader.units")
+        if self.tuning and self.evaluation_share == 1:
+            raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
+        if self.together and self.columns.get("drive", "") is None:
+            raise ConfigError("leader.together divides drives by name; the table holds one record")
+        try:
+            re.compile(self.together or "")
+        except re.error as error:
+            raise ConfigError(f"leader.together={self.together}: {error}") from error
+
+    def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
+        """Read everything; see :meth:`RecordLeaders.load`."""
+        columns = {**COLUMNS, **self.columns}
+        profiles, report = read_drives(self.path, columns, time_step, self.plausible, self.units)
+        divide = self._by_time if columns["drive"] is None else self._by_name
+        training, held_out = divide(profiles)
+        if self.tuning:
+            training, held_out = divide(training, again=True)
+        self._check_lengths(profiles, (training, held_out), horizon)
+        windows = varying(held_out.at_least(horizon).windows(horizon), self.least_variation)
+        if self.fastest is not None:
+            windows = slow(windows, self.fastest)
+        if len(training):
+            training = training.at_least(horizon)
+        by = "at the end" if columns["drive"] is None else "by name"
+        count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
+        line = f"{self.path}: {count}{', '.join(held_out.names)}"
+        return Leaders(training, windows, report=(*report, line))
+
+    def _check_lengths(self, all_: Profiles, parts: Sequence[Profiles], horizon: int) -> None:
+        """Check that both sides hold a record of an episode's length; say what can be done."""
+        whole, *sides = (int(x.lengths.max()) - 1 if len(x) else horizon for x in (all_, *parts))
+        if min(sides) >= horizon:
+            return
+        raise DataError(
+            f"{self.path}: shorter than the horizon: an episode needs {horizon} steps, the longest "
+            f"record has {whole}, its parts for training and evaluation {sides[0]} and {sides[1]}; "
+            f"lower scenario.horizon to at most {max(1, min(whole, *sides))}, give longer records, "
+            "or say leader.evaluation_share=1 to evaluate on all of it"
+        )
+
+    def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
+        """Divide drives by a hash of their names; once more for tuning."""
+        share = self.evaluation_share
+        place = np.array([hashed(self._family(name)) for name in profiles.recordings])
+        if again:  # what is left lies in share…1
+            place = (place - share) / (1 - share)
+        held = place < share
+        if held.all() and share == 1:
+            return nothing(profiles.time_step), profiles
+        if held.all() or not held.any():
+            side = "evaluation" if held.any() else "training"
+            raise DataError(
+                f"{self.path}: the names of all {len(held)} drives fall on the side of {side}; "
+                "change leader.evaluation_share (1: all for evaluation) or give more drives"
+            )
+        return profiles.select(np.flatnonzero(~held)), profiles.select(np.flatnonzero(held))
+
+    def _family(self, name: str) -> str:
+        """Return the part of a name that says on which side its drive is.
+
+        Raises:
+            DataError: if the name has no such part.
+        """
+        if self.together is None:
+            return name
+        found = re.match(self.together, name)
+        if not found or not found.group():
+            raise DataError(f"{self.path}: drive {name!r} does not begin with {self.together!r}")
+        return found.group()
+
+    def _by_time(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
+        """Divide the one record, whose end is held out."""
+        if self.evaluation_share == 1:
+            return nothing(profiles.time_step), profiles
+        record, name = profiles.record(0), profiles.names[0]
+        cut = len(record) - round(self.evaluation_share * len(record))
+        if not 1 < cut < len(record) - 1:
+            raise DataError(f"{self.path}: {len(record)} samples cannot be divided")
+        at = f"{name}+{cut * profiles.time_step:g}s"
+        parts = ((record[:cut], name), (record[cut:], at))
+        first, last = (
+            from_records([part], [label], profiles.recordings, profiles.time_step)
+            for part, label in parts
+        )
+        return first, last
+
+
+def slow(profiles: Profiles, fastest: float) -> Profiles:
+    """Return the records whose mean speed is at most ``fastest`` [m/s]."""
+    kept = [i for i in range(len(profiles)) if float(profiles.record(i).mean()) <= fastest]
+    if not kept:
+        raise DataError(
+            f"no held-out window in which the leader's mean speed is at most {fastest:g} m/s; "
+            "raise leader.fastest or give another record"
+        )
+    return profiles.select(kept)
+
+
+def varying(profiles: Profiles, least_variation: float) -> Profiles:
+    """Return the records whose speed changes by at least so much in total [m/s].
+
+    Raises:
+        DataError: if there is none.
+    """
+    variation = [float(profiles.record(i).diff().abs().sum()) for i in range(len(profiles))]
+    kept = [i for i, total in enumerate(variation) if total >= least_variation]
+    if not kept:
+        raise DataError(
+            f"no held-out window in which the leader's speed changes by {least_variation:g} m/s; "
+            "lower leader.least_variation or give another record"
+        )
+    return profiles.select(kept)
+
+
+def hashed(name: str) -> float:
+    """Return a number in [0, 1) that depends on a name alone, the same on every machine.
+
+    The prefix keeps it apart from other divisions by the plain hash of the same names.
+    """
+    digest = hashlib.sha256(f"lcc_rl held out: {name}".encode()).digest()
+    return int.from_bytes(digest[:6], "big") / 2**48
+
+
+class Mixture:
+    """Leaders from several sources side by side.
+
+    Training draws a source by its weight, then one of its records, all alike. Evaluation takes
+    the windows of every source.
+
+    Args:
+        weights: how often a source is drawn, relative to the others, by name; those not named
+            have 1.
+        **sources: by name, each like a node of ``leader``.
+
+    Raises:
+        ConfigError: if there is no source, a weight is not positive or names no source.
+    """
+
+    def __init__(self, weights: Mapping[str, float] | None = None, **sources: Any) -> None:
+        if not sources:
+            raise ConfigError("leader: a mixture names no source of leaders")
+        for name, source in sources.items():
+            if not callable(getattr(source, "load", None)):
+                raise ConfigError(
+                    f"leader.{name} must be a source of leaders, got {source!r}; "
+                    f"say +leader@leader.{name}=…"
+                )
+        for name, weight in (weights or {}).items():
+            if name not in sources:
+                raise unknown_name("source in leader.weights", str(name), sources)
+            require_positive("leader.weights", **{str(name): weight})
+        self.sources, self.weights = sources, dict(weights or {})
+
+    def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
+        """Read everything; see :meth:`RecordLeaders.load`."""
+        found: dict[str, Leaders] = {}
+        for name, source in self.sources.items():
+            try:
+                found[name] = source.load(time_step, horizon, followers)
+            except DataError as error:
+                raise DataError(f"leader.{name}: {error}") from error
+        # A source that is for evaluation only has nothing to draw from.
+        learned = {name: one for name, one in found.items() if len(one.training)}
+        parts = [one.training.at_least(horizon) for one in learned.values()]
+        training = join(parts) if parts else next(iter(found.values())).training
+        each = [
+            torch.full((len(part),), self.weights.get(name, 1.0) / len(part), dtype=torch.float64)
+            for name, part in zip(learned, parts, strict=True)
+        ]
+        windows = join([one.windows for one in found.values()])
+        names = tuple(name for name, one in found.items() for _ in range(len(one.windows)))
+        return Leaders(
+            replace(training, weights=torch.cat(each) if each else None),
+            replace(windows, sources=names),
+            tuple(case for one in found.values() for case in one.cases),
+            tuple(case for one in found.values() for case in one.full_length),
+            tuple(f"{name}: {line}" for name, one in found.items() for line in one.report),
+        )
