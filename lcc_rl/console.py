@@ -21,7 +21,6 @@ TOOLS = {
     "status": ("lcc_rl.status", "what runs are running, waiting, finished, failed"),
     "animate": ("lcc_rl.commands.animate", "an episode as a moving picture: page, GIF, MP4"),
     "reproduce": ("lcc_rl.commands.reproduce", "a paper's study, to one page"),
-    "benchmark": ("lcc_rl.commands.benchmark", "speed, against named alternatives"),
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
     "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX or PyTorch program"),

@@ -51,7 +51,7 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
     elif program == "pip":
         assert set(re.findall(r"\w+", rest[-1].strip("'\""))) <= set(EXTRAS), rest
     elif program.endswith("python"):
-        assert (ROOT / rest[0]).is_file(), rest[0]
+        assert (ROOT / rest[0]).exists(), rest[0]
         settings = parsed(rest[0], rest[1:])
         once("train", (*ALWAYS.get(rest[0], ()), *settings))
     elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:

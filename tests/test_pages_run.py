@@ -31,7 +31,7 @@ NOT_RUN = {
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
     "lcc-rl sumo": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
     "lcc-rl animate": "tests/results/test_animation.py runs it",
-    "lcc-rl benchmark": "tests/tools/test_benchmark.py runs it",
+    "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
     "python tools/compare_agents.py": "tests/tools/test_compare_agents.py runs it",
     "python tools/compare_lengths.py": "tests/tools/test_compare_lengths.py runs it",
     "python tools/compare_launchers.py": "runs of every launcher, of extras",

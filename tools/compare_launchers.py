@@ -22,8 +22,8 @@ from resource import RUSAGE_CHILDREN, getrusage
 
 import pandas as pd
 
+from benchmarks.harness import installed
 from lcc_rl import results
-from lcc_rl.benchmarks.harness import installed
 
 # Override and package of each launcher.
 LAUNCHERS = {

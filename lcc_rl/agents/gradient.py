@@ -14,10 +14,9 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, derived_seed, episode_statistics
 from lcc_rl.agents.simulated import SimulatedLoop
-from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.pieces.base import State, next_key
+from lcc_rl.pieces.base import next_key
 
 log = logging.getLogger("lcc_rl")
 
@@ -52,39 +51,6 @@ class GradientTrainer(SimulatedLoop[Analytic]):
         if compiled is None:
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
         return self._rollout(compiled)
-
-    def footprint(self) -> Footprint:
-        source, own = self._rollout(), self.agent.settings
-        # The first steps lack the gradient that reaches the later ones through the motion.
-        (less, _, _), (more, data, state) = (self._played(source, steps) for steps in (2, 3))
-        count = self.env.batch_size.numel()
-        vehicles = data.get(OBSERVATION).shape[-2]
-        layers = 4 * sum(own.hidden) * COPIES * vehicles / own.value_every if own.bootstrap else 0
-        return Footprint(
-            # Twice the graph: what it holds, and the gradients on the way back.
-            step=(2 * (more - less) + COPIES * data.bytes() / 3) / count + layers,
-            reported=data.select(*REPORTED).bytes() / 3 / count,
-            moment=nbytes(state.values()) / count,
-            fixed={},
-        )
-
-    def _played(
-        self, source: DifferentiableRollout, steps: int
-    ) -> tuple[int, TensorDictBase, State]:
-        """Play some steps; return the bytes that their graph holds, and what was played."""
-        held: dict[int, int] = {}  # by the place in memory
-
-        def keep(tensor: Tensor) -> Tensor:
-            held[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-            return tensor
-
-        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            state, record = source.play(source.start(), self.agent.policy.module, steps)
-            data = source.assemble(record)
-            # Kept until all are counted: what is freed would give its place to another.
-            total = self.objective.score(data, checked=False)
-        assert total.requires_grad
-        return sum(held.values()), data.detach(), state
 
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Play one batch of episodes, with a gradient step after every segment of them."""

@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.checks import check_learner
-from lcc_rl.agents.sizes import Footprint, check_length
+from lcc_rl.agents.sizes import check_length
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.errors import Diverged, Interrupted, ResultsError, require_in
 from lcc_rl.io.files import write_parquet
@@ -141,10 +141,6 @@ class TrainingLoop(ABC, Generic[AgentT]):
     @abstractmethod
     def _source(self) -> Any:
         """Return what :meth:`_iterate` plays episodes with; made once per run."""
-
-    @abstractmethod
-    def footprint(self) -> Footprint:
-        """Measure the memory that an iteration needs on one step of this loop's episodes."""
 
     @abstractmethod
     def _iterate(self, source: Any) -> dict[str, float]:

@@ -70,12 +70,11 @@ class Objective:
                 )
         return [key for _, key in read]
 
-    def score(self, data: TensorDictBase, checked: bool = True) -> Tensor:
+    def score(self, data: TensorDictBase) -> Tensor:
         """Return the objective at every step of a rollout, ``[batch, steps, A]``.
 
         Args:
             data: the rollout, ``[batch, steps]``.
-            checked: look for terms that are no finite numbers.
 
         Raises:
             Diverged: naming the first of them.
@@ -84,7 +83,7 @@ class Objective:
             factor * self.limits.price(term.name) * term.compute(*_entries(term, data)).squeeze(-1)
             for term, factor in self.terms
         ]
-        if checked and any_lost(parts):
+        if any_lost(parts):
             for (term, _), part in zip(self.terms, parts, strict=True):
                 if any_lost([part]):
                     kind = type(term).__name__

@@ -15,7 +15,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.agents.sizes import COPIES, Footprint, check_window
+from lcc_rl.agents.sizes import check_window
 from lcc_rl.config import require
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import pieces_of
@@ -71,21 +71,6 @@ class Trainer(TrainingLoop[OffPolicy]):
         keys = (*LEARNED_FROM, *REPORTED)
         return StringCollector(
             self.env, policy, frames_per_batch=frames, keys=keys, compiled=compiled
-        )
-
-    def footprint(self) -> Footprint:
-        batch = next(iter(self._collector(1, False)))
-        rows, own, count = transitions(batch), self.agent.settings, self.env.batch_size.numel()
-        row = rows.bytes() / len(rows)
-        layers = 4 * sum(own.hidden) * COPIES * (1 + self.agent.critics)
-        return Footprint(
-            step=COPIES * batch.bytes() / count,
-            reported=batch.select(*REPORTED).bytes() / count,
-            moment=self.env.fake_tensordict().bytes() / count,
-            fixed={
-                f"agent.buffer_size={own.buffer_size}": own.buffer_size * row,
-                f"agent.batch_size={own.batch_size}": own.batch_size * (2 * row + layers),
-            },
         )
 
     def _compiled(self) -> bool:

@@ -19,7 +19,6 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, derived_seed, episode_statistics
 from lcc_rl.agents.simulated import SimulatedAgent, SimulatedLoop, SimulatedSettings
-from lcc_rl.agents.sizes import COPIES, Footprint, nbytes
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, how_to_install, require_positive, require_whole
@@ -145,15 +144,6 @@ class SearchLoop(SimulatedLoop[Tuned]):
 
     def _source(self) -> DifferentiableRollout:
         return self._rollout()
-
-    def footprint(self) -> Footprint:
-        with torch.no_grad():
-            source = self._source()
-            state, record = source.play(source.start(), self.agent.policy.module, 2)
-            data = source.assemble(record)
-        count = self.env.batch_size.numel()
-        step = COPIES * data.bytes() / 2 / count
-        return Footprint(step, step, nbytes(state.values()) / count, {})
 
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Let a candidate drive a batch of episodes."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
 from lcc_rl.agents.sizes import check_length, check_window
@@ -18,8 +19,9 @@ from lcc_rl.envs.inputs import (
     constant_profiles,
     string_of,
 )
+from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.evaluation.episodes import any_leader, check_shard, needed
+from lcc_rl.evaluation.episodes import any_leader, check_shard, plan_of
 from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
@@ -47,6 +49,8 @@ OBJECTIVES = {
     "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
 }
 MEASURED = ("ttc", "time_gap", "power")
+MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
+RECORD = 4096  # bytes of an iteration's row in the record
 
 
 def check_settings(cfg: DictConfig, folder: Path) -> None:
@@ -78,9 +82,10 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         check_length(cfg.training, horizon)
         check_window(cfg.agent.get("best_window"), cfg.training)
         trial.training.environments, trial.training.episodes = 2, 2
-        footprint = make_trainer(trial, agent, profiles, population, folder).footprint()
-        require_memory(footprint.needs(cfg.training, horizon), cfg.device)
-    build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
+        make_trainer(trial, agent, profiles, population, folder)
+    env = build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
+    if learns(cfg):
+        require_memory(training_bytes(cfg, env.reset()), cfg.device)
 
 
 def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
@@ -91,7 +96,40 @@ def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
     """
     own, profiles = deployed(any_leader(cfg)), inputs.evaluation
     env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
-    require_memory(needed(env, cfg, inputs), cfg.device)
+    require_memory(evaluation_bytes(cfg, env.reset(), inputs), cfg.device)
+
+
+def training_bytes(cfg: DictConfig, moment: TensorDictBase) -> dict[str, float]:
+    """Return the bytes that a training needs at the least, by the option that they are due to.
+
+    Args:
+        cfg: its configuration.
+        moment: the entries of one episode at one moment.
+    """
+    settings, agent = cfg.training, cfg.agent
+    count, vehicles = settings.environments, moment[OBSERVATION].shape[-2]
+    transition = 4 * (2 * moment[OBSERVATION].shape[-1] + 2)  # before, after, action and reward
+    needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD}
+    if "buffer_size" in agent:
+        played = MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition
+        learned = 2 * transition + 16 * sum(agent.hidden)
+        needs[f"agent.buffer_size={agent.buffer_size}"] = agent.buffer_size * transition
+        needs[f"agent.batch_size={agent.batch_size}"] = agent.batch_size * learned
+    else:
+        played = MOMENTS * moment.bytes() * settings.segment
+    return {f"training.environments={count}": count * played, **needs}
+
+
+def evaluation_bytes(cfg: DictConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
+    """Return the bytes of the largest block of an evaluation; arguments as above."""
+    settings, steps, count = cfg.evaluation, cfg.scenario.horizon, len(inputs.evaluation)
+    if settings.rows == "episodes":
+        count = plan_of(cfg, inputs).size
+    longest = max((case.horizon for case in inputs.full_length), default=0)
+    if settings.full_length and longest > count * steps:
+        count, steps = 1, longest
+    what = f"an evaluation of {count} episodes of {steps} steps side by side"
+    return {what: count * steps * moment.bytes()}
 
 
 def check_installed(cfg: DictConfig, compared: Sequence[str] = ()) -> None:

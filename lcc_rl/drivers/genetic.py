@@ -15,8 +15,8 @@ from lcc_rl.io.memory import require_memory
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
-DRAWN = 12  # bytes of an individual that takes part in a tournament: its number and fitness
 SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
+LARGEST = 100_000  # individuals of a population, and founders
 _LEAST = {"population": 4, "generations": 1, "founders": 1, "patience": 1}
 _INTERVALS = {
     **dict.fromkeys(("elites", "difference_rate", "mutation_rate"), "[0, 1]"),
@@ -64,24 +64,8 @@ class GeneticSettings:
         for name, interval in _INTERVALS.items():
             require_in("genetic", interval, **{name: getattr(self, name)})
         for name, least in _LEAST.items():
-            require_whole("genetic", least, **{name: getattr(self, name)})
+            require_whole("genetic", least, LARGEST, **{name: getattr(self, name)})
         require_whole("genetic", 1, self.population, tournament=self.tournament)
-        self.check_memory(1, 1)
-
-    def check_memory(self, problems: int, dims: int, device: torch.device | str = "cpu") -> None:
-        """Check that the first generation, the largest one, fits into memory.
-
-        Raises:
-            ConfigError: saying what it needs.
-        """
-        largest = self.founders * self.population
-        what = f"a genetic search of {problems} × {largest} (founders × population) individuals"
-        drawn = f"genetic.tournament={self.tournament}"
-        needs = {
-            what: problems * largest * (4 * dims + SIMULATED) * 4,
-            drawn: problems * self.population * self.tournament * DRAWN,
-        }
-        require_memory(needs, device)
 
 
 @dataclass(frozen=True)
@@ -131,7 +115,10 @@ def minimise(
     settings = settings or GeneticSettings()
     if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
         raise ConfigError("bounds must be two vectors of one length with lower < upper")
-    settings.check_memory(problems, lower.numel(), lower.device)
+    first = settings.founders * settings.population
+    what = f"a genetic search of {problems} × {first} (founders × population) individuals"
+    needs = problems * first * (4 * lower.numel() + SIMULATED) * 4
+    require_memory({what: needs}, lower.device)
     evaluate = _in_units(objective, lower, upper)
     found = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
     return replace(found, best=lower + found.best * (upper - lower))

@@ -11,7 +11,6 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import require
 from lcc_rl.energy import build_energy
@@ -33,7 +32,6 @@ from lcc_rl.evaluation.rows import (
     traffic,
 )
 from lcc_rl.evaluation.strategies import Strategy
-from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.tables import FASTER
 
@@ -261,32 +259,6 @@ def evaluate(
     episodes = Episodes(strategy, inputs, plan, seed, sample_episodes, device, compiled)
     rows, steps = zip(*map(episodes.play, plan.own), strict=True)
     return pd.concat(rows, ignore_index=True), pd.concat(steps, ignore_index=True)
-
-
-def needed(
-    env: TransformedEnv, cfg: DictConfig, inputs: Inputs, copies: int = 4
-) -> dict[str, float]:
-    """Return the bytes that the largest batch of an evaluation needs, by option.
-
-    Args:
-        env: an environment of the configuration with one episode.
-        cfg: the configuration.
-        inputs: what it is evaluated on.
-        copies: of an entry: the steps, the record, the record of each group, its measures.
-    """
-    moment = env.reset()
-    known = set(map(as_key, moment.keys(True, True)))
-    size = sum(moment.get(key).nbytes for key in KEYS if key in known)
-    settings = cfg.evaluation
-    count = len(inputs.evaluation)
-    if settings.rows == "episodes":
-        count = plan_of(cfg, inputs).size
-    steps = cfg.scenario.horizon
-    longest = max((case.horizon for case in inputs.full_length), default=0)
-    if settings.full_length and longest > count * steps:
-        count, steps = 1, longest
-    what = f"an evaluation of {count} episodes of {steps} steps side by side"
-    return {what: count * copies * size * steps}
 
 
 def any_leader(cfg: DictConfig) -> DictConfig:

@@ -210,7 +210,7 @@ ITERATION = r" in iteration 1 of .*; nothing is saved$"
             marks=pytest.mark.slow,
         ),
         ("nan", "torchrl", ENTRY, ENTRY_LOST + f" {EPISODE}{ITERATION}"),
-        ("nan", "torchrl", POWER, POWER_LOST + f" {EPISODE}$"),  # when the settings are tried
+        ("nan", "torchrl", POWER, POWER_LOST + f" {EPISODE}{ITERATION}"),
     ],
     indirect=["value"],
 )

@@ -1,4 +1,4 @@
-"""The benchmark command: every benchmark runs and writes sane rows; no speed is asserted."""
+"""The benchmarks: every benchmark runs and writes sane rows; no speed is asserted."""
 
 from __future__ import annotations
 
@@ -12,20 +12,7 @@ import torch
 from lcc_rl.io.files import read_parquet
 from lcc_rl.synthetic.stream import StreamSource
 
-NAMES = (
-    "read",
-    "env",
-    "estimator",
-    "collect",
-    "update",
-    "seeds",
-    "train",
-    "calibrate",
-    "evaluate",
-    "scale",
-    "infer",
-    "sweep",
-)
+NAMES = ("read", "env", "collect", "update", "train", "calibrate", "evaluate")
 COLUMNS = [
     "benchmark",
     "case",
@@ -48,12 +35,12 @@ EXTRAS = ("collect", "update", "calibrate")  # those that compare with packages 
 
 @pytest.fixture(scope="module")
 def benchmark() -> ModuleType:
-    module = importlib.import_module("lcc_rl.commands.benchmark")
+    module = importlib.import_module("benchmarks.command")
     assert set(module.BENCHMARKS) == set(NAMES)
     return module
 
 
-LONG = ("sweep", "calibrate", "read", "evaluate", "seeds")  # longer than all others together
+LONG = ("calibrate", "read", "evaluate")  # longer than all others together
 
 
 def check_rows(rows: pd.DataFrame, name: str) -> None:
@@ -118,7 +105,7 @@ def test_bad_input_ends_in_one_clear_error(benchmark, tmp_path, capsys, argument
 
 
 def test_a_wrong_plain_loop_is_not_timed(benchmark, monkeypatch) -> None:
-    monkeypatch.setattr("lcc_rl.benchmarks.plain.motor_power", lambda speed, acceleration: speed)
+    monkeypatch.setattr("benchmarks.plain.motor_power", lambda speed, acceleration: speed)
     options = benchmark.parse(["env", "--quick", "--device", "cpu"])
     with pytest.raises(RuntimeError, match="plain loop is off"):
         benchmark.env(options)
@@ -127,7 +114,7 @@ def test_a_wrong_plain_loop_is_not_timed(benchmark, monkeypatch) -> None:
 def test_a_wrong_plain_python_loop_is_not_timed(benchmark, monkeypatch) -> None:
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setattr("lcc_rl.benchmarks.scalar.power", lambda speed, acceleration: speed)
+    monkeypatch.setattr("benchmarks.scalar.power", lambda speed, acceleration: speed)
     options = benchmark.parse(["collect", "--quick", "--device", "cpu"])
     with pytest.raises(RuntimeError, match="plain Python loop is off"):
         benchmark.collect(options)
@@ -135,8 +122,8 @@ def test_a_wrong_plain_python_loop_is_not_timed(benchmark, monkeypatch) -> None:
 
 @pytest.mark.slow
 def test_without_the_extra_it_says_what_is_left_out(benchmark, monkeypatch, tmp_path, capsys):
-    for module in ("commands.benchmark", *(f"benchmarks.{x}" for x in EXTRAS)):
-        monkeypatch.setattr(f"lcc_rl.{module}.installed", lambda *names: False)
+    for module in ("command", *EXTRAS):
+        monkeypatch.setattr(f"benchmarks.{module}.installed", lambda *names: False)
     out = tmp_path / "rows.parquet"
     names = ["collect", "update", "calibrate"]
     assert benchmark.main([*names, "--quick", "--out", str(out)]) == 0
@@ -150,7 +137,7 @@ def test_without_the_extra_it_says_what_is_left_out(benchmark, monkeypatch, tmp_
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the compiler's own making
 def test_compiled_cases(benchmark, tmp_path, capsys) -> None:
     out = tmp_path / "rows.parquet"
-    assert benchmark.main(["env", "estimator", "--quick", "--compile", "--out", str(out)]) == 0
+    assert benchmark.main(["env", "--quick", "--compile", "--out", str(out)]) == 0
     rows = read_parquet(out)
     compiled = rows[rows["case"].str.contains("compiled")]
-    assert set(compiled["benchmark"]) == {"env", "estimator"}
+    assert set(compiled["benchmark"]) == {"env"}

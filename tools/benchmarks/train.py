@@ -11,12 +11,12 @@ from tempfile import TemporaryDirectory
 import torch
 from torchrl.envs import TransformedEnv
 
+from benchmarks.collect import OTHER, stable_baselines_model
+from benchmarks.harness import Row, Run, alternate, installed, rows_of
+from benchmarks.plain import alcc, study
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
 from lcc_rl.agents.replay import Trainer, transitions
-from lcc_rl.benchmarks.collect import OTHER, stable_baselines_model
-from lcc_rl.benchmarks.harness import Row, Run, alternate, installed, rows_of
-from lcc_rl.benchmarks.plain import alcc, study
 
 
 def train(options: Namespace) -> list[Row]:

@@ -13,9 +13,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from benchmarks.harness import TOLERANCE, Row, Run, alternate, endings, rows_of
+from benchmarks.plain import PlainLoop, study
 from lcc_rl.agents.factory import build_agent
-from lcc_rl.benchmarks.harness import TOLERANCE, Row, Run, alternate, endings, rows_of
-from lcc_rl.benchmarks.plain import PlainLoop, study
 from lcc_rl.evaluation.episodes import Episodes, Plan
 from lcc_rl.evaluation.metrics import LONG_TIME_GAP, PACE, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options

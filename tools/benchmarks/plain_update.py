@@ -12,8 +12,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from benchmarks.harness import TOLERANCE
 from lcc_rl.agents import DDPG
-from lcc_rl.benchmarks.harness import TOLERANCE
 
 Network = list[tuple[Tensor, Tensor]]
 COLUMNS = ("observation", "action", "reached", "reward", "terminated")

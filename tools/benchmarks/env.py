@@ -9,8 +9,8 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.benchmarks.harness import Row, Run, alternate, endings, first_calls, rows_of
-from lcc_rl.benchmarks.plain import PlainLoop, alcc, check_physics
+from benchmarks.harness import Row, Run, alternate, endings, first_calls, rows_of
+from benchmarks.plain import PlainLoop, alcc, check_physics
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.rollout import ACTION, OBSERVATION
 from lcc_rl.pieces.rewards import REWARD

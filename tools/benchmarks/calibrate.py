@@ -1,4 +1,4 @@
-"""Benchmark of the calibration, beside scipy driver by driver and a search in numba."""
+"""Benchmark of the calibration, beside scipy driver by driver."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import differential_evolution
 
-from lcc_rl.benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
-from lcc_rl.benchmarks.search import batched_search
+from benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.drivers.fit import DEFAULT_GENETIC, fit
+from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.observed import Observed, observe
 from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants
 
 NAMES = ("desired_speed", "time_gap")
 IDENTITY = "episode"
-OURS, PYTHON, NUMBA, SEARCH = "fit", "scipy, scaled from few", "scipy and numba", "numba search"
+OURS, PYTHON, NUMBA = "fit", "scipy, scaled from few", "scipy and numba"
 
 
 def squared_error(
@@ -81,13 +80,12 @@ class Problem:
 
 
 def calibrate(options: Namespace) -> list[Row]:
-    """Seconds to fit (v0, T) of every driver, beside scipy driver by driver and one numba search.
+    """Seconds to fit (v0, T) of every driver, beside scipy driver by driver.
 
     scipy's differential evolution runs with its own defaults: with an objective that numba
     compiled (before the clock starts) for every driver, and with one in plain Python for a few,
-    scaled to all by the number of samples. The numba search has our algorithm and as many
-    evaluations, and is one compiled function. Ours is the default search, compiled in the untimed
-    run before.
+    scaled to all by the number of samples. Ours is the default search, compiled in the untimed run
+    before.
     """
     source = EpisodesSource(path=options.episodes) if options.episodes else stream(options.quick)
     observed = observe(source.load().episodes)
@@ -98,16 +96,13 @@ def calibrate(options: Namespace) -> list[Row]:
     runs[PYTHON] = partial(scipy, found, PYTHON, [Problem(observed, int(i)) for i in few], limit)
     if installed("numba"):
         runs[NUMBA] = partial(scipy, found, NUMBA, numba_problems(observed), limit)
-        run = batched_search(observed, NAMES, DEFAULT_GENETIC["local"])
-        runs[SEARCH] = partial(searched, found, run)
     spent = alternate(runs, options.repeats)
     spent[PYTHON] = spent[PYTHON] * (observed.samples.sum() / observed.samples[few].sum())
     check_objective(found[OURS], observed, few)
     rows = rows_of("calibrate", spent, "s", PYTHON, observed.count)
-    for other in (NUMBA, SEARCH):
-        if other in spent:
-            pair = {OURS: spent[OURS], other: spent[other]}
-            rows += rows_of("calibrate", pair, "s", other, observed.count)[:1]
+    if NUMBA in spent:
+        pair = {OURS: spent[OURS], NUMBA: spent[NUMBA]}
+        rows += rows_of("calibrate", pair, "s", NUMBA, observed.count)[:1]
     return rows + errors(found, few, observed.count)
 
 
@@ -115,11 +110,6 @@ def ours(found: dict[str, Any], observed: Observed, options: Namespace) -> None:
     """Fit every driver at once."""
     result = fit(observed, device=options.device)
     found[OURS] = result.drivers.set_index(IDENTITY).loc[observed.identity[IDENTITY]]
-
-
-def searched(found: dict[str, Any], run: Callable[[], Any]) -> None:
-    """Fit every driver in one function of numba."""
-    found[SEARCH] = run()
 
 
 def scipy(
@@ -161,5 +151,5 @@ def errors(found: dict[str, Any], few: np.ndarray, count: int) -> list[Row]:
     some = {OURS: mean(fitted[few]), PYTHON: mean(found[PYTHON])}
     rows = rows_of("calibrate", some, "% RMSPE", PYTHON, len(few))
     whole = {OURS: mean(fitted)}
-    whole |= {name: mean(found[name]) for name in (NUMBA, SEARCH) if name in found}
+    whole |= {NUMBA: mean(found[NUMBA])} if NUMBA in found else {}
     return rows + rows_of("calibrate", whole, "% RMSPE", NUMBA if NUMBA in found else None, count)

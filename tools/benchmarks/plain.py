@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from lcc_rl.benchmarks.harness import TOLERANCE, stream
+from benchmarks.harness import TOLERANCE, stream
 from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.rollout import ACTION

@@ -12,12 +12,12 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
+from benchmarks.harness import Row, Run, alternate, endings, first_calls, installed, rows_of
+from benchmarks.plain import PlainLoop, alcc, check_resets, training
+from benchmarks.scalar import check_scalar, gymnasium_env
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.loop import REPORTED
 from lcc_rl.agents.replay import LEARNED_FROM
-from lcc_rl.benchmarks.harness import Row, Run, alternate, endings, first_calls, installed, rows_of
-from lcc_rl.benchmarks.plain import PlainLoop, alcc, check_resets, training
-from lcc_rl.benchmarks.scalar import check_scalar, gymnasium_env
 from lcc_rl.envs import StringCollector
 from lcc_rl.policies import shared_policy
 
@@ -169,7 +169,7 @@ def loop_with_resets(
 
 def batched(options: Namespace, batch: int, steps: int, compiled: bool) -> Run:
     """``predict`` of stable-baselines3 on the plain loop as a VecEnv; nothing is kept."""
-    from lcc_rl.benchmarks.vector import PlainVector
+    from benchmarks.vector import PlainVector
 
     vector = PlainVector(training(options, batch), compiled)
     model, state = their_model(options, vector), {"seen": vector.reset()}

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.benchmarks.plain import PlainLoop
+from benchmarks.plain import PlainLoop
 
 
 class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]

@@ -1,4 +1,4 @@
-"""Measure speed against named alternatives: lcc-rl benchmark [read env …] [--quick].
+"""Measure speed against named alternatives: python tools/benchmarks [read env …] [--quick].
 
 A figure is the median of alternating repeats (A B A B …); a ratio is the median over the repeats
 of value / value of the alternative, both of the same run, so that a busy machine slows both.
@@ -18,36 +18,18 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 
-from lcc_rl.benchmarks.calibrate import calibrate
-from lcc_rl.benchmarks.collect import collect
-from lcc_rl.benchmarks.env import env
-from lcc_rl.benchmarks.estimator import estimator
-from lcc_rl.benchmarks.evaluate import evaluate
-from lcc_rl.benchmarks.harness import EXTRA, Row, drawn, installed
-from lcc_rl.benchmarks.infer import infer
-from lcc_rl.benchmarks.read import read
-from lcc_rl.benchmarks.scale import scale
-from lcc_rl.benchmarks.seeds import seeds
-from lcc_rl.benchmarks.sweep import sweep
-from lcc_rl.benchmarks.train import train
-from lcc_rl.benchmarks.update import update
+from benchmarks.calibrate import calibrate
+from benchmarks.collect import collect
+from benchmarks.env import env
+from benchmarks.evaluate import evaluate
+from benchmarks.harness import EXTRA, Row, drawn, installed
+from benchmarks.read import read
+from benchmarks.train import train
+from benchmarks.update import update
 from lcc_rl.errors import LccError, how_to_install, unknown_name
 from lcc_rl.io.files import processor, write_parquet
 
-LISTED = (
-    read,
-    env,
-    estimator,
-    collect,
-    update,
-    seeds,
-    train,
-    calibrate,
-    evaluate,
-    scale,
-    infer,
-    sweep,
-)
+LISTED = (read, env, collect, update, train, calibrate, evaluate)
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
 }
@@ -80,8 +62,8 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
 
 
 def devices(options: Namespace, name: str) -> list[str]:
-    """Return where to run a benchmark: the reader knows no device, short runs need none."""
-    if name in ("read", "sweep"):
+    """Return where to run a benchmark; the reader knows no device."""
+    if name == "read":
         return ["cpu"]
     if options.device is not None:
         return [options.device]

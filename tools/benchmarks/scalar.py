@@ -14,8 +14,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from lcc_rl.benchmarks.harness import TOLERANCE
-from lcc_rl.benchmarks.plain import PlainLoop
+from benchmarks.harness import TOLERANCE
+from benchmarks.plain import PlainLoop
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.functional.random import STEP as COUNT

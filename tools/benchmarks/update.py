@@ -13,13 +13,13 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from benchmarks.collect import OTHER, stable_baselines_model
+from benchmarks.harness import Row, Run, alternate, installed, rows_of, times
+from benchmarks.plain import alcc
+from benchmarks.plain_update import PlainUpdate, check
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
 from lcc_rl.agents.replay import LEARNED_FROM, draws, transitions
-from lcc_rl.benchmarks.collect import OTHER, stable_baselines_model
-from lcc_rl.benchmarks.harness import Row, Run, alternate, installed, rows_of, times
-from lcc_rl.benchmarks.plain import alcc
-from lcc_rl.benchmarks.plain_update import PlainUpdate, check
 
 PLAIN = "plain update"
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
-from lcc_rl.benchmarks.harness import Row, alternate, rows_of, stream
+from benchmarks.harness import Row, alternate, rows_of, stream
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.errors import DataError
 

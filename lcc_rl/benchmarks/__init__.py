@@ -1,1 +1,0 @@
-"""Benchmarks: one module each, run by ``lcc-rl benchmark``; see docs/benchmarks.md."""
