@@ -117,6 +117,8 @@ def complete(cfg: DictConfig) -> None:
     for group in NODES:
         nodes = OmegaConf.select(cfg, group)
         for name in nodes or ():
+            if OmegaConf.is_missing(nodes, name):
+                raise ConfigError(f"{group}.{name} is required: say {group}.{name}=…")
             node = nodes[name]
             if OmegaConf.is_dict(node) and TARGET not in node:
                 known = [key for key in nodes if TARGET in (nodes[key] or ())]

@@ -75,7 +75,7 @@ def run_name(*, _root_: DictConfig) -> str:
 
 def result_overrides(typed: Sequence[str]) -> list[str]:
     """Return the overrides that change a result."""
-    return [item for item in typed if key_of(item) not in NOT_IDENTITY]
+    return [item.removeprefix("++") for item in typed if key_of(item) not in NOT_IDENTITY]
 
 
 def key_of(override: str) -> str:

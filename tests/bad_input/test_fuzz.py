@@ -79,7 +79,7 @@ def test_two_wrong_options_of_which_the_second_shows_without_the_first() -> None
 
 
 def test_a_reference_in_a_circle_that_arises_when_the_policy_is_deployed() -> None:
-    with pytest.raises(ConfigError, match="Interpolation to parent node"):
+    with pytest.raises(ConfigError, match="clamp must be a valid boolean"):
         fuzz.build_study(("variant=hcfs", *fuzz.SMALL, "deployed.clamp=${scenario}"))
 
 

@@ -281,13 +281,19 @@ def test_types_inside_lists_and_mappings(override, words) -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("leader.training.udds.scale=0", r"scale must be positive"),
-        ("leader.training.udds.scale=abc", r"leader\.training\.udds\.scale must be float"),
-        ("leader.training.udds.from_s=abc", r"leader\.training\.udds\.from_s must be float"),
-        ("leader.training.udds=5", r"leader\.training\.udds must be a mapping with "),
-        ("leader.cases.case_1.followers=0", r"case_1\.followers must be a whole number"),
-        ("leader.cases.case_1.start_s=-1", r"case_1\.start_s must not be negative"),
-        ("leader.training=3", r"leader\.training must be mapping"),
+        ("leader.training.udds.scale=0", r"scale must be greater than 0"),
+        ("leader.training.udds.scale=abc", r"leader\.training\.udds\.scale must be a valid number"),
+        (
+            "leader.training.udds.from_s=abc",
+            r"leader\.training\.udds\.from_s must be a valid number",
+        ),
+        ("leader.training.udds=5", r"leader\.training\.udds must be a mapping"),
+        (
+            "leader.cases.case_1.followers=0",
+            r"case_1\.followers must be greater than or equal to 1",
+        ),
+        ("leader.cases.case_1.start_s=-1", r"case_1\.start_s must be greater than or equal to 0"),
+        ("leader.training=3", r"leader\.training must be a valid dictionary"),
     ],
 )
 def test_stretches_and_cases_of_a_leader(override, words) -> None:

@@ -116,15 +116,15 @@ def test_a_folder_without_an_evaluation_has_no_page(tmp_path) -> None:
 
 def test_one_profile_for_both_sides() -> None:
     profiles = wavy_profiles()
-    training, evaluation = SingleProfile(2)(profiles)
+    training, evaluation = SingleProfile(profile=2)(profiles)
     assert training.names == evaluation.names == (profiles.names[2],)
-    split = Split("vehicle", 0.5)
+    split = Split(by="vehicle", evaluation_share=0.5)
     many, held_out = split(profiles)
-    training, evaluation = SingleProfile(1, split)(profiles)
+    training, evaluation = SingleProfile(profile=1, held_out=split)(profiles)
     assert training.names == (many.names[1],)
     assert evaluation.names == held_out.names
     with pytest.raises(ConfigError, match=r"split\.profile must lie in 0…3"):
-        SingleProfile(4)(profiles)
+        SingleProfile(profile=4)(profiles)
 
 
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:

@@ -143,7 +143,7 @@ class PlainLoop:
     def begin(self, seed: Tensor) -> dict[str, Tensor]:
         """Return the first moment of the episodes of some seeds, ``[n, 1]``."""
         leader, human, believed = self.leader, self.human, self.estimator
-        starts = self.motion.start
+        starts = self.motion.starts
         profile = choose(seed, len(leader.offsets), leader.profile_stream)
         first = choose(seed, leader.starts[profile], leader.start_stream)
         place = leader.offsets[profile] + first
