@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.live import Live
 
-from lcc_rl.config import NOT_IDENTITY, identity
+from lcc_rl.config import NOT_IDENTITY, complete, identity, leave_out_foreign
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
@@ -63,14 +63,25 @@ def run_name(*, _root_: DictConfig) -> str:
 
     An existing folder with the same hash is used again.
     """
-    settings = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
-    mark, sweep = identity(settings)[:8], Path(_root_.hydra.sweep.dir)
+    mark, sweep = _mark(_root_), Path(_root_.hydra.sweep.dir)
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
     typed, varied = result_overrides(_root_.hydra.overrides.task), read_plan(sweep).varied
     shown = ",".join(item for item in typed if key_of(item) in varied)
     text = re.sub(r"[^\w.=,+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
     return f"{text}_{mark}".lstrip("_")
+
+
+def _mark(root: DictConfig) -> str:
+    """Return a short hash of a run's settings; of what was typed where its job will refuse them."""
+    settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
+    typed = [str(item) for item in root.hydra.overrides.task]
+    try:
+        leave_out_foreign(settings, typed)
+        complete(settings)
+        return identity(settings)[:8]
+    except (LccError, OmegaConfBaseException):
+        return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8]
 
 
 def result_overrides(typed: Sequence[str]) -> list[str]:
