@@ -123,6 +123,13 @@ def test_between_the_limits_the_controller_decides() -> None:
     assert torch.equal(piece.filtered(wanted, speed, gap, speed, 0 * speed), wanted)
 
 
+def test_the_margin_counts_as_contact() -> None:
+    # Both drive 5 m/s, 2.2 m apart; of that 2.2 − 0.2 = 2 m are free: 3 · 2 / (4 + 0.05) m/s².
+    piece = CBFFilter(0.1, rate=3.0, margin=0.2)
+    held = piece.filtered(column(3.0), column(5.0), column(2.2), column(5.0), column(0.0))
+    assert held.item() == pytest.approx(6.0 / 4.05, rel=1e-5)
+
+
 def test_safety_wins() -> None:
     # A gap far too long, closing far too fast: the limits contradict each other.
     piece = CBFFilter(0.1, time_gap=0.5, full_speed=0.0)

@@ -17,6 +17,7 @@ from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.rules import follower_stopper_speed
 from lcc_rl.functional.string import advance_string, selector
 from lcc_rl.pieces import (
+    Collision,
     FollowerStopper,
     Observation,
     PISaturation,
@@ -250,6 +251,15 @@ def test_motion_equals_a_plain_loop_over_the_vehicles(ring) -> None:
         )
         for name, value, wanted in zip(found._fields, found, expected, strict=True):
             torch.testing.assert_close(value[:, i], wanted, msg=name)
+
+
+def test_contact_of_any_two_vehicles_ends_the_episode() -> None:
+    # Three episodes of two vehicles: 1 cm is no contact, 0 is, and so is less.
+    gap = torch.tensor([[5.0, 0.01], [5.0, 0.0], [-0.1, 5.0]]).unsqueeze(-1)
+    running = torch.zeros(3, 1, dtype=torch.bool)
+    done, terminated = Collision().compute(running, running, gap)
+    assert terminated.flatten().tolist() == [False, True, True]
+    assert torch.equal(done, terminated)
 
 
 def test_a_start_for_every_role_and_room_on_the_ring() -> None:
