@@ -39,7 +39,7 @@ class Mutant:
 
     Args:
         name: as on the command line.
-        file: where it is made, below the root.
+        file: where it is made, a module of ``lcc_rl/``; the copy shares ``conf/`` with the tree.
         text: what is replaced; occurs exactly once in the file.
         fault: what replaces it.
         breaks: what is wrong then.
@@ -112,6 +112,8 @@ class Copy:
             if (ROOT / name).is_file():
                 (self.tree / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, self.tree / name)
+        # The test of the list would miss there what a fault has replaced.
+        (self.tree / LIST.relative_to(ROOT)).write_text("")
         own = {"PYTHONPATH": str(self.tree), "XDG_CACHE_HOME": str(cache), "OMP_NUM_THREADS": "1"}
         self.environment = {**os.environ, **own}
 

@@ -52,6 +52,15 @@ def test_an_episode_holds_both_vehicles_and_the_gap(tmp_path: Path) -> None:
     )
 
 
+def test_the_gap_ends_at_the_rear_of_the_leader(tmp_path: Path) -> None:
+    # Fronts are 60 ft apart, the leader is 20 ft long, the follower 12 ft: 60 − 20 = 40 ft.
+    rows = pair(v_Length=12.0)
+    for row in rows[20:]:
+        row[8] = "20.0"
+    episodes, _ = extracted(tmp_path, rows)
+    assert episodes["gap_m"].to_numpy() == pytest.approx(40 * FOOT, rel=1e-6)
+
+
 def test_a_new_leader_begins_a_new_episode(tmp_path: Path) -> None:
     rows = pair(range(40)) + [cells(8, k, Local_Y=10.0 * k + 30) for k in range(40)]
     for row in rows[15:40]:
