@@ -28,11 +28,16 @@ NAMES = {  # of strategies, for readers
     "cacc tuned": "CACC, tuned",
     "ddpg": "DDPG",
     "hcfs": "HCFS",
-    "hcfs J=10": "HCFS, J = 10",
     "hcfs literal": "HCFS, literal",
     "hcfs oracle": "HCFS, oracle",
     "hcfs untuned": "HCFS of the fitted CACC",
     "deadbeat": "dead-beat, nothing learned",
+}
+# Columns of :func:`win_rates`, for readers.
+GAINED = {
+    f"{old}{end}": f"{new}{end}"
+    for old, new in {"wins_pct": "HCFS wins_pct", "gain_pct": "HCFS gains_pct"}.items()
+    for end in ("", "_low", "_high")
 }
 RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
@@ -141,32 +146,27 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
         }
         for name in strategies
     ]
-    gained = against.reindex(list(strategies)).reset_index(drop=True)
-    columns = {
-        str(name): str(name).replace("wins", "HCFS wins").replace("gain", "HCFS gains")
-        for name in gained
-        if str(name).startswith(("wins", "gain"))
-    }
-    return pd.concat([pd.DataFrame(rows), gained[list(columns)].rename(columns=columns)], axis=1)
+    gained = against.reindex(list(strategies))[list(GAINED)].rename(columns=GAINED)
+    return pd.concat([pd.DataFrame(rows), gained.reset_index(drop=True)], axis=1)
 
 
 def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
     """Return what HCFS gains on its parents over whole records, with intervals over seeds."""
-    cases = [c for c in map(str, dict.fromkeys(episodes["case"])) if c.startswith(WHOLE)]
-    rows = []
-    for case in cases:
-        table = win_rates(episodes, against=parents, case=case).set_index("against")
-        for name in parents:
-            row: dict[str, object] = {"record": _record(case), "against": NAMES[name]}
-            for end in ("", "_low", "_high"):
-                row[f"HCFS gains_pct{end}"] = table.at[name, f"gain_pct{end}"]
-            row["seeds ahead"] = table.at[name, "seeds_ahead"]
-            rows.append(row)
-    return pd.DataFrame(rows)
+    return pd.DataFrame(
+        [
+            {"record": record, "against": NAMES[str(row["against"])]}
+            | {new: row[old] for old, new in GAINED.items() if old.startswith("gain")}
+            | {"seeds ahead": row["seeds_ahead"]}
+            for case, record in _records(episodes).items()
+            for row in win_rates(episodes, against=parents, case=case).to_dict("records")
+        ]
+    )
 
 
-def _record(case: str) -> str:
-    return case.removeprefix(WHOLE).strip().upper()
+def _records(episodes: pd.DataFrame) -> dict[str, str]:
+    """Return the cases that are whole records, and the records' names."""
+    cases = (c for c in map(str, dict.fromkeys(episodes["case"])) if c.startswith(WHOLE))
+    return {case: case.removeprefix(WHOLE).strip().upper() for case in cases}
 
 
 def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]) -> pd.DataFrame:
@@ -192,17 +192,14 @@ def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for episodes, group in rewards_by_length.groupby("training_episodes"):
-        parent = win_rates(group, against=[LEARNED])
+        (parent,) = win_rates(group, against=[LEARNED]).to_dict("records")
         rows.append(
             {
                 "episodes of training": episodes,
-                "trainings": parent["trainings"].iloc[0],
+                "trainings": parent["trainings"],
                 **intervals.crossed(rewards(group, LEARNED, WINDOWS)).columns("DDPG"),
                 **intervals.crossed(rewards(group, "hcfs", WINDOWS)).columns("HCFS"),
-                **{
-                    column.replace("gain", "HCFS gains"): parent[column].iloc[0]
-                    for column in ("gain_pct", "gain_pct_low", "gain_pct_high")
-                },
+                **{new: parent[old] for old, new in GAINED.items() if old.startswith("gain")},
             }
         )
     return pd.DataFrame(rows)
@@ -211,14 +208,14 @@ def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
 def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataFrame:
     """Return reward, with the least and most of the seeds, and safety over whole records."""
     rows = []
-    for case in (c for c in dict.fromkeys(episodes["case"]) if str(c).startswith(WHOLE)):
+    for case, record in _records(episodes).items():
         for name in strategies:
             runs = episodes[(episodes["case"] == case) & (episodes["strategy"] == name)]
             many = len(runs) > 1
             if len(runs):
                 rows.append(
                     {
-                        "record": _record(str(case)),
+                        "record": record,
                         "strategy": NAMES[name],
                         "Σ reward": runs["reward"].mean(),
                         "Σ reward_low": runs["reward"].min() if many else np.nan,
