@@ -1,0 +1,51 @@
+"""What is kept behind a page: sums per window and means per window and driver, by hand."""
+
+from __future__ import annotations
+
+import keep
+import pandas as pd
+from study_frames import episodes
+
+from lcc_rl.io.files import write_parquet
+
+
+def test_the_length_of_the_training_stands_beside_the_windows(tmp_path) -> None:
+    for number in (400, 800):
+        rows = pd.DataFrame(
+            {
+                "strategy": ["ddpg", "ddpg", "hcfs", "deadbeat", "ddpg"],
+                "training_seed": pd.Series([0, 0, 0, None, 0], dtype="Int64"),
+                "case": ["windows"] * 4 + ["case 1"],
+                "profile": ["a", "a", "a", "a", "x"],
+                "reward": [-1.0, -2.0, -number / 800, -9.0, -9.0],
+            }
+        )
+        write_parquet(rows, tmp_path / str(number) / "episodes.parquet")
+        table = pd.DataFrame({"episodes": [40, number]})
+        write_parquet(table, tmp_path / str(number) / "training.parquet")
+    words = ["lengths", *(str(tmp_path / name) for name in ("400", "800"))]
+    assert keep.main([*words, "--out", str(tmp_path / "lengths.parquet")]) == 0
+    kept = pd.read_parquet(tmp_path / "lengths.parquet")
+    found = kept.set_index(["training_episodes", "strategy"])["reward"].to_dict()
+    assert found == {
+        (400, "ddpg"): -3.0,
+        (400, "hcfs"): -0.5,
+        (800, "ddpg"): -3.0,
+        (800, "hcfs"): -1.0,
+    }
+
+
+def test_means_per_window_and_per_driver(tmp_path) -> None:
+    rows = episodes(drivers=3, profiles=2)
+    write_parquet(rows.assign(min_gap_m=rows["driver_id"] + 1.0), tmp_path / "episodes.parquet")
+    assert keep.main(["means", str(tmp_path), "--out", str(tmp_path / "kept")]) == 0
+    windows, drivers = (
+        pd.read_parquet(tmp_path / "kept" / f"{name}.parquet") for name in ("windows", "drivers")
+    )
+    own = windows[(windows["strategy"] == "reference") & (windows["training_seed"] == 1)]
+    # A human of 50 kJ, 2 more for each driver's number, 10 more on the second profile.
+    assert own["hdv_energy_kj"].tolist() == [52.0, 62.0]
+    assert own["min_gap_m"].tolist() == [1.0, 1.0]  # the least of the drivers, not their mean
+    own = drivers[(drivers["strategy"] == "reference") & (drivers["training_seed"] == 1)]
+    assert own["hdv_energy_kj"].tolist() == [55.0, 57.0, 59.0]
+    assert own["cav_energy_kj"].tolist() == [90.0] * 3
