@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 import torch
 from omegaconf import OmegaConf
+from sumo_ring import write_network
 from torch import Tensor
 
 from lcc_rl.config import build
@@ -28,7 +29,6 @@ from lcc_rl.data.profiles import resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.energy import CirclesFuel, EnergyModel
 from lcc_rl.interfaces.sumo import load_sumo
-from lcc_rl.interfaces.sumo_ring import write_network
 from lcc_rl.io.files import write_parquet
 from lcc_rl.runs.cli import main_guard
 

@@ -1,6 +1,8 @@
 """The task ``ring-22`` in SUMO: human drivers by SUMO's IDM, one vehicle by a policy or rule.
 
-lcc-rl sumo pretrained/ring-22 --from-s 300
+    python tools/sumo_ring.py pretrained/ring-22 --from-s 300
+
+The first vehicle alone may be automated, and all humans are the driver of ``drivers=fixed``.
 """
 
 from __future__ import annotations
@@ -16,18 +18,17 @@ import numpy as np
 import pandas as pd
 from omegaconf import DictConfig
 
-from lcc_rl.config import load, require
-from lcc_rl.errors import ConfigError, require_in, require_whole
-from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
-from lcc_rl.targets import TARGET
+from lcc_rl.runs.cli import main_guard
 
 HUMAN, FIRST = "human", "car0"
-FIXED = "lcc_rl.drivers.population.fixed"
 LAST_S, CALM = 60.0, 0.5  # final speeds are of [s]; spread of the speeds without a wave [m/s]
 SPEED_LIMIT, CORNERS, AROUND = 40.0, 32, 10_000  # of the road [m/s]; of a half; rounds of a route
 HALVES = {"east": ("south", "north", -0.5), "west": ("north", "south", 0.5)}
@@ -168,42 +169,19 @@ def measured(rows: pd.DataFrame, from_s: float) -> dict[str, float]:
     }
 
 
-def _check(cfg: DictConfig) -> None:
-    """Check that a configuration is of a ring that this module can write."""
-    roles = parse_string(cfg.scenario.string, cfg.scenario.road).roles
-    first = isinstance(cfg.scenario.string, str) and roles[0] == AUTOMATED
-    if cfg.scenario.road != RING or not first or roles.count(AUTOMATED) != 1:
-        raise ConfigError(
-            "lcc-rl sumo needs a ring whose first vehicle alone is automated, got scenario.road="
-            f"{cfg.scenario.road} and scenario.string={cfg.scenario.string}"
-        )
-    least = len(roles) * cfg.scenario.vehicle_length
-    require_in("scenario", f"({least}, 100000]", circumference=cfg.scenario.circumference)
-    if cfg.drivers[TARGET] != FIXED:
-        raise ConfigError(f"lcc-rl sumo needs drivers=fixed, got {cfg.drivers[TARGET]}")
-
-
 def main(words: Sequence[str] | None = None) -> int:
-    """Simulate the ring without and with a policy; write trajectories and figure."""
+    """Simulate the ring without and with a policy; write trajectories and a figure."""
     parser = argparse.ArgumentParser(description="The ring road of task=ring-22 in SUMO.")
     parser.add_argument("driver", help="run folder, policy.pt, pretrained/<name> or a rule")
-    parser.add_argument("overrides", nargs="*", help="settings: scenario.circumference=230")
-    parser.add_argument(
-        "--from-s", type=float, default=300.0, help="it drives from then on [s], 300"
-    )
-    parser.add_argument("--seconds", type=float, default=600.0, help="how long in all [s], 600")
-    parser.add_argument("--seed", type=int, default=0, help="of the humans' noise, 0")
+    parser.add_argument("overrides", nargs="*", help="settings, as scenario.circumference=230")
+    parser.add_argument("--from-s", type=float, default=300.0, help="start of its driving [s], 300")
+    parser.add_argument("--seconds", type=float, default=600.0, help="duration [s], 600")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the humans' noise, 0")
     parser.add_argument("--folder", type=Path, default=Path("outputs/sumo"))
     options = parser.parse_intermixed_args(words)
-    require_in("lcc-rl sumo", "[0, inf)", from_s=options.from_s)
-    require_in("lcc-rl sumo", "(0, 36000]", seconds=options.seconds)
-    require(
-        options.seconds > options.from_s,
-        f"--seconds={options.seconds:g} ends before --from-s={options.from_s:g}, when it drives",
-    )
-    require_whole("", 0, seed=options.seed)
+    if options.seconds <= options.from_s:
+        raise ConfigError(f"--seconds={options.seconds:g} must exceed --from-s={options.from_s:g}")
     cfg = load("evaluate", ["variant=alcc", "task=ring-22", *options.overrides])
-    _check(cfg)
     options.folder.mkdir(parents=True, exist_ok=True)
     fixed = (options.folder, options.seconds, options.from_s, options.seed)
     parts = [simulate(cfg, driver, *fixed) for driver in (None, options.driver)]
@@ -213,9 +191,11 @@ def main(words: Sequence[str] | None = None) -> int:
     assert figure is not None
     figure.axes[1].axvline(options.from_s, color="black", linestyle=":", linewidth=1.0)
     save(figure, options.folder / "space_time.png", dpi=100)
-    table = pd.DataFrame(
-        [measured(part, options.from_s) for part in parts], [HUMAN, options.driver]
-    )
-    print(table.round(2).to_string())
+    rows = [measured(part, options.from_s) for part in parts]
+    print(pd.DataFrame(rows, [HUMAN, options.driver]).round(2).to_string())
     print(f"{options.folder}: steps.parquet, space_time.png, ring.net.xml, ring.rou.xml")
     return 0
+
+
+if __name__ == "__main__":
+    main_guard(main)()
