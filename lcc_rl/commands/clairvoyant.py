@@ -34,8 +34,7 @@ from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
-from lcc_rl.evaluation.naming import check_distinct
-from lcc_rl.evaluation.strategies import Strategy, baseline, trained
+from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, trained
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.policies import load_policy

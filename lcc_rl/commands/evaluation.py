@@ -20,10 +20,12 @@ from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
-from lcc_rl.evaluation.naming import POLICY, check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
+    POLICY,
     Strategy,
     baselines,
+    check_distinct,
+    named_apart,
     no_policy,
     rules,
     studied,

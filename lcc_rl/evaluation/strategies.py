@@ -1,12 +1,14 @@
-"""Strategies: what drives the automated vehicles of a string in an evaluation.
+"""Strategies: policies and rules that drive the automated vehicles of an evaluation.
 
 All strategies of an evaluation share the scenario under study: its drivers, energy model, noise
-and pieces. A strategy differs in who drives the automated vehicles and what that one observes.
+and pieces. They differ in the controller of the automated vehicles and in its observation.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -30,23 +32,22 @@ from lcc_rl.targets import TARGET
 
 log = logging.getLogger("lcc_rl")
 
-# Pieces that belong to what a policy observes, not to the traffic.
-KNOWLEDGE = ("memory", "preview")
-GAINS = ("path", "paper_like", "tuned")
+POLICY = "policy.pt"
+KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
 PLACE = "controller@scenario.controllers.automated"
-# Cruise controls whose constants were tuned, also behind the safety filter: they keep it.
+# Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
 TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
 FILTERED = "_filtered"
-# Baselines by name: the controller of the automated vehicles, by what makes it.
+# Settings that make the controller of each baseline.
 BASELINES = {
     "idm": ("variant=idm",),
-    "human": ("variant=idm", *(f"{AUTO}.{x}=null" for x in ("desired_speed", "time_gap"))),
+    "human": ("variant=idm", f"{AUTO}.desired_speed=null", f"{AUTO}.time_gap=null"),
     **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
-    **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
+    **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
     "deadbeat": ("variant=deadbeat",),
-    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
+    "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
 }
-DIRECT = "direct"
+DIRECT = "direct"  # a string without automated vehicles
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
@@ -54,13 +55,13 @@ TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
 
 @dataclass(frozen=True)
 class Strategy:
-    """A way to drive the automated vehicles.
+    """A controller of the automated vehicles, and its environment.
 
     Args:
-        name: how tables call it.
+        name: name in tables.
         cfg: configuration of its environment.
-        policy: writes ``("automated", "action")``, deterministic; None where a rule drives.
-        seed: training seed, for the tables; None where nothing was learned.
+        policy: deterministic, writes ``("automated", "action")``; None for a rule.
+        seed: training seed; None for a rule.
         source: file or folder that the policy was read from.
     """
 
@@ -72,7 +73,7 @@ class Strategy:
 
     @property
     def title(self) -> str:
-        """How messages call it."""
+        """Name in messages."""
         return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
 
 
@@ -96,17 +97,13 @@ def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
 
 
 def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
-    """Build the baselines that an evaluation names, and further ones, in the scenario under study.
-
-    Raises:
-        ConfigError: if there is none of a name.
-    """
+    """Build the baselines that an evaluation names, and further ones."""
     names = [*cfg.evaluation.baselines, *further]
     return [baseline(cfg, name) for name in dict.fromkeys(names) if applies(cfg, name)]
 
 
 def applies(cfg: DictConfig, name: str) -> bool:
-    """Whether a baseline means anything for a string: there must be somebody to drive."""
+    """Return whether a string has the vehicles that a baseline drives."""
     roles = set(string_of(cfg).names)
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
@@ -114,15 +111,15 @@ def applies(cfg: DictConfig, name: str) -> bool:
 
 
 def baseline(cfg: DictConfig, name: str) -> Strategy:
-    """Build a baseline in the scenario under study; its own settings where it is the one studied.
+    """Build a baseline in the scenario under study, with the settings of the variant under study.
 
     Raises:
-        ConfigError: if there is none of that name, or no filter for constants tuned behind it.
+        ConfigError: if the name is unknown, or needs the safety filter and there is none.
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
     behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
-    require(behind or not named, f"{name} drives behind the safety filter: say +filter=cbf")
+    require(behind or not named, f"{name} drives behind the safety filter: add +filter=cbf")
     controller = baseline_controller(name, suffix := FILTERED * (behind and name in TUNED))
     if named or suffix:
         return Strategy(name, driven_by(cfg, controller))
@@ -131,20 +128,24 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
-@cache  # looked up for every name
+@cache
 def rules() -> tuple[str, ...]:
-    """Return the names of all baselines and of the files of conf/controller, no name twice."""
+    """Return the names of all baselines and of the files of conf/controller."""
     shipped = Path(str(files("lcc_rl.conf"))) / "controller"
     found = sorted(path.stem for path in shipped.glob("*.yaml") if path.stem not in NEEDY)
     return tuple(dict.fromkeys([DIRECT, *BASELINES, *found]))
 
 
-@cache  # composed once: an evaluation asks for each several times
+@cache
 def baseline_controller(name: str, suffix: str = "") -> Any:
-    """Return the node of a baseline's controller, of a tuned one also behind the filter.
+    """Return the node of a baseline's controller.
+
+    Args:
+        name: name of the baseline.
+        suffix: ``"_filtered"`` for the constants of a tuned one behind the safety filter.
 
     Raises:
-        ConfigError: if there is none of that name.
+        ConfigError: if the name is unknown.
     """
     if name not in rules():
         raise unknown_name("baseline", name, rules())
@@ -168,15 +169,15 @@ def without_automated(cfg: DictConfig) -> DictConfig:
 
 
 def rule(cfg: DictConfig) -> Strategy:
-    """Return the strategy of a configuration that learns nothing, named after its variant.
+    """Return the strategy of a configuration that learns nothing.
 
-    After the controller where that is another, and ``direct`` where nobody is automated.
+    Its name is that of the variant, or of the controller's class where that is not the variant's.
     """
     if not string_of(cfg).count(AUTOMATED):
         return Strategy(DIRECT, cfg)
     try:
         own = _target(load("evaluate", [f"variant={cfg.variant}"]))
-    except ConfigError:  # a variant of the user's own, known to this command line only
+    except ConfigError:  # a variant of the user's own that only this command line knows
         own = _target(cfg)
     name = cfg.variant if _target(cfg) == own else short_name(_target(cfg))
     return Strategy(name, deployed(cfg))
@@ -206,7 +207,7 @@ def no_policy(cfg: DictConfig) -> ConfigError:
 def studied(
     cfg: DictConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
-    """Build what the configuration asks for; of a hybrid, its parents and its oracle, too.
+    """Build the strategy under study; of a hybrid, its parents and its oracle, too.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.
@@ -214,7 +215,7 @@ def studied(
         population: the human drivers.
 
     Raises:
-        ConfigError: if it needs a policy and none is given, or the policy does not fit.
+        ConfigError: if the variant needs a policy that is not given, or the policy does not fit.
     """
     if not learns(cfg):
         strategy = rule(cfg)
@@ -226,13 +227,19 @@ def studied(
         raise no_policy(cfg)
     weights, own_cfg = policy
     check_policy(cfg, own_cfg)
-    cfg = _copy(cfg)
-    cfg.agent = own_cfg.agent
-    if cfg.scenario.filters.get(AUTOMATED) is None and own_cfg.scenario.filters.get(AUTOMATED):
-        log.info("policy=%s was trained with a filter and keeps it", cfg.policy)
-        cfg.scenario.filters.automated = own_cfg.scenario.filters.automated
+    cfg = _of_training(cfg, own_cfg)
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
+
+
+def _of_training(cfg: DictConfig, own: DictConfig) -> DictConfig:
+    """Return the scenario under study with the agent, and where it has none the filter, of own."""
+    cfg = _copy(cfg)
+    cfg.agent = own.agent
+    if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
+        log.info("the policy of variant %s keeps the filter of its training", own.variant)
+        cfg.scenario.filters.automated = own.scenario.filters.automated
+    return cfg
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
@@ -260,17 +267,14 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
         population: the human drivers.
 
     Raises:
-        ConfigError, ResultsError: if the policy does not fit the scenario or its own network.
+        LccError: if the policy does not fit the scenario or its own network.
     """
     weights, own = policy
-    other = _copy(cfg)
     check_scenario(path, own, cfg)
-    for key in ("variant", "agent", "observation"):
-        other[key] = own[key]
+    other = _of_training(cfg, own)
+    other.variant, other.observation = own.variant, own.observation
     other.deployed = own.get("deployed")
     other.scenario.controllers.automated = own.scenario.controllers.automated
-    if other.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
-        other.scenario.filters.automated = own.scenario.filters.automated
     for name, node in own.scenario.pieces.items():
         if name in KNOWLEDGE or name not in other.scenario.pieces:
             other.scenario.pieces[name] = node
@@ -298,3 +302,53 @@ def with_weights(
         words = f"the weights do not fit the policy network: {' '.join(str(error).split())}"
         raise ResultsError(f"{path}: {words}") from error
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)
+
+
+def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Return strategies whose names differ wherever their training differs by more than the seed.
+
+    A variant that several kinds of agents learned gets the agent's name; one whose settings differ
+    otherwise gets the name of the file or folder that its policy comes from.
+    """
+    kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
+    found = _where_several(strategies, kinds, kinds)
+    return _where_several(found, [_settings(one) for one in found], [_place(one) for one in found])
+
+
+def _where_several(
+    strategies: Sequence[Strategy], marks: Sequence[str], labels: Sequence[str]
+) -> list[Strategy]:
+    different = Counter(
+        name for name, _ in {(s.name, m) for s, m in zip(strategies, marks, strict=True)}
+    )
+    return [
+        replace(one, name=f"{one.name} {label}") if different[one.name] > 1 else one
+        for one, label in zip(strategies, labels, strict=True)
+    ]
+
+
+def _settings(strategy: Strategy) -> str:
+    if strategy.policy is None:
+        return ""
+    cfg = strategy.cfg
+    return json.dumps([plain(cfg.agent), plain(cfg.scenario.filters)], sort_keys=True)
+
+
+def _place(strategy: Strategy) -> str:
+    path = Path(strategy.source)
+    return path.parent.name if path.name == POLICY else path.name.removesuffix(".pt")
+
+
+def check_distinct(strategies: Sequence[Strategy]) -> None:
+    """Refuse two policies of one name and seed.
+
+    Raises:
+        ConfigError: naming the variant and the seed.
+    """
+    counts = Counter((strategy.name, strategy.seed) for strategy in strategies)
+    for name, seed in (key for key, count in counts.items() if count > 1):
+        which = name if seed is None else f"{name} with training seed {seed}"
+        raise ConfigError(
+            f"policy and compare name two policies of variant {which}, whose rows could not be "
+            "distinguished; evaluate them one after the other"
+        )
