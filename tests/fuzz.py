@@ -48,7 +48,7 @@ DATA = ("data.platoons=2", "data.recordings=2")
 RECIPES = (
     *("+filter=cbf", "+knowledge=memory", "+knowledge=preview", "scenario=ring agent=none"),
     *("agent=td3", "agent=sac", "agent=analytic", "agent=none", "drivers=fixed", "drivers=kde"),
-    *("split=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
+    *("split.by=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
     *("scenario.string=automated*2", "scenario.string={size:6,penetration:0.3}"),
     "controller@scenario.controllers.automated=handover",
 )

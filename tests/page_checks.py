@@ -53,7 +53,8 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
     elif program.endswith("python"):
         assert (ROOT / rest[0]).exists(), rest[0]
         settings = parsed(rest[0], rest[1:])
-        once("train", (*ALWAYS.get(rest[0], ()), *settings))
+        typed = (word for word in settings if "=" in word)
+        once("train", (*ALWAYS.get(rest[0], ()), *typed))
     elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:
         composed(ENTRIES.get(rest[0], rest[0]), rest[1:], own, fails)
     elif program == "lcc-rl":

@@ -188,10 +188,10 @@ def test_an_option_of_a_former_release_names_todays_in_one_line(item, new) -> No
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["variant=cacc", "data=ngsim", "data.path=x", "split=vehicle"], "drives the records"),
-        (["variant=cacc", "split=vehicle"], "leader=trajectories"),
+        (["variant=cacc", "data=ngsim", "data.path=x", "split.by=vehicle"], "drives the records"),
+        (["variant=cacc", "split.by=vehicle"], "leader=trajectories"),
         (["variant=cacc", "drivers=kde"], "there is no human driver"),
-        (["scenario=ring", "agent=none", "split=vehicle"], "a ring road has no leader"),
+        (["scenario=ring", "agent=none", "split.by=vehicle"], "a ring road has no leader"),
         (["scenario.circumference=200"], "belongs to scenario.road=ring"),
         (["variant=idm", "training.episodes=20"], "variant idm learns nothing"),
         (["variant=direct", f"{AUTO}.max_acceleration=2"], "no vehicle of the string is automated"),

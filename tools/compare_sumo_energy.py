@@ -36,7 +36,7 @@ STEP, AROUND, SPACE = 0.1, 80_000.0, 20.0  # [s]; of a ring without bends to spe
 CYCLES = ("udds", "hwfet", "us06")
 MOMENTS = {"standing": torch.zeros(101), "to 15 m/s": torch.linspace(0.0, 15.0, 101)}
 ROOT = Path(__file__).resolve().parents[1]
-FUEL = ("compact", "midsize")
+FUEL = {"compact": "Compact", "midsize": "midBase"}
 ELECTRIC = ("electric", "bolt")
 UNLIMITED = {"regeneration_limit": 1e9, "fade_speed": 1e-6}
 CLASSES = {  # of SUMO, emission classes of cars by name
@@ -55,7 +55,9 @@ def settings(name: str) -> dict[str, Any]:
 
 def own_models() -> dict[str, EnergyModel]:
     """Return our models, the electric ones also without the limits of recuperation."""
-    models = {name: build(settings(name), name) for name in (*FUEL, *ELECTRIC)}
+    fuel = settings("fuel")
+    models = {name: build(fuel | {"vehicle": kind}, name) for name, kind in FUEL.items()}
+    models |= {name: build(settings(name), name) for name in ELECTRIC}
     for name in ELECTRIC:
         models[f"{name}, unlimited"] = build(settings(name) | UNLIMITED, name)
     return models

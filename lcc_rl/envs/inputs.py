@@ -51,7 +51,7 @@ class Inputs:
         """
         if not len(self.training):
             raise ConfigError(
-                "no profile is left to train on: split=none, or evaluation_share=1 of split or "
+                "no profile is left to train on: evaluation_share=1 of split or "
                 "leader, is for evaluations of what no training has seen; hold out less"
             )
         return self.training

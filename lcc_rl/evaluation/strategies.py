@@ -44,6 +44,8 @@ BASELINES = {
     "human": ("variant=idm", f"{AUTO}.desired_speed=null", f"{AUTO}.time_gap=null"),
     **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
     **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
+    # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
+    "mpc_far": ("variant=idm", f"{AUTO}.longest_gap=-4.0", f"{PLACE}=mpc"),
     "deadbeat": ("variant=deadbeat",),
     "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
 }

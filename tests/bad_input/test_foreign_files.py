@@ -91,7 +91,7 @@ def test_places_within_other_nodes_and_of_loggers_are_left_out(run) -> None:
 
 
 def test_a_resumed_run_may_be_given_a_logger_and_nothing_else(run) -> None:
-    words = (f"resume={run}", "logger=tensorboard", "logger.kind=typo")
+    words = (f"resume={run}", "logger=rows", "logger.kind=typo")
     done = run_command("lcc_rl.train", *words, cwd=run.parent)
     assert "logger.kind must be one of" in done.stderr
     done = run_command("lcc_rl.train", f"resume={run}", "seed=3", cwd=run.parent)

@@ -142,7 +142,7 @@ def test_a_pipeline_splits_the_data_before_it_calibrates(tmp_path) -> None:
     done = run_command("lcc_rl.pipeline", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert "by recording: only" in done.stderr
-    assert "say split=vehicle" in done.stderr
+    assert "say split.by=vehicle" in done.stderr
     assert not (tmp_path / "job" / "calibration").exists()
 
 

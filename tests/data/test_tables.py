@@ -67,7 +67,7 @@ def test_the_leader_is_named_or_the_next_on_the_lane(tmp_path, name, columns) ->
 def test_all_from_the_command_line(tmp_path) -> None:
     path = written(tmp_path, long_table())
     columns = "{vehicle: id, time: t, speed: v, leader: ahead, gap: gap, position: x}"
-    said = ["variant=alcc", "split=vehicle", "data=table", f"data.path={path}"]
+    said = ["variant=alcc", "split.by=vehicle", "data=table", f"data.path={path}"]
     inputs = load_inputs(load("train", [*said, f"data.columns={columns}"]))
     assert (len(inputs.training), len(inputs.evaluation)) == (1, 1)
 

@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_the_same_command_gets_the_same_folder() -> None:
     one = sweep_name(None, ["seed=0,1", "variant=alcc"])
-    assert one == sweep_name(None, ["variant=alcc", "seed=0,1", "logger=wandb"])
+    assert one == sweep_name(None, ["variant=alcc", "seed=0,1", "logger=rows"])
     assert one != sweep_name(None, ["variant=alcc", "seed=0,1,2"])
     assert sweep_name("mine", ["seed=0,1"]) == "mine"
 
@@ -84,7 +84,7 @@ def test_plans_know_grids_and_searches(tmp_path) -> None:
     cfg.hydra.overrides.task = ["seed=range(8)", "variant=alcc,reference", "agent.gamma=0.9"]
     assert make_plan(cfg) == Plan(16, ["seed", "variant"])
     # Where its rows are sent to does not make another run.
-    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,tensorboard"]
+    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,rows"]
     assert make_plan(cfg) == Plan(8, ["seed"])
     cfg.hydra.sweeper = {"n_trials": 40, "params": {"agent.tau": "interval(0.001,0.01)"}}
     cfg.hydra.overrides.task = []
