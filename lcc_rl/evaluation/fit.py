@@ -5,30 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
-from lcc_rl.config import plain
-from lcc_rl.config_checks import AUTO
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.runs import differing, flatten
+from lcc_rl.schemas import AUTO, StudyConfig
 
 
-def check_policy(cfg: DictConfig, own: DictConfig) -> None:
+def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
     """Check that a policy was trained for the variant and the observation under study.
 
     Raises:
         ConfigError: naming what differs.
     """
-    hybrid = cfg.deployed is not None or own.get("deployed") is not None
+    hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
         raise ConfigError(
             f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
             f"say variant={own.variant}"
         )
-    trained_with, observed = (
-        dict(flatten(plain(node))) for node in (own.observation, cfg.observation)
-    )
+    trained_with, observed = (dict(flatten(node)) for node in (own.observation, cfg.observation))
     changes = [
         f"observation.{key}: {trained_with.get(key)}, got {observed.get(key)}"
         for key in differing(trained_with, observed)
@@ -56,7 +53,7 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
         )
 
 
-def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
+def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that a policy to compare with was trained in the scenario under study.
 
     Raises:
@@ -69,7 +66,7 @@ def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
         )
 
 
-def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
+def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that an action means what it did in training: how much, and for how long.
 
     Args:
@@ -82,7 +79,7 @@ def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
     """
     trained_with, asked = (
         {"scenario.time_step": node.scenario.time_step}
-        | dict(flatten({AUTO: plain(node.scenario.controllers.automated)}))
+        | dict(flatten({AUTO: node.scenario.controllers[AUTOMATED]}))
         for node in (own, cfg)
     )
     changes = [

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lcc_rl.config import plain, short_name
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import Strategy
-from lcc_rl.targets import TARGET
+from lcc_rl.nodes import TARGET, short_name
 
 POLICY = "policy.pt"
 
@@ -45,7 +44,7 @@ def _settings(strategy: Strategy) -> str:
     if strategy.policy is None:
         return ""
     cfg = strategy.cfg
-    return json.dumps([plain(cfg.agent), plain(cfg.scenario.filters)], sort_keys=True)
+    return json.dumps([cfg.agent, cfg.scenario.filters], sort_keys=True)
 
 
 def _place(strategy: Strategy) -> str:

@@ -8,32 +8,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import load, plain, require, short_name
-from lcc_rl.config_checks import AUTO
+from lcc_rl.config import load
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.nodes import TARGET, short_name
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.policies import shared_policy
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import AUTO, StudyConfig
 
 log = logging.getLogger("lcc_rl")
 
 # Pieces that belong to what a policy observes, not to the traffic.
 KNOWLEDGE = ("memory", "preview")
 GAINS = ("path", "paper_like", "tuned")
-PLACE = "controller@scenario.controllers.automated"
+PLACE = "controller@scenario.controllers[AUTOMATED]"
 # Cruise controls whose constants were tuned, also behind the safety filter: they keep it.
 TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
 FILTERED = "_filtered"
@@ -44,12 +43,12 @@ BASELINES = {
     **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
     **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
     "deadbeat": ("variant=deadbeat",),
-    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
+    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers[AUTOMATED].lookahead=oracle"),
 }
 DIRECT = "direct"
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
-TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
+TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Strategy:
     """
 
     name: str
-    cfg: DictConfig
+    cfg: StudyConfig
     policy: Policy | None = None
     seed: int | None = None
     source: str = ""
@@ -76,26 +75,20 @@ class Strategy:
         return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
 
 
-def _copy(cfg: DictConfig) -> DictConfig:
-    cfg = cfg.copy()
-    OmegaConf.set_struct(cfg, False)
-    return cfg
-
-
-def deployed(cfg: DictConfig) -> DictConfig:
+def deployed(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration in which the automated vehicles drive as after training."""
-    return cfg if cfg.get("deployed") is None else driven_by(cfg, cfg.deployed)
+    return cfg if cfg.deployed is None else driven_by(cfg, cfg.deployed)
 
 
-def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
+def driven_by(cfg: StudyConfig, controller: Any) -> StudyConfig:
     """Return a configuration in which another controller drives the automated vehicles."""
-    cfg = _copy(cfg)
-    cfg.scenario.controllers.automated = controller
+    cfg = deepcopy(cfg)
+    cfg.scenario.controllers[AUTOMATED] = controller
     cfg.deployed = None
     return cfg
 
 
-def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
+def baselines(cfg: StudyConfig, further: Sequence[str] = ()) -> list[Strategy]:
     """Build the baselines that an evaluation names, and further ones, in the scenario under study.
 
     Raises:
@@ -105,7 +98,7 @@ def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
     return [baseline(cfg, name) for name in dict.fromkeys(names) if applies(cfg, name)]
 
 
-def applies(cfg: DictConfig, name: str) -> bool:
+def applies(cfg: StudyConfig, name: str) -> bool:
     """Whether a baseline means anything for a string: there must be somebody to drive."""
     roles = set(string_of(cfg).names)
     if name == DIRECT:
@@ -113,7 +106,7 @@ def applies(cfg: DictConfig, name: str) -> bool:
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
-def baseline(cfg: DictConfig, name: str) -> Strategy:
+def baseline(cfg: StudyConfig, name: str) -> Strategy:
     """Build a baseline in the scenario under study; its own settings where it is the one studied.
 
     Raises:
@@ -149,17 +142,17 @@ def baseline_controller(name: str, suffix: str = "") -> Any:
     if name not in rules():
         raise unknown_name("baseline", name, rules())
     *first, last = BASELINES.get(name, ("variant=idm", f"{PLACE}={name}"))
-    return plain(load("evaluate", [*first, last + suffix]).scenario.controllers.automated)
+    return load("evaluate", [*first, last + suffix]).scenario.controllers[AUTOMATED]
 
 
-def without_filter(cfg: DictConfig) -> DictConfig:
+def without_filter(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration without a safety filter of the automated vehicles."""
-    cfg = _copy(cfg)
+    cfg = deepcopy(cfg)
     cfg.scenario.filters.pop(AUTOMATED, None)
     return cfg
 
 
-def without_automated(cfg: DictConfig) -> DictConfig:
+def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose string lacks the automated vehicles."""
     roles = [role for role in string_of(cfg).roles if role != AUTOMATED]
     cfg = without_filter(cfg)
@@ -167,7 +160,7 @@ def without_automated(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def rule(cfg: DictConfig) -> Strategy:
+def rule(cfg: StudyConfig) -> Strategy:
     """Return the strategy of a configuration that learns nothing, named after its variant.
 
     After the controller where that is another, and ``direct`` where nobody is automated.
@@ -182,20 +175,20 @@ def rule(cfg: DictConfig) -> Strategy:
     return Strategy(name, deployed(cfg))
 
 
-def _target(cfg: DictConfig) -> str:
-    return str(cfg.scenario.controllers.automated.get(TARGET))
+def _target(cfg: StudyConfig) -> str:
+    return str(cfg.scenario.controllers[AUTOMATED].get(TARGET))
 
 
-def _baseline_controllers(cfg: DictConfig) -> list[Any]:
+def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
     """Return the nodes of the controllers of all baselines in which somebody is automated."""
     return [
-        plain(strategy.cfg.scenario.controllers.automated)
+        strategy.cfg.scenario.controllers[AUTOMATED]
         for strategy in baselines(cfg)
         if strategy.name != DIRECT
     ]
 
 
-def no_policy(cfg: DictConfig) -> ConfigError:
+def no_policy(cfg: StudyConfig) -> ConfigError:
     """Return the error for a learned variant without a policy."""
     return ConfigError(
         f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
@@ -204,7 +197,7 @@ def no_policy(cfg: DictConfig) -> ConfigError:
 
 
 def studied(
-    cfg: DictConfig, policy: TrainedPolicy | None, population: Population
+    cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
     """Build what the configuration asks for; of a hybrid, its parents and its oracle, too.
 
@@ -218,7 +211,7 @@ def studied(
     """
     if not learns(cfg):
         strategy = rule(cfg)
-        known = plain(cfg.scenario.controllers.automated) in _baseline_controllers(cfg)
+        known = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
         same = known and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
         named = strategy.name in cfg.evaluation.baselines
         return [] if same or named else [strategy]
@@ -226,11 +219,11 @@ def studied(
         raise no_policy(cfg)
     weights, own_cfg = policy
     check_policy(cfg, own_cfg)
-    cfg = _copy(cfg)
+    cfg = deepcopy(cfg)
     cfg.agent = own_cfg.agent
     if cfg.scenario.filters.get(AUTOMATED) is None and own_cfg.scenario.filters.get(AUTOMATED):
         log.info("policy=%s was trained with a filter and keeps it", cfg.policy)
-        cfg.scenario.filters.automated = own_cfg.scenario.filters.automated
+        cfg.scenario.filters[AUTOMATED] = own_cfg.scenario.filters[AUTOMATED]
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
 
@@ -238,19 +231,19 @@ def studied(
 def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, the parents it is composed of, and its oracle."""
     cfg = strategy.cfg
-    parent = driven_by(cfg, cfg.scenario.controllers.automated)
+    parent = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
     found = [replace(strategy, name=short_name(cfg.agent[TARGET]), cfg=parent)]
-    parent_rule = plain(cfg.deployed).get("rule")
+    parent_rule = cfg.deployed.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
         found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
     if set(string_of(cfg).names) == {AUTOMATED}:
-        knowing = driven_by(cfg, {**plain(cfg.deployed), "lookahead": "oracle"})
+        knowing = driven_by(cfg, {**cfg.deployed, "lookahead": "oracle"})
         found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found
 
 
-def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
+def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
     """Build a trained strategy to compare with, in the scenario under study.
 
     Args:
@@ -263,14 +256,13 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
         ConfigError, ResultsError: if the policy does not fit the scenario or its own network.
     """
     weights, own = policy
-    other = _copy(cfg)
+    other = deepcopy(cfg)
     check_scenario(path, own, cfg)
-    for key in ("variant", "agent", "observation"):
-        other[key] = own[key]
-    other.deployed = own.get("deployed")
-    other.scenario.controllers.automated = own.scenario.controllers.automated
+    for key in ("variant", "agent", "observation", "deployed"):
+        setattr(other, key, getattr(own, key))
+    other.scenario.controllers[AUTOMATED] = own.scenario.controllers[AUTOMATED]
     if other.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
-        other.scenario.filters.automated = own.scenario.filters.automated
+        other.scenario.filters[AUTOMATED] = own.scenario.filters[AUTOMATED]
     for name, node in own.scenario.pieces.items():
         if name in KNOWLEDGE or name not in other.scenario.pieces:
             other.scenario.pieces[name] = node
@@ -280,7 +272,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
 
 
 def with_weights(
-    cfg: DictConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
+    cfg: StudyConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
 ) -> Strategy:
     """Build a strategy and load its policy's weights.
 

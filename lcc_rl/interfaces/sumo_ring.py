@@ -14,17 +14,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig
 
-from lcc_rl.config import load, require
-from lcc_rl.errors import ConfigError, require_in, require_whole
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError, require, require_in, require_whole
 from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
+from lcc_rl.nodes import TARGET
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import StudyConfig
 
 HUMAN, FIRST = "human", "car0"
 FIXED = "lcc_rl.drivers.population.fixed"
@@ -58,14 +58,18 @@ def write_network(path: Path, circumference: float) -> None:
     _write(root, path)
 
 
-def write_vehicles(path: Path, cfg: DictConfig) -> None:
+def write_vehicles(path: Path, cfg: StudyConfig) -> None:
     """Write the vehicles, evenly spread; each follows the one of the number before."""
     scenario, driver = cfg.scenario, cfg.drivers
-    around, count = float(scenario.circumference), len(parse_string(scenario.string).roles)
+    around, count = float(scenario.circumference or 0.0), len(parse_string(scenario.string).roles)
     root = ElementTree.Element("routes")
-    of_type = {"carFollowModel": "IDM", "length": scenario.vehicle_length, "tau": driver.time_gap}
-    of_type |= {"accel": driver.acceleration, "decel": driver.deceleration}
-    of_type |= {"minGap": driver.min_gap, "maxSpeed": driver.desired_speed}
+    of_type = {
+        "carFollowModel": "IDM",
+        "length": scenario.vehicle_length,
+        "tau": driver["time_gap"],
+    }
+    of_type |= {"accel": driver["acceleration"], "decel": driver["deceleration"]}
+    of_type |= {"minGap": driver["min_gap"], "maxSpeed": driver["desired_speed"]}
     fixed = {"id": HUMAN, "speedFactor": "1", "speedDev": "0"}
     text = {key: str(value) for key, value in of_type.items()}
     ElementTree.SubElement(root, "vType", fixed | text)
@@ -87,7 +91,7 @@ def _write(root: ElementTree.Element, path: Path) -> None:
 
 
 def simulate(
-    cfg: DictConfig, driver: str | None, folder: Path, seconds: float, from_s: float, seed: int
+    cfg: StudyConfig, driver: str | None, folder: Path, seconds: float, from_s: float, seed: int
 ) -> pd.DataFrame:
     """Simulate the ring in SUMO.
 
@@ -103,7 +107,7 @@ def simulate(
         Rows as in steps.parquet, and the number of vehicles in collisions at each step.
     """
     sumo, step = load_sumo(), float(cfg.scenario.time_step)
-    write_network(folder / "ring.net.xml", float(cfg.scenario.circumference))
+    write_network(folder / "ring.net.xml", float(cfg.scenario.circumference or 0.0))
     write_vehicles(folder / "ring.rou.xml", cfg)
     words = ["sumo", "-n", f"{folder}/ring.net.xml", "-r", f"{folder}/ring.rou.xml"]
     words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-step-log"]
@@ -119,7 +123,7 @@ def simulate(
                 bridge.command(drives)
             rows.append({"time_s": number * step, **_row(sumo, driver is not None)})
             sumo.simulationStep()
-            _disturb(sumo, noise, float(cfg.scenario.controllers.human.wiener), step, drives)
+            _disturb(sumo, noise, float(cfg.scenario.controllers[HUMAN]["wiener"]), step, drives)
     finally:
         sumo.close()
     return pd.DataFrame(rows).assign(
@@ -168,7 +172,7 @@ def measured(rows: pd.DataFrame, from_s: float) -> dict[str, float]:
     }
 
 
-def _check(cfg: DictConfig) -> None:
+def _check(cfg: StudyConfig) -> None:
     """Check that a configuration is of a ring that this module can write."""
     roles = parse_string(cfg.scenario.string, cfg.scenario.road).roles
     first = isinstance(cfg.scenario.string, str) and roles[0] == AUTOMATED

@@ -6,10 +6,9 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.targets import TARGET, find_target, forget_places, settings_at
+from lcc_rl.nodes import TARGET, find_target, forget_places, settings_at
+from lcc_rl.schemas import parse_config
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
 ROOMS = "agents data drivers energy evaluation functional pieces policies runs.loggers synthetic"
@@ -19,7 +18,7 @@ FUNCTIONS = "lcc_rl.drivers.population"
 
 def trusted(
     content: dict[str, Any], where: str, trust: Sequence[str] = ()
-) -> tuple[DictConfig, list[str]]:
+) -> tuple[Any, list[str]]:
     """Return a stored configuration that can be built without harm.
 
     Args:
@@ -39,13 +38,9 @@ def trusted(
     if "trust" in content:
         content["trust"] = list(trust)
     try:
-        cfg = OmegaConf.create(content)
-    except Exception as error:  # OmegaConf raises many kinds
-        raise ResultsError(f"{where}: damaged: {error}") from error
-    for key, kind in (("variant", str), ("scenario", Mapping), ("evaluation", Mapping)):
-        if not isinstance(content.get(key), kind):
-            raise ResultsError(f"{where}: not the configuration of a run: {key} is missing")
-    return cfg, places
+        return parse_config(content), places
+    except ConfigError as error:
+        raise ResultsError(f"{where}: not the configuration of a run: {error}") from error
 
 
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
