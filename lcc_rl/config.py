@@ -14,14 +14,14 @@ from typing import Any
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
-from lcc_rl.nodes import TARGET, find_target, forget_places, settings_of
+from lcc_rl.nodes import TARGET, find_target, forget_places, settings_of, with_defaults
 from lcc_rl.schemas import KINDS, as_plain, parse_config
 from lcc_rl.unused import check_used
 
@@ -85,8 +85,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
         else:
             with initialize_config_module(CONF, version_base="1.3"):
                 cfg = compose(entry, overrides=as_meant(overrides))
-    except HYDRA_ERRORS as error:
-        raise explained(error) from error
+    except (*HYDRA_ERRORS, ValueError, TypeError) as error:  # Hydra raises some as plain ones
+        raise explained(error, overrides) from error
     return parsed(cfg, entry, overrides)
 
 
@@ -144,7 +144,9 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         ConfigError: if a setting is unknown, wrong or has no effect.
     """
     try:
-        content: Any = OmegaConf.to_container(cfg, resolve=True)
+        # Settings may refer to the default of a class.
+        whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))
+        content: Any = OmegaConf.to_container(whole, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
     if isinstance(content.get("agent"), dict) and TARGET not in content["agent"]:
@@ -186,13 +188,19 @@ def is_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
 
 
-def explained(error: Exception) -> ConfigError:
+def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     """Return what Hydra refused in one line, with the nearest choice that exists."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
             return ConfigError(f"{group}/{name} is not installed: {how_to_install(EXTRAS[name])}")
         return unknown_name(f"choice of {group}" if group else "option", name, error.options or ())
+    if isinstance(error, OverrideParseException):
+        key, _, value = str(error.override).lstrip("+").partition("=")
+        return ConfigError(
+            f"{key}={value}: cannot be read as a setting. Brackets must be closed, and text "
+            f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\""
+        )
     found = re.search(
         r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
@@ -200,7 +208,8 @@ def explained(error: Exception) -> ConfigError:
         return unknown_name("option", found.group(1), _top_level() | _groups())
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
-    return ConfigError(" ".join(text.partition("See https://")[0].split()))
+    words = [*overrides, *text.partition("See https://")[0].split()]
+    return ConfigError(" ".join(words))
 
 
 def config_hash(content: Any) -> str:

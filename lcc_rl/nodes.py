@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from lcc_rl.errors import LARGEST, ConfigError, LccError, unknown_name
-from lcc_rl.settings import Settings, parse, values
+from lcc_rl.settings import Settings, defaults, parse
 
 TARGET = "_target_"
 MISSING = "???"
@@ -52,8 +52,31 @@ def settings_of(target: Any) -> list[str] | None:
     return list(found)
 
 
-def completed(value: Any, where: str) -> Any:
-    """Check every node in a setting, and return the setting with the defaults of their classes.
+def with_defaults(value: Any, where: str = "") -> Any:
+    """Return a setting in which every node holds the defaults of its class, too.
+
+    Args:
+        value: a setting as plain containers; references to other settings may be unresolved.
+        where: its place in the configuration, for messages.
+
+    Raises:
+        ConfigError: if a target is unknown.
+    """
+    if isinstance(value, list):
+        return [with_defaults(item, f"{where}[{place}]") for place, item in enumerate(value)]
+    if not isinstance(value, Mapping):
+        return value
+    found = {
+        key: with_defaults(item, f"{where}.{key}".removeprefix(".")) for key, item in value.items()
+    }
+    kind = find_target(str(found[TARGET]), where) if TARGET in found else None
+    if inspect.isclass(kind) and issubclass(kind, Settings):
+        found |= {key: x for key, x in defaults(kind).items() if key not in found}
+    return found
+
+
+def check_nodes(value: Any, where: str) -> None:
+    """Check every node in a setting.
 
     Args:
         value: a setting as plain containers.
@@ -62,19 +85,13 @@ def completed(value: Any, where: str) -> Any:
     Raises:
         ConfigError: naming a setting that is unknown, missing or wrong.
     """
-    if isinstance(value, list):
-        return [completed(item, f"{where}[{place}]") for place, item in enumerate(value)]
-    if not isinstance(value, Mapping):
-        return value
-    found = {key: completed(item, f"{where}.{key}") for key, item in value.items()}
-    if TARGET not in found:
-        return found
-    kind = find_target(str(found[TARGET]), where)
-    if inspect.isclass(kind) and issubclass(kind, Settings):
-        found |= {k: v for k, v in values(build(found, where)).items() if k not in found}
-    else:
-        _check_names(getattr(kind, "Settings", kind), found, where)
-    return found
+    for key, _, node in [(where, None, value), *settings_at(value, where)]:
+        if is_node(node):
+            kind = find_target(str(node[TARGET]), key)
+            if inspect.isclass(kind) and issubclass(kind, Settings):
+                build(node, key)
+            else:
+                _check_names(getattr(kind, "Settings", kind), node, key)
 
 
 def build(

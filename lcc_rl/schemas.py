@@ -15,7 +15,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from lcc_rl.errors import LAST_SEED, ConfigError
-from lcc_rl.nodes import TARGET, check_numbers, completed, is_node
+from lcc_rl.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
 
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
@@ -193,7 +193,9 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
     """
     kind = kind or _kind_of(content)
     check_numbers(content, "")
-    found = {key: completed(value, key) for key, value in content.items()}
+    found = with_defaults(content)
+    for key, value in found.items():
+        check_nodes(value, key)
     for name, section in SECTIONS.items():
         if name in found:
             if not isinstance(found[name], Mapping):

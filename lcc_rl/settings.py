@@ -101,3 +101,14 @@ def values(settings: Settings) -> dict[str, Any]:
     """Return the settings of an object by name."""
     names = (field.name for field in dataclasses.fields(settings))  # type: ignore[arg-type]
     return {name: getattr(settings, name) for name in names}
+
+
+def defaults(kind: type[Settings]) -> dict[str, Any]:
+    """Return the defaults of a class's settings by name."""
+    found = {}
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        if field.default is not dataclasses.MISSING:
+            found[field.name] = field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            found[field.name] = field.default_factory()
+    return found

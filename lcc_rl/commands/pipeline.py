@@ -10,7 +10,6 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from dataclasses import fields
-from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
-from lcc_rl.schemas import CalibrateConfig, PipelineConfig, TrainConfig, as_plain
+from lcc_rl.schemas import KINDS, CalibrateConfig, PipelineConfig, TrainConfig, as_plain
 
 log = logging.getLogger("lcc_rl")
 
@@ -249,9 +248,5 @@ def _finished(folder: Path) -> bool:
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:
     """Keep the overrides that an entry point has settings for."""
-    return [item for item in overrides if root_key(item) in _settings_of(entry)]
-
-
-@cache
-def _settings_of(entry: str) -> frozenset[str]:
-    return frozenset(map(str, load(entry))) | {"experiment"}
+    known = {"experiment", *KINDS[entry].__dataclass_fields__}
+    return [item for item in overrides if root_key(item) in known]

@@ -176,7 +176,7 @@ def _drivers(scenario: Any, world: World) -> list[Any]:
     """Build the controllers of the roles that occur, and their safety filters."""
     pieces, roles = [], world.string.names
     for group, needed in (("controllers", True), ("filters", False)):
-        nodes = scenario[group]
+        nodes = getattr(scenario, group)
         for role in roles:
             if nodes.get(role) is not None:
                 pieces.append(_build(nodes[role], f"scenario.{group}", world, role))
@@ -202,7 +202,7 @@ def _motion(scenario: Any, world: World) -> StringMotion:
     if not string.ring and scenario.circumference is not None:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
     names = ("circumference", "vehicle_length", "initial_speed")
-    of_ring = {name: scenario[name] for name in names} if string.ring else {}
+    of_ring = {name: getattr(scenario, name) for name in names} if string.ring else {}
     return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 
 

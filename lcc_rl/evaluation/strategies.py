@@ -32,7 +32,7 @@ log = logging.getLogger("lcc_rl")
 # Pieces that belong to what a policy observes, not to the traffic.
 KNOWLEDGE = ("memory", "preview")
 GAINS = ("path", "paper_like", "tuned")
-PLACE = "controller@scenario.controllers[AUTOMATED]"
+PLACE = "controller@scenario.controllers.automated"
 # Cruise controls whose constants were tuned, also behind the safety filter: they keep it.
 TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
 FILTERED = "_filtered"
@@ -43,7 +43,7 @@ BASELINES = {
     **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
     **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
     "deadbeat": ("variant=deadbeat",),
-    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers[AUTOMATED].lookahead=oracle"),
+    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
 }
 DIRECT = "direct"
 # Controllers that need a policy's action, or the communication of a platoon.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
@@ -167,8 +168,13 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
     def explained_function(*arguments: Any) -> Any:
         try:
             return function(*arguments)
-        except HYDRA_ERRORS as error:
-            raise input_error(error) or explained(error) from error
+        except (*HYDRA_ERRORS, ValueError, TypeError) as error:
+            *_, last = traceback.walk_tb(error.__traceback__)
+            module = str(last[0].f_globals["__name__"])
+            if not module.startswith(("hydra.", "omegaconf.")):
+                raise
+            typed = [word for word in sys.argv[1:] if "=" in word]
+            raise input_error(error) or explained(error, typed) from error
 
     return explained_function
 
