@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -79,15 +79,33 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
     Raises:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
+    return parsed(composed(entry, overrides), entry, overrides)
+
+
+def raw(entry: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what Hydra composes as plain containers, before anything that it names is imported."""
+    found: Any = OmegaConf.to_container(composed(entry, overrides))
+    return found
+
+
+def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Return what Hydra composes.
+
+    Raises:
+        ConfigError: if Hydra refuses an override.
+    """
     try:
         if GlobalHydra.instance().is_initialized():
-            cfg = compose(entry, overrides=as_meant(overrides))
-        else:
-            with initialize_config_module(CONF, version_base="1.3"):
-                cfg = compose(entry, overrides=as_meant(overrides))
+            return compose(entry, overrides=as_meant(overrides))
+        return _composed(entry, tuple(as_meant(overrides)))
     except (*HYDRA_ERRORS, ValueError, TypeError) as error:  # Hydra raises some as plain ones
         raise explained(error, overrides) from error
-    return parsed(cfg, entry, overrides)
+
+
+@lru_cache(maxsize=512)  # an evaluation asks for its baselines several times
+def _composed(entry: str, overrides: tuple[str, ...]) -> DictConfig:
+    with initialize_config_module(CONF, version_base="1.3"):
+        return compose(entry, overrides=list(overrides))
 
 
 def as_meant(overrides: Sequence[str]) -> list[str]:

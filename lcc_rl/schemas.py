@@ -34,9 +34,11 @@ def _described(node: Any) -> Any:
 
 def _all_described(nodes: dict[str, Any]) -> dict[str, Any]:
     for name, node in nodes.items():
-        if node is not None and not is_node(node):
+        if isinstance(node, Mapping) and not is_node(node):
             known = ", ".join(key for key in nodes if key != name)
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
+        if node is not None and not is_node(node):
+            raise ValueError(f"{name}: expected a node with {TARGET} or null, got {node!r}")
     return nodes
 
 

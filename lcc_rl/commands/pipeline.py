@@ -20,7 +20,7 @@ from rich.console import Console
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_settings, check_sizes
-from lcc_rl.config import load
+from lcc_rl.config import load, raw
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import Interrupted, ResultsError, require
@@ -142,23 +142,29 @@ def stored_overrides(path: Path, trust: Sequence[str]) -> list[str]:
         if "${" in item:
             raise ResultsError(f"{path}: {item} refers to another value; expected plain values")
     places: dict[str, str] = {}
-    for content in _composed(overrides):
-        check_targets(content, str(path), trust)
+    for content in _composed(overrides, path, trust):
         places |= {place.partition("=")[0]: place for place in forget_places(content)}
     for place in places.values():
         log.warning("%s: %s names a place to write and is left out", path, place)
     kept = [item for item in overrides if item.lstrip("+").partition("=")[0] not in places]
-    if any(forget_places(content) for content in _composed(kept)):
+    if any(forget_places(content) for content in _composed(kept, path, trust)):
         raise ResultsError(f"{path}: names a place to write: {', '.join(places.values())}")
     return kept
 
 
-def _composed(overrides: list[str]) -> list[dict[str, Any]]:
+def _composed(overrides: list[str], path: Path, trust: Sequence[str]) -> list[dict[str, Any]]:
     """Compose a job and the training of each of its variants, as plain containers."""
-    job = load("pipeline", overrides)
     shared = [item for item in overrides if root_key(item) not in OWN]
-    parts = [load("train", [*shared, f"variant={name}"]) for name in job.variants]
-    return [as_plain(cfg) for cfg in (job, *parts)]
+    found = [_checked("pipeline", overrides, path, trust)]
+    for name in found[0]["variants"]:
+        found.append(_checked("train", [*shared, f"variant={name}"], path, trust))
+    return found
+
+
+def _checked(entry: str, overrides: list[str], path: Path, trust: Sequence[str]) -> dict[str, Any]:
+    """Compose one configuration; its targets are checked before one of them is imported."""
+    check_targets(raw(entry, overrides), str(path), trust)
+    return as_plain(load(entry, overrides))
 
 
 def _episodes(cfg: PipelineConfig, folder: Path) -> dict[str, Any]:

@@ -33,6 +33,9 @@ def trusted(
     Raises:
         ResultsError: naming the key at fault.
     """
+    for key, _, value in settings_at(content):
+        if isinstance(value, str) and "${" in value:
+            raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
     check_targets(content, where, trust)
     places = forget_places(content)
     if "trust" in content:
@@ -57,8 +60,6 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
         ResultsError: naming the target, or a reference instead of a value.
     """
     for key, _, value in settings_at(content):
-        if isinstance(value, str) and "${" in value:
-            raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
         if key.rpartition(".")[2] == TARGET and not is_registered(str(value), where, trust):
             module = str(value).rpartition(".")[0]
             raise ResultsError(

@@ -8,7 +8,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from lcc_rl.config import build, load
+from lcc_rl.config import load
+from lcc_rl.nodes import build
 from lcc_rl.data.leaders import RecordLeaders, stretch, varying
 from lcc_rl.data.profiles import from_records, resample
 from lcc_rl.data.speed_records import read_speed_record, shipped_cycles

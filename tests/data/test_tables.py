@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 from table_text import GAP, LENGTH, long_table, openacc_text, speed
 
-from lcc_rl.config import build, load
+from lcc_rl.config import load
+from lcc_rl.nodes import build
 from lcc_rl.data.episodes import read_episodes, validate_episodes
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes

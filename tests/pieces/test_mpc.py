@@ -14,7 +14,8 @@ from scipy.optimize import minimize
 
 from lcc_rl.commands.checks import check_settings
 from lcc_rl.commands.evaluation import run
-from lcc_rl.config import build, load, plain
+from lcc_rl.config import load
+from lcc_rl.nodes import build
 from lcc_rl.data.profiles import from_records
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
