@@ -155,10 +155,9 @@ def stored_overrides(path: Path, trust: Sequence[str]) -> list[str]:
 def _composed(overrides: list[str], path: Path, trust: Sequence[str]) -> list[dict[str, Any]]:
     """Compose a job and the training of each of its variants, as plain containers."""
     shared = [item for item in overrides if root_key(item) not in OWN]
-    found = [_checked("pipeline", overrides, path, trust)]
-    for name in found[0]["variants"]:
-        found.append(_checked("train", [*shared, f"variant={name}"], path, trust))
-    return found
+    job = _checked("pipeline", overrides, path, trust)
+    parts = ([*shared, f"variant={name}"] for name in job["variants"])
+    return [job, *(_checked("train", part, path, trust) for part in parts)]
 
 
 def _checked(entry: str, overrides: list[str], path: Path, trust: Sequence[str]) -> dict[str, Any]:

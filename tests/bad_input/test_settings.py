@@ -34,7 +34,7 @@ WRONG = {
     "training.episodes=2.5": "training.episodes must be a valid integer",
     "evaluation.baselines=idm": "evaluation.baselines must be a valid list",
     "agent=5": "agent=5",
-    "scenario.pieces.ttc=5": "unknown name 'ttc'",
+    "scenario.pieces.ttc=5": "ttc: expected a node",
     "data.path=a (copy).csv": "cannot be read as a setting.*quotes within quotes",
     "scenario.initial_speed=${nowhere}": "nowhere",
     "~drivers": "drivers is required",
