@@ -24,7 +24,6 @@ from commands import (
     tiny,
     wait_for,
 )
-from omegaconf import OmegaConf
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation, pipeline, training
@@ -141,7 +140,7 @@ def test_a_filter_is_put_on_a_trained_policy_and_not_on_a_human(trained, tmp_pat
 @pytest.mark.slow
 def test_compared_policies_get_the_filter_under_study(trained, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=alcc", f"policy={trained}", "+filter=cbf")
-    OmegaConf.update(cfg, "compare", ["pretrained/reference"])
+    cfg.compare = ["pretrained/reference"]
     rows = evaluation.run(cfg, tmp_path, quiet=True)
     learned = rows[rows["strategy"].isin(["alcc", "reference"])]
     assert learned["strategy"].nunique() == 2

@@ -8,9 +8,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl import results
-from lcc_rl.config import short_name
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet
+from lcc_rl.nodes import short_name
 from lcc_rl.results.drawing import INK, in_words, legend_above, new_figure
 from lcc_rl.results.figures import style
 

@@ -36,8 +36,9 @@ from matplotlib.figure import Figure
 
 from lcc_rl.commands.pipeline import root_key
 from lcc_rl.commands.training import POLICIES
-from lcc_rl.config import load, require
+from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
+from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import trained
 from lcc_rl.io.files import read_parquet, write_parquet

@@ -14,21 +14,22 @@ from collections.abc import Sequence
 from time import process_time
 
 import pandas as pd
-from omegaconf import DictConfig
 
-from lcc_rl.config import CALLED, build_as, load
+from lcc_rl.config import load
 from lcc_rl.drivers.fit import ERRORS, OUT
 from lcc_rl.envs.inputs import build_source
 from lcc_rl.errors import LccError
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import write_parquet
+from lcc_rl.nodes import CALLED, build
+from lcc_rl.schemas import CalibrateConfig
 
 OBJECTIVES = ("speed_rmspe", "gap_rmse")
 DEFAULTS = ("calibration=global", "calibration.holdout=0.3")
 HEAD = ("model", "objective", "RMSPE", "gap RMSE", "RMSPE, held out", "gap RMSE, held out")
 
 
-def calibrated(cfg: DictConfig, episodes: pd.DataFrame) -> pd.DataFrame:
+def calibrated(cfg: CalibrateConfig, episodes: pd.DataFrame) -> pd.DataFrame:
     """Calibrate all drivers as a configuration says.
 
     Args:
@@ -39,7 +40,7 @@ def calibrated(cfg: DictConfig, episodes: pd.DataFrame) -> pd.DataFrame:
         One row per mode: model, objective, holdout, seed, number of drivers, mean, median and
         95th percentile of every error, and the seconds of the processor.
     """
-    calibrator = build_as("a calibrator", CALLED, cfg.calibration, "calibration")
+    calibrator = build(cfg.calibration, "calibration", CALLED)
     start = process_time()
     drivers = calibrator(episodes, seed=cfg.seed).drivers
     seconds = process_time() - start

@@ -21,19 +21,20 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
-from omegaconf import DictConfig
 
-from lcc_rl.config import CALLED, build_as, load
+from lcc_rl.config import load
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.envs.inputs import build_source
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.nodes import CALLED, build
 from lcc_rl.results.calibration_figures import COLOURS
 from lcc_rl.results.drawing import INK, new_figure, save, unbox
 from lcc_rl.results.intervals import bounds, weights
 from lcc_rl.runs.cli import main_guard
+from lcc_rl.schemas import CalibrateConfig
 
 KEPT, FIGURE = Path("outputs/reference/calibration.parquet"), Path("docs/figures/calibration.png")
 BASE, ALONE = "first 60 s", "one at a time"
@@ -90,9 +91,9 @@ def pieces(episodes: pd.DataFrame, shortest: float, longest: float) -> pd.DataFr
     return pd.concat(parts, ignore_index=True)
 
 
-def calibrated(cfg: DictConfig, episodes: pd.DataFrame, condition: str) -> pd.DataFrame:
+def calibrated(cfg: CalibrateConfig, episodes: pd.DataFrame, condition: str) -> pd.DataFrame:
     """Calibrate all episodes in both modes; one row per episode and mode."""
-    calibrator = build_as("a calibrator", CALLED, cfg.calibration, "calibration")
+    calibrator = build(cfg.calibration, "calibration", CALLED)
     parts = []
     for mode in cfg.calibration.modes:
         start = process_time()

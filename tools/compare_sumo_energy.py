@@ -24,12 +24,12 @@ from omegaconf import OmegaConf
 from sumo_ring import write_network
 from torch import Tensor
 
-from lcc_rl.config import build
 from lcc_rl.data.profiles import resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.energy import CirclesFuel, EnergyModel
 from lcc_rl.interfaces.sumo import load_sumo
 from lcc_rl.io.files import write_parquet
+from lcc_rl.nodes import build
 from lcc_rl.runs.cli import main_guard
 
 STEP, AROUND, SPACE = 0.1, 80_000.0, 20.0  # [s]; of a ring without bends to speak of, [m]

@@ -13,11 +13,10 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from omegaconf import OmegaConf
-
 from lcc_rl.errors import LccError
 from lcc_rl.io.tensors import write_torch
 from lcc_rl.results.policies import load_policy
+from lcc_rl.schemas import as_text
 
 LOCAL = ("data", "drivers", "leader", "split", "resume", "policy", "compare")
 FOLDER = Path(__file__).parents[1] / "lcc_rl" / "assets" / "pretrained"
@@ -39,12 +38,11 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None
         ResultsError: if the run holds no policy.
     """
     weights, cfg = load_policy(run)
-    OmegaConf.set_struct(cfg, False)
     for key in LOCAL:
-        cfg.pop(key, None)
+        setattr(cfg, key, None)
     path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
-    content = {"weights": weights, "config": OmegaConf.to_yaml(cfg), "provenance": provenance}
+    content = {"weights": weights, "config": as_text(cfg), "provenance": provenance}
     write_torch(content, path)
     return path
 

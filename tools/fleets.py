@@ -16,9 +16,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.commands.tasks import task_of
-from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.envs.inputs import string_of
+from lcc_rl.errors import require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.drawing import legend_above, new_figure, save

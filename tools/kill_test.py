@@ -82,7 +82,7 @@ def jobs(data: Path) -> dict[str, Job]:
 
 def tiny_data(folder: Path) -> Path:
     """Write the episodes that every command here reads."""
-    from lcc_rl.config import build
+    from lcc_rl.nodes import build
 
     cfg = load("train", ["data.platoons=4", "data.recordings=2"])
     loaded: LoadedEpisodes = build(cfg.data, "data").load()

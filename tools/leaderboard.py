@@ -20,12 +20,11 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.commands.tasks import task_of
-from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.envs.step import entries, pieces_of
-from lcc_rl.errors import LccError
+from lcc_rl.errors import LccError, require
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path

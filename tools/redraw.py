@@ -19,10 +19,12 @@ from compare_lengths import figure_of_lengths
 from limit_results import figure_of_limits
 from matplotlib.figure import Figure
 
-from lcc_rl.config import build, load, require
+from lcc_rl.config import load
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
+from lcc_rl.errors import require
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.nodes import build
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
 from lcc_rl.results.string_figures import record_figure

@@ -16,7 +16,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig
 
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
@@ -27,6 +26,7 @@ from lcc_rl.io.files import write_parquet
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
 from lcc_rl.runs.cli import main_guard
+from lcc_rl.schemas import StudyConfig
 
 HUMAN, FIRST = "human", "car0"
 LAST_S, CALM = 60.0, 0.5  # final speeds are of [s]; spread of the speeds without a wave [m/s]
@@ -59,14 +59,18 @@ def write_network(path: Path, circumference: float) -> None:
     _write(root, path)
 
 
-def write_vehicles(path: Path, cfg: DictConfig) -> None:
+def write_vehicles(path: Path, cfg: StudyConfig, around: float) -> None:
     """Write the vehicles, evenly spread; each follows the one of the number before."""
     scenario, driver = cfg.scenario, cfg.drivers
-    around, count = float(scenario.circumference), len(parse_string(scenario.string).roles)
+    count = len(parse_string(scenario.string).roles)
     root = ElementTree.Element("routes")
-    of_type = {"carFollowModel": "IDM", "length": scenario.vehicle_length, "tau": driver.time_gap}
-    of_type |= {"accel": driver.acceleration, "decel": driver.deceleration}
-    of_type |= {"minGap": driver.min_gap, "maxSpeed": driver.desired_speed}
+    of_type = {
+        "carFollowModel": "IDM",
+        "length": scenario.vehicle_length,
+        "tau": driver["time_gap"],
+    }
+    of_type |= {"accel": driver["acceleration"], "decel": driver["deceleration"]}
+    of_type |= {"minGap": driver["min_gap"], "maxSpeed": driver["desired_speed"]}
     fixed = {"id": HUMAN, "speedFactor": "1", "speedDev": "0"}
     text = {key: str(value) for key, value in of_type.items()}
     ElementTree.SubElement(root, "vType", fixed | text)
@@ -88,7 +92,7 @@ def _write(root: ElementTree.Element, path: Path) -> None:
 
 
 def simulate(
-    cfg: DictConfig, driver: str | None, folder: Path, seconds: float, from_s: float, seed: int
+    cfg: StudyConfig, driver: str | None, folder: Path, seconds: float, from_s: float, seed: int
 ) -> pd.DataFrame:
     """Simulate the ring in SUMO.
 
@@ -103,9 +107,11 @@ def simulate(
     Returns:
         Rows as in steps.parquet, and the number of vehicles in collisions at each step.
     """
-    sumo, step = load_sumo(), float(cfg.scenario.time_step)
-    write_network(folder / "ring.net.xml", float(cfg.scenario.circumference))
-    write_vehicles(folder / "ring.rou.xml", cfg)
+    sumo, step, around = load_sumo(), cfg.scenario.time_step, cfg.scenario.circumference
+    if around is None:
+        raise ConfigError("SUMO's ring needs scenario.circumference")
+    write_network(folder / "ring.net.xml", around)
+    write_vehicles(folder / "ring.rou.xml", cfg, around)
     words = ["sumo", "-n", f"{folder}/ring.net.xml", "-r", f"{folder}/ring.rou.xml"]
     words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-step-log"]
     sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
@@ -120,7 +126,7 @@ def simulate(
                 bridge.command(drives)
             rows.append({"time_s": number * step, **_row(sumo, driver is not None)})
             sumo.simulationStep()
-            _disturb(sumo, noise, float(cfg.scenario.controllers.human.wiener), step, drives)
+            _disturb(sumo, noise, float(cfg.scenario.controllers["human"]["wiener"]), step, drives)
     finally:
         sumo.close()
     return pd.DataFrame(rows).assign(

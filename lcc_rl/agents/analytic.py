@@ -17,8 +17,7 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.loop import anneal, check_fraction
 from lcc_rl.agents.simulated import SimulatedAgent, SimulatedSettings
-from lcc_rl.config import require
-from lcc_rl.errors import require_in, require_positive, require_whole
+from lcc_rl.errors import require, require_in, require_positive, require_whole
 from lcc_rl.policies.actor import seeded_mlp
 
 

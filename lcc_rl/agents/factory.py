@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-from omegaconf import DictConfig
 
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import Agent, TrainingLoop
 from lcc_rl.agents.replay import Trainer
 from lcc_rl.agents.tuned import SearchLoop, Tuned
-from lcc_rl.config import build_as, identity, short_name
+from lcc_rl.config import identity
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.nodes import TARGET, build, short_name
 from lcc_rl.pieces import Piece
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.world import World
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import StudyConfig
 
 
-def learns(cfg: DictConfig) -> bool:
+def learns(cfg: StudyConfig) -> bool:
     """Whether anything is learned: the configuration has an agent."""
-    return isinstance(cfg.agent, Mapping | DictConfig) and TARGET in cfg.agent
+    return cfg.agent is not None
 
 
-def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Agent:
+def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -> Agent:
     """Build the agent of a configuration.
 
     Raises:
@@ -45,15 +43,14 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
             f"scenario.string={cfg.scenario.string}: nobody is automated, so nothing can be "
             "learned; say agent=none to evaluate it"
         )
-    observation = build_as("a piece", Piece, cfg.observation, "observation", world=World(string))
+    observation = build(cfg.observation, "observation", Piece, world=World(string))
     driver = cfg.scenario.controllers.get(AUTOMATED) or {}
     # The acceleration of action 1, where the vehicles are driven by actions.
     limits = {key: driver[key] for key in ("max_acceleration",) if key in driver}
-    agent: Agent = build_as(
-        "an agent",
-        ("policy", "anneal", "load_state_dict"),
+    agent: Agent = build(
         cfg.agent,
         "agent",
+        ("policy", "anneal", "load_state_dict"),
         population=population,
         observation=observation,
         **limits,
@@ -69,7 +66,7 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
 
 
 def make_trainer(
-    cfg: DictConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
+    cfg: StudyConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
 ) -> TrainingLoop:
     """Build the training loop of an agent with its environment.
 
@@ -78,7 +75,7 @@ def make_trainer(
     """
     env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
     if not list(env.full_action_spec.keys(True, True)):
-        kind = short_name(cfg.scenario.controllers.automated.get(TARGET))
+        kind = short_name(cfg.scenario.controllers[AUTOMATED].get(TARGET))
         raise ConfigError(
             f"scenario.controllers.automated ({kind}) takes no action of a policy, so nothing can "
             "be learned; say agent=none, or leave the controller out"

@@ -16,10 +16,9 @@ from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.agents.sizes import check_window
-from lcc_rl.config import require
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import Diverged
+from lcc_rl.errors import Diverged, require
 from lcc_rl.pieces.rewards import REWARD
 from lcc_rl.policies import shared_policy
 from lcc_rl.policies.actor import ACTION, OBSERVATION

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lcc_rl.config import require
+from lcc_rl.errors import require
 from lcc_rl.schemas import TrainingConfig
 
 

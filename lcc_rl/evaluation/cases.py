@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from lcc_rl.data.leaders import Case
@@ -17,6 +18,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
 from lcc_rl.results.savings import SOURCE
+from lcc_rl.schemas import StudyConfig
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")
@@ -29,7 +31,7 @@ Series = dict[str, Tensor]
 
 
 def evaluate(
-    strategy: Strategy, cfg: DictConfig, inputs: Inputs
+    strategy: Strategy, cfg: StudyConfig, inputs: Inputs
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Drive one strategy through every case, the held-out windows and the whole records.
 
@@ -58,13 +60,13 @@ def evaluate(
     return pd.concat(rows, ignore_index=True), trails
 
 
-def cases_of(cfg: DictConfig, inputs: Inputs) -> list[Case]:
+def cases_of(cfg: StudyConfig, inputs: Inputs) -> list[Case]:
     """Return what an evaluation drives: its cases, the held-out windows and whole records."""
     windows = Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))
     return [*inputs.cases, windows, *(inputs.full_length if cfg.evaluation.full_length else ())]
 
 
-def check_cases(cfg: DictConfig, inputs: Inputs) -> None:
+def check_cases(cfg: StudyConfig, inputs: Inputs) -> None:
     """Check, before anything expensive starts, that a strategy can follow the fastest leader.
 
     Args:
@@ -79,10 +81,9 @@ def check_cases(cfg: DictConfig, inputs: Inputs) -> None:
         build_pieces(of_case(cfg, case), case.profile, inputs.population, True)
 
 
-def of_case(cfg: DictConfig, case: Case) -> DictConfig:
+def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
     """Return the configuration of a case; a platoon has the case's number of vehicles."""
-    cfg = cfg.copy()
-    OmegaConf.set_struct(cfg, False)
+    cfg = deepcopy(cfg)
     cfg.scenario.horizon = case.horizon
     if set(string_of(cfg).names) == {AUTOMATED}:
         cfg.scenario.string = f"{AUTOMATED}*{case.followers}"

@@ -18,12 +18,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.config import require
 from lcc_rl.energy import Fleet, as_fleet, build_energy
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import any_leader, pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options

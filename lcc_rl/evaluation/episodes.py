@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 from torch import Tensor
 
-from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
     INDEX,
@@ -34,6 +34,7 @@ from lcc_rl.evaluation.rows import (
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.tables import FASTER
+from lcc_rl.schemas import StudyConfig
 
 # Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
 WORTH_COMPILING = 20_000_000
@@ -130,7 +131,7 @@ def pairs(profiles: int, drivers: int, chosen: int | None) -> tuple[Tensor, Tens
     return Plan(profiles, drivers, chosen, profiles * drivers).episodes(0)[:2]
 
 
-def plan_of(cfg: DictConfig, inputs: Inputs) -> Plan:
+def plan_of(cfg: StudyConfig, inputs: Inputs) -> Plan:
     """Return the episodes of a configuration's evaluation."""
     settings, people = cfg.evaluation, len(inputs.population.time_gap)
     sizes = (settings.batch_size, settings.repeats, settings.shards, settings.shard)
@@ -239,10 +240,10 @@ def evaluate(
     return pd.concat(rows, ignore_index=True), pd.concat(steps, ignore_index=True)
 
 
-def any_leader(cfg: DictConfig) -> DictConfig:
+def any_leader(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose leader plays any record, not the one chosen for training."""
-    cfg = cfg.copy()
+    cfg = deepcopy(cfg)
     leader = cfg.scenario.pieces.get("leader")
     if leader is not None and "profile" in leader:
-        leader.profile = None
+        leader["profile"] = None
     return cfg

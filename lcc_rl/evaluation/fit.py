@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
-from lcc_rl.config import plain
-from lcc_rl.config_checks import AUTO
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.runs import differing, flatten
+from lcc_rl.schemas import AUTO, StudyConfig
 
 FIRST = "module.0.0.weight"  # of a policy's network
 
 
-def check_policy(cfg: DictConfig, own: DictConfig) -> None:
+def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
     """Check that a policy was trained for the variant, observation and action under study.
 
     Args:
@@ -27,23 +26,23 @@ def check_policy(cfg: DictConfig, own: DictConfig) -> None:
         ConfigError: naming what differs.
     """
     path = f"policy={cfg.policy}"
-    hybrid = cfg.deployed is not None or own.get("deployed") is not None
+    hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
         raise ConfigError(f"{path} was trained as variant {own.variant}, not {cfg.variant}")
     _check_same(path, _observed(own), _observed(cfg))
     check_action(path, own, cfg)
 
 
-def _observed(cfg: DictConfig) -> dict[str, Any]:
+def _observed(cfg: StudyConfig) -> dict[str, Any]:
     """Return what makes an observation: its settings, the order of its entries, the memory."""
-    node = plain(cfg.observation)
+    node = cfg.observation
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
     memory = cfg.scenario.pieces.get("memory")
     found = {"observation": {**node, "order of scales": order}}
-    return found if memory is None else {**found, "scenario.pieces.memory": plain(memory)}
+    return found if memory is None else {**found, "scenario.pieces.memory": memory}
 
 
-def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
+def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that a policy to compare with was trained in the scenario under study.
 
     Raises:
@@ -56,7 +55,7 @@ def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
         )
 
 
-def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
+def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that an action has the size and the duration that it had in training.
 
     Args:
@@ -70,7 +69,7 @@ def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
     one, other = (
         {
             "scenario.time_step": node.scenario.time_step,
-            AUTO: plain(node.scenario.controllers.automated),
+            AUTO: node.scenario.controllers[AUTOMATED],
         }
         for node in (own, cfg)
     )

@@ -10,31 +10,30 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import load, plain, require, short_name
-from lcc_rl.config_checks import AUTO
+from lcc_rl.config import load
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.nodes import TARGET, short_name
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.policies import shared_policy
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import AUTO, StudyConfig
 
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
-PLACE = "controller@scenario.controllers.automated"
+PLACE = f"controller@{AUTO}"
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
 TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
 FILTERED = "_filtered"
@@ -52,7 +51,7 @@ BASELINES = {
 DIRECT = "direct"  # a string without automated vehicles
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
-TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
+TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Strategy:
     """
 
     name: str
-    cfg: DictConfig
+    cfg: StudyConfig
     policy: Policy | None = None
     seed: int | None = None
     source: str = ""
@@ -79,32 +78,26 @@ class Strategy:
         return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
 
 
-def _copy(cfg: DictConfig) -> DictConfig:
-    cfg = cfg.copy()
-    OmegaConf.set_struct(cfg, False)
-    return cfg
-
-
-def deployed(cfg: DictConfig) -> DictConfig:
+def deployed(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration in which the automated vehicles drive as after training."""
-    return cfg if cfg.get("deployed") is None else driven_by(cfg, cfg.deployed)
+    return cfg if cfg.deployed is None else driven_by(cfg, cfg.deployed)
 
 
-def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
+def driven_by(cfg: StudyConfig, controller: Any) -> StudyConfig:
     """Return a configuration in which another controller drives the automated vehicles."""
-    cfg = _copy(cfg)
-    cfg.scenario.controllers.automated = controller
+    cfg = deepcopy(cfg)
+    cfg.scenario.controllers[AUTOMATED] = controller
     cfg.deployed = None
     return cfg
 
 
-def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
+def baselines(cfg: StudyConfig, further: Sequence[str] = ()) -> list[Strategy]:
     """Build the baselines that an evaluation names, and further ones."""
     names = [*cfg.evaluation.baselines, *further]
     return [baseline(cfg, name) for name in dict.fromkeys(names) if applies(cfg, name)]
 
 
-def applies(cfg: DictConfig, name: str) -> bool:
+def applies(cfg: StudyConfig, name: str) -> bool:
     """Return whether a string has the vehicles that a baseline drives."""
     roles = set(string_of(cfg).names)
     if name == DIRECT:
@@ -112,7 +105,7 @@ def applies(cfg: DictConfig, name: str) -> bool:
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
-def baseline(cfg: DictConfig, name: str) -> Strategy:
+def baseline(cfg: StudyConfig, name: str) -> Strategy:
     """Build a baseline in the scenario under study, with the settings of the variant under study.
 
     Raises:
@@ -152,17 +145,17 @@ def baseline_controller(name: str, suffix: str = "") -> Any:
     if name not in rules():
         raise unknown_name("baseline", name, rules())
     *first, last = BASELINES.get(name, ("variant=idm", f"{PLACE}={name}"))
-    return plain(load("evaluate", [*first, last + suffix]).scenario.controllers.automated)
+    return load("evaluate", [*first, last + suffix]).scenario.controllers[AUTOMATED]
 
 
-def without_filter(cfg: DictConfig) -> DictConfig:
+def without_filter(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration without a safety filter of the automated vehicles."""
-    cfg = _copy(cfg)
+    cfg = deepcopy(cfg)
     cfg.scenario.filters.pop(AUTOMATED, None)
     return cfg
 
 
-def without_automated(cfg: DictConfig) -> DictConfig:
+def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose string lacks the automated vehicles."""
     roles = [role for role in string_of(cfg).roles if role != AUTOMATED]
     cfg = without_filter(cfg)
@@ -170,7 +163,7 @@ def without_automated(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def rule(cfg: DictConfig) -> Strategy:
+def rule(cfg: StudyConfig) -> Strategy:
     """Return the strategy of a configuration that learns nothing.
 
     Its name is that of the variant, or of the controller's class where that is not the variant's.
@@ -185,20 +178,20 @@ def rule(cfg: DictConfig) -> Strategy:
     return Strategy(name, deployed(cfg))
 
 
-def _target(cfg: DictConfig) -> str:
-    return str(cfg.scenario.controllers.automated.get(TARGET))
+def _target(cfg: StudyConfig) -> str:
+    return str(cfg.scenario.controllers[AUTOMATED].get(TARGET))
 
 
-def _baseline_controllers(cfg: DictConfig) -> list[Any]:
+def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
     """Return the nodes of the controllers of all baselines in which somebody is automated."""
     return [
-        plain(strategy.cfg.scenario.controllers.automated)
+        strategy.cfg.scenario.controllers[AUTOMATED]
         for strategy in baselines(cfg)
         if strategy.name != DIRECT
     ]
 
 
-def no_policy(cfg: DictConfig) -> ConfigError:
+def no_policy(cfg: StudyConfig) -> ConfigError:
     """Return the error for a learned variant without a policy."""
     return ConfigError(
         f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
@@ -207,7 +200,7 @@ def no_policy(cfg: DictConfig) -> ConfigError:
 
 
 def studied(
-    cfg: DictConfig, policy: TrainedPolicy | None, population: Population
+    cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
     """Build the strategy under study; of a hybrid, its parents and its oracle, too.
 
@@ -221,7 +214,7 @@ def studied(
     """
     if not learns(cfg):
         strategy = rule(cfg)
-        known = plain(cfg.scenario.controllers.automated) in _baseline_controllers(cfg)
+        known = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
         same = known and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
         named = strategy.name in cfg.evaluation.baselines
         return [] if same or named else [strategy]
@@ -234,32 +227,32 @@ def studied(
     return [strategy] if cfg.deployed is None else hybrids(strategy)
 
 
-def _of_training(cfg: DictConfig, own: DictConfig) -> DictConfig:
+def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     """Return the scenario under study with the agent, and where it has none the filter, of own."""
-    cfg = _copy(cfg)
+    cfg = deepcopy(cfg)
     cfg.agent = own.agent
     if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
-        cfg.scenario.filters.automated = own.scenario.filters.automated
+        cfg.scenario.filters[AUTOMATED] = own.scenario.filters[AUTOMATED]
     return cfg
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, the parents it is composed of, and its oracle."""
     cfg = strategy.cfg
-    parent = driven_by(cfg, cfg.scenario.controllers.automated)
+    parent = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
     found = [replace(strategy, name=short_name(cfg.agent[TARGET]), cfg=parent)]
-    parent_rule = plain(cfg.deployed).get("rule")
+    parent_rule = cfg.deployed.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
         found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
     if set(string_of(cfg).names) == {AUTOMATED}:
-        knowing = driven_by(cfg, {**plain(cfg.deployed), "lookahead": "oracle"})
+        knowing = driven_by(cfg, {**cfg.deployed, "lookahead": "oracle"})
         found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found
 
 
-def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
+def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
     """Build a trained strategy to compare with, in the scenario under study.
 
     Args:
@@ -275,8 +268,8 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
     check_scenario(path, own, cfg)
     other = _of_training(cfg, own)
     other.variant, other.observation = own.variant, own.observation
-    other.deployed = own.get("deployed")
-    other.scenario.controllers.automated = own.scenario.controllers.automated
+    other.deployed = own.deployed
+    other.scenario.controllers[AUTOMATED] = own.scenario.controllers[AUTOMATED]
     for name, node in own.scenario.pieces.items():
         if name in KNOWLEDGE or name not in other.scenario.pieces:
             other.scenario.pieces[name] = node
@@ -286,7 +279,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
 
 
 def with_weights(
-    cfg: DictConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
+    cfg: StudyConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
 ) -> Strategy:
     """Build a strategy and load its policy's weights.
 
@@ -333,7 +326,7 @@ def _settings(strategy: Strategy) -> str:
     if strategy.policy is None:
         return ""
     cfg = strategy.cfg
-    return json.dumps([plain(cfg.agent), plain(cfg.scenario.filters)], sort_keys=True)
+    return json.dumps([cfg.agent, cfg.scenario.filters], sort_keys=True)
 
 
 def _place(strategy: Strategy) -> str:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from omegaconf import DictConfig
 
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.drawing import INK, in_file, in_words, legend_above, new_figure, save, unbox
@@ -239,7 +239,7 @@ def write_study_figures(folder: str | Path) -> list[Path]:
 
 
 def study_figures(
-    episodes: pd.DataFrame, steps: pd.DataFrame, cfg: DictConfig
+    episodes: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any]
 ) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of all that an evaluation with a row per episode shows.
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
 from rich.markup import escape
 from rich.table import Table
 
@@ -14,6 +13,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.report import MISSING, Section, column_cells, made, write_report
 from lcc_rl.results.savings import UNTRAINED
 from lcc_rl.results.tables import PATH, ROWS, summary
+from lcc_rl.schemas import StudyConfig
 
 TITLE = "lcc_rl: data → drivers → policies → results"
 WHO = {
@@ -47,20 +47,22 @@ CAPTION = (
 )
 
 
-LIMIT = "agent.limits.efficiency"
+LIMIT = "efficiency"
 HELD_TO = (
-    f"The networks learn within a limit of long time gaps, {LIMIT}={{limit}} of the time; rows "
-    "with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these data."
+    f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
+    "time; rows with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these "
+    "data."
 )
 
 
-def caption_of(trainings: Iterable[DictConfig]) -> str:
+def caption_of(trainings: Iterable[StudyConfig]) -> str:
     """Say what the table shows, and what only the networks are held to.
 
     Args:
         trainings: configuration of each.
     """
-    limits = {OmegaConf.select(cfg, LIMIT) for cfg in trainings} - {None}
+    found = [((cfg.agent or {}).get("limits") or {}).get(LIMIT) for cfg in trainings]
+    limits = {limit for limit in found if limit is not None}
     held = ", ".join(f"{limit:.2g}" for limit in sorted(limits))
     return CAPTION if not limits else f"{CAPTION} {HELD_TO.format(limit=held)}"
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from omegaconf import DictConfig
 from scipy.spatial import ConvexHull, QhullError
 
 from lcc_rl.errors import ResultsError
@@ -48,7 +48,7 @@ def write_maps(folder: Path) -> list[Path]:
     return [save(x, figures / f"{name}.png", formats=formats) for name, x in found.items()]
 
 
-def accelerations(rows: pd.DataFrame, steps: pd.DataFrame, cfg: DictConfig) -> Figure:
+def accelerations(rows: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any]) -> Figure:
     """Acceleration over gap and relative speed, a row per strategy, a column per speed.
 
     Args:
@@ -118,11 +118,13 @@ def _grid(rows: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray, np.n
     return table.columns.to_numpy(float), table.index.to_numpy(float), table.to_numpy(float)
 
 
-def _outline(steps: pd.DataFrame, name: str, speed: float, cfg: DictConfig) -> np.ndarray | None:
+def _outline(
+    steps: pd.DataFrame, name: str, speed: float, cfg: Mapping[str, Any]
+) -> np.ndarray | None:
     """Return the convex hull of what sample episodes visit near a speed, closed, ``[n, 2]``."""
     try:
         episodes = sample_episodes(steps, name).values()
-        seen = np.concatenate([visited(motion_of(rows, cfg.scenario)) for rows in episodes])
+        seen = np.concatenate([visited(motion_of(rows, cfg["scenario"])) for rows in episodes])
         points = seen[np.abs(seen[:, 0] - speed) <= NEAR][:, [2, 1]]
         corners = ConvexHull(points).vertices
     except (ResultsError, QhullError, ValueError):  # none, too few, or on a line

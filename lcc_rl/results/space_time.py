@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from omegaconf import DictConfig
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED
@@ -25,7 +25,7 @@ COLOURS = LinearSegmentedColormap.from_list("speed", ["#a50f15", "#f0a202", "#2c
 
 
 def space_time(
-    steps: pd.DataFrame, names: Sequence[str], cfg: DictConfig, every: int = EVERY
+    steps: pd.DataFrame, names: Sequence[str], cfg: Mapping[str, Any], every: int = EVERY
 ) -> Figure | None:
     """Positions over time of one sample episode, a panel per strategy (the same episode).
 
@@ -59,13 +59,13 @@ def space_time(
     return figure
 
 
-def _motion(steps: pd.DataFrame, name: str, cfg: DictConfig, every: int) -> Motion | None:
+def _motion(steps: pd.DataFrame, name: str, cfg: Mapping[str, Any], every: int) -> Motion | None:
     """Return a strategy's motion in the first episode of all; None where it does not drive it."""
     first = steps.iloc[0]
     same = (steps["profile"] == first["profile"]) & (steps["driver_id"] == first["driver_id"])
     try:
         rows = next(iter(sample_episodes(steps[same], name).values()))
-        return motion_of(rows, cfg.scenario).at(slice(None, None, every))
+        return motion_of(rows, cfg["scenario"]).at(slice(None, None, every))
     except ResultsError:
         return None
 

@@ -16,15 +16,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
-from lcc_rl.config import NOT_IDENTITY, identity, load, plain, require
-from lcc_rl.errors import ConfigError, Interrupted
+from lcc_rl.config import NOT_IDENTITY, identity, load
+from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
 from lcc_rl.runs.sweeps import key_of
+from lcc_rl.schemas import StudyConfig, as_plain
 
 log = logging.getLogger("lcc_rl")
 
@@ -41,7 +40,7 @@ class Run:
     folder: Path
     overrides: tuple[str, ...]
 
-    def compose(self) -> DictConfig:
+    def compose(self) -> StudyConfig:
         """Return its configuration; a ConfigError for an unknown or wrong override."""
         return load("train", self.overrides)
 
@@ -113,7 +112,7 @@ def check_overrides(words: Sequence[str]) -> None:
             )
 
 
-def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> list[str]:
+def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> list[str]:
     """List the settings in which the stored configuration of a run differs from the wanted one.
 
     Args:
@@ -124,7 +123,7 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
     Returns:
         ``key: found → wanted`` for each.
     """
-    found, asked = (dict(flatten(plain(cfg))) for cfg in (load_config(run.folder), wanted))
+    found, asked = (dict(flatten(as_plain(cfg))) for cfg in (load_config(run.folder), wanted))
     ignored = (*NOT_IDENTITY, *accept)
     return [
         f"{key}: {found.get(key)} → {asked.get(key)}"
@@ -133,7 +132,7 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
     ]
 
 
-def up_to_date(cfg: DictConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:
+def up_to_date(cfg: StudyConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:
     """Whether a folder holds the evaluation of a configuration, not older than its policies.
 
     Args:

@@ -6,12 +6,12 @@ from copy import deepcopy
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.ddpg import DDPGSettings
 from lcc_rl.agents.off_policy import leaves
+from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.policies import save_policy
@@ -119,7 +119,7 @@ def test_networks_that_learn_at_two_rates_do_so_where_one_rate_is_nearly_zero() 
 
 def test_a_policys_file_holds_its_weights_only(tmp_path) -> None:
     learner = agent()
-    save_policy(learner.policy.state_dict(), OmegaConf.create({}), tmp_path / "policy.pt")
+    save_policy(learner.policy.state_dict(), load("train"), tmp_path / "policy.pt")
     found = read_torch(tmp_path / "policy.pt")["weights"]
     for name, weight in learner.policy.state_dict().items():
         assert torch.equal(found[name], weight)

@@ -12,7 +12,6 @@ import pytest
 import torch
 from commands import run_command, tiny
 from helpers import ACTION, POPULATION, compose, network, slow_but, wavy_profiles
-from omegaconf import DictConfig
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation
@@ -24,6 +23,7 @@ from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.io.files import as_dataset, read_parquet, write_parquet
 from lcc_rl.results.tables import leader_too_fast, summary
+from lcc_rl.schemas import EvaluateConfig
 
 PROFILES = wavy_profiles().windows(100)
 INPUTS = Inputs(PROFILES, PROFILES, POPULATION)
@@ -31,7 +31,7 @@ WORDS = ("variant=idm", "evaluation.baselines=[direct,human]", "evaluation.drive
 BLOCK = "evaluation.batch_size=3"
 
 
-def settings(*overrides: str) -> DictConfig:
+def settings(*overrides: str) -> EvaluateConfig:
     return tiny("evaluate", *WORDS, *overrides, agent=False)
 
 

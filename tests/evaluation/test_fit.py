@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 from helpers import compose
-from omegaconf import OmegaConf
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
@@ -13,8 +12,8 @@ from lcc_rl.evaluation.fit import check_policy
 def test_observed_entries_in_another_order_are_refused() -> None:
     own, cfg = compose("alcc"), compose("alcc")
     check_policy(cfg, own)
-    scales = OmegaConf.to_container(cfg.observation.scales)
-    cfg.observation.scales = dict(reversed(scales.items()))
+    scales = cfg.observation["scales"]
+    cfg.observation["scales"] = dict(reversed(scales.items()))
     words = "another order of observation.scales: expected scales.ahead.speed, .* got scales.behind"
     with pytest.raises(ConfigError, match=words):
         check_policy(cfg, own)

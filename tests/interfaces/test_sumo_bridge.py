@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 import sumo_ring
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from lcc_rl.config import load
@@ -44,9 +43,8 @@ def leader_speed() -> Tensor:
 def own_motion(driver: str) -> tuple[Tensor, Tensor]:
     """Return speeds and gaps, ``[time + 1, 2]``, in this package's environment."""
     cfg = load("evaluate", ["variant=alcc", "task=i24-follow5", f"scenario.horizon={STEPS}"])
-    OmegaConf.set_struct(cfg, False)
     cfg.scenario.string = "automated human"
-    cfg.scenario.controllers.human = HUMAN
+    cfg.scenario.controllers["human"] = HUMAN
     policy: Any = None
     if driver.startswith("pretrained"):
         weights, own = load_policy(driver)

@@ -9,7 +9,6 @@ import torch
 from commands import tiny
 from helpers import POPULATION
 from matplotlib.colors import to_rgb
-from omegaconf import OmegaConf
 from PIL import Image
 
 from lcc_rl.commands import evaluation
@@ -89,7 +88,7 @@ def pixels(figure, path) -> np.ndarray:
 
 def test_the_image_brakes_in_red_below_and_accelerates_in_blue_above(tmp_path) -> None:
     steps = pd.DataFrame({"strategy": [], "training_seed": [], "profile": [], "driver_id": []})
-    figure = accelerations(grid(), steps, OmegaConf.create({"scenario": {}}))
+    figure = accelerations(grid(), steps, {"scenario": {}})
     titles = [axis.get_title(loc="right") for axis in figure.axes[:4]]
     assert titles == ["alcc at 2 m/s", "alcc at 6 m/s", "idm tuned at 2 m/s", "idm tuned at 6 m/s"]
     image = pixels(figure, tmp_path / "map.png")

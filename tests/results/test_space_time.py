@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from omegaconf import OmegaConf
 
 from lcc_rl.results.drawing import save
 from lcc_rl.results.space_time import space_time
@@ -15,7 +14,7 @@ TIME = 0.1 * np.arange(1, 101)
 
 def config(string="automated human*2", road="open"):
     scenario = {"string": string, "road": road, "circumference": 60.0, "vehicle_length": 5.0}
-    return OmegaConf.create({"scenario": scenario})
+    return {"scenario": scenario}
 
 
 def steps(name: str, stops: float) -> pd.DataFrame:

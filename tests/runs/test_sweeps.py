@@ -35,6 +35,7 @@ from lcc_rl.runs.sweeps import (
     run_name,
     sweep_name,
 )
+from lcc_rl.schemas import as_plain
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -48,8 +49,9 @@ def test_the_same_command_gets_the_same_folder() -> None:
 
 def hydra_like(sweep: Path, *overrides: str):
     """Return a job's whole configuration as Hydra builds it: the run's, and Hydra's own node."""
-    cfg = OmegaConf.create(OmegaConf.to_container(load("train", overrides)))
+    cfg = OmegaConf.create(as_plain(load("train", overrides)))
     own = {"overrides": {"task": list(overrides)}, "sweep": {"dir": str(sweep)}, "sweeper": {}}
+    own["job"] = {"config_name": "train"}
     cfg.hydra = own
     return cfg
 

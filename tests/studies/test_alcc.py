@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 from helpers import POPULATION, wavy_profiles
-from omegaconf import OmegaConf
 
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.data.profiles import SingleProfile, Split
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.schemas import as_text
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.alcc.settings import PRECISE, followers_change, followers_study
@@ -25,8 +25,8 @@ def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> No
         assert [f"variant={variant}" for variant in change.variants] == [
             run.overrides[1] for run in runs
         ]
-        seen.setdefault(OmegaConf.to_yaml(runs[0].compose()), []).append(name)
-    main = OmegaConf.to_yaml(study.runs(tmp_path)[0].compose())
+        seen.setdefault(as_text(runs[0].compose()), []).append(name)
+    main = as_text(study.runs(tmp_path)[0].compose())
     # The recipe itself, and nothing else is.
     assert seen.pop(main) == ["recipe_paper_alcc", "gamma_0.9"]
     assert all(len(names) == 1 for names in seen.values())

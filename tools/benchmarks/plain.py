@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable
+from copy import deepcopy
 from functools import cache
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -26,10 +26,11 @@ from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.pieces.rewards import TOUCH
+from lcc_rl.schemas import StudyConfig
 
 
 @cache
-def study(quick: bool) -> tuple[DictConfig, Inputs]:
+def study(quick: bool) -> tuple[StudyConfig, Inputs]:
     """Configuration and inputs of the ALCC study on the synthetic stream."""
     cfg = load("train", ["variant=alcc"])
     return cfg, load_inputs(cfg, stream(quick).load().episodes)
@@ -46,9 +47,8 @@ def alcc(
 ) -> TransformedEnv:
     """Build the ALCC environment; the automated vehicle starts with the given time gap [s]."""
     cfg, inputs = study(options.quick)
-    cfg = cfg.copy()
-    cfg.scenario.start.automated.time_gap = initial_time_gap
-    cfg.scenario.start.automated.gap_range = [1.0, 1.0]
+    cfg = deepcopy(cfg)
+    cfg.scenario.start["automated"] |= {"time_gap": initial_time_gap, "gap_range": [1.0, 1.0]}
     cfg.scenario.string = f"automated human*{followers}"
     return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -52,7 +53,7 @@ def medium(run: Run) -> None:
 
 def trainer(options: Namespace, batch: int, steps: int, folder: Path) -> Run:
     """One iteration of the package's training: so many transitions and as many updates."""
-    cfg = study(options.quick)[0].copy()
+    cfg = deepcopy(study(options.quick)[0])
     cfg.training.environments, cfg.training.segment = 20, steps // 20
     cfg.training.episodes, cfg.training.compiled = 10**6, options.compile
     env = short(options, 20, steps // 20)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lcc_rl.commands.pipeline import TRAJECTORIES, known_settings, root_key
-from lcc_rl.config import require
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require, unknown_name
 from lcc_rl.runs.sweeps import key_of
 from lcc_rl.studies.runner import (
     EPISODES,
