@@ -126,7 +126,7 @@ def test_overrides_are_read_as_they_are_meant() -> None:
 def test_identity_sees_values_and_no_order_or_place() -> None:
     base = identity(load("train"))
     assert identity(load("train", ["seed=1"])) != base
-    same = ["trust=[mine]", "logger=tensorboard", "logger.where=/x", "training.keep_every=5"]
+    same = ["trust=[mine]", "logger=rows", "logger.where=/x", "training.keep_every=5"]
     assert identity(load("train", same)) == base
     assert identity(load("train", ["data.keep=a.csv"])) == base
 
