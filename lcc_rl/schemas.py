@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field
 
-from lcc_rl.errors import LAST_SEED, ConfigError
+from lcc_rl.errors import LAST_SEED, ConfigError, require
 from lcc_rl.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
 
@@ -79,8 +79,15 @@ class TrainingConfig(Settings):
     checkpoint_every: Count
     keep_every: Count | None = None
     compiled: bool | None = None
-    collector: str = "string"
+    collector: Literal["string", "torchrl"] = "string"
     gap_range: list[float]
+
+    def settled(self) -> None:
+        require(
+            self.episodes % self.environments == 0,
+            f"training.episodes ({self.episodes}) must be a multiple of training.environments "
+            f"({self.environments})",
+        )
 
 
 class EvaluationConfig(Settings):
@@ -153,6 +160,23 @@ class TrainConfig(StudyConfig):
 
     objective: str | list[str] = "total_path_energy_kj"
     logger: Node = None
+
+    def settled(self) -> None:
+        super().settled()
+        if self.agent is None:
+            return
+        length, segment = self.scenario.horizon, self.training.segment
+        require(
+            length % segment == 0,
+            f"training.segment ({segment}) must divide scenario.horizon ({length})",
+        )
+        window, count = self.agent.get("best_window") or 0, self.training.environments
+        require(
+            window % count == 0 and window <= self.training.episodes,
+            f"agent.best_window ({window}) must be a multiple of training.environments ({count}) "
+            f"and at most training.episodes ({self.training.episodes}), or null: the last policy "
+            "is kept",
+        )
 
 
 class EvaluateConfig(StudyConfig):

@@ -11,6 +11,7 @@ from commands import AGENT, HORIZON, run_command
 from helpers import POPULATION, slow_but
 
 from lcc_rl import results
+from lcc_rl.agents.actor import ACTION, shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.agents.replay import LEARNED_FROM, Trainer, transitions
 from lcc_rl.commands import evaluation, training
@@ -18,8 +19,6 @@ from lcc_rl.config import identity, load
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.policies import shared_policy
-from lcc_rl.policies.actor import ACTION
 from lcc_rl.results.policies import load_policy
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs

@@ -10,13 +10,13 @@ import pytest
 import torch
 from helpers import POPULATION, REWARD, TERMS, compose, make_agent, slow_but, string, wavy_profiles
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.gradient import GradientTrainer
-from lcc_rl.agents.loop import derived_seed
+from lcc_rl.agents.agent import derived_seed
 from lcc_rl.config import identity, load
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
-from lcc_rl.policies import shared_policy
 
 SMALL = (
     "agent=analytic",
@@ -98,7 +98,7 @@ def test_the_value_is_fitted_to_returns_of_all_lengths(every) -> None:
     """Against the definition, episode by episode: the last stretch is short, one collides."""
     agent = make_agent(compose("alcc", *SMALL, f"agent.value_every={every}"))
     generator = torch.Generator().manual_seed(0)
-    steps, own = 7, agent.settings
+    steps, own = 7, agent
     moments = torch.randn(3, steps + 1, 1, 7, generator=generator)
     rewards = torch.randn(3, steps, 1, generator=generator)
     running = torch.ones(3, steps, 1)

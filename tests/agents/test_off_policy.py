@@ -12,13 +12,13 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.off_policy import leaves
 from lcc_rl.agents.replay import Trainer, draws
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.policies import shared_policy
 
 SMALL = (
     "training.episodes=16",

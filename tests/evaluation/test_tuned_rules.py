@@ -6,12 +6,12 @@ import pytest
 import torch
 from helpers import compose
 
+from lcc_rl.agents.rules import ACCRule, IDMRule
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import TUNED, baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.rules import idm_acc, linear_acc
 from lcc_rl.pieces import IDMACC, LinearACC
-from lcc_rl.policies.rules import ACCRule, IDMRule
 
 
 @pytest.mark.parametrize("name", TUNED)

@@ -29,6 +29,7 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
+from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
@@ -37,7 +38,6 @@ from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.cacc import Gains
 from lcc_rl.pieces import CACC, HCFS, Communication, DeadBeat, parse_string
 from lcc_rl.pieces.world import World
-from lcc_rl.policies import ControllerPolicy
 
 # -- dead-beat -------------------------------------------------------------------------------------
 
