@@ -161,23 +161,6 @@ class TrainConfig(StudyConfig):
     objective: str | list[str] = "total_path_energy_kj"
     logger: Node = None
 
-    def settled(self) -> None:
-        super().settled()
-        if self.agent is None:
-            return
-        length, segment = self.scenario.horizon, self.training.segment
-        require(
-            length % segment == 0,
-            f"training.segment ({segment}) must divide scenario.horizon ({length})",
-        )
-        window, count = self.agent.get("best_window") or 0, self.training.environments
-        require(
-            window % count == 0 and window <= self.training.episodes,
-            f"agent.best_window ({window}) must be a multiple of training.environments ({count}) "
-            f"and at most training.episodes ({self.training.episodes}), or null: the last policy "
-            "is kept",
-        )
-
 
 class EvaluateConfig(StudyConfig):
     """``lcc-rl evaluate``."""

@@ -16,7 +16,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import world_of
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.nodes import TARGET, build, short_name
 from lcc_rl.pieces import Observation
@@ -62,6 +62,7 @@ def make_trainer(
     Raises:
         ConfigError: naming the option at fault, or if no vehicle takes the agent's action.
     """
+    _check_lengths(cfg)
     env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
     if not list(env.full_action_spec.keys(True, True)):
         kind = short_name(cfg.scenario.controllers[AUTOMATED].get(TARGET))
@@ -73,3 +74,18 @@ def make_trainer(
     loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
     return trained
+
+
+def _check_lengths(cfg: StudyConfig) -> None:
+    """Check that the length of a training and those of its parts go together."""
+    settings, horizon = cfg.training, cfg.scenario.horizon
+    require(
+        horizon % settings.segment == 0,
+        f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})",
+    )
+    window, count = cfg.agent.get("best_window") or 0, settings.environments
+    require(
+        window % count == 0 and window <= settings.episodes,
+        f"agent.best_window ({window}) must be a multiple of training.environments ({count}) and "
+        f"at most training.episodes ({settings.episodes}), or null: the last policy is kept",
+    )

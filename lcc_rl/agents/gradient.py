@@ -16,7 +16,6 @@ from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, episode_statistics
 from lcc_rl.agents.simulated import SimulatedLoop
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
-from lcc_rl.envs.step import pieces_of
 from lcc_rl.pieces.base import next_key
 
 log = logging.getLogger("lcc_rl")
@@ -65,7 +64,7 @@ class GradientTrainer(SimulatedLoop[Analytic]):
             begun = time.perf_counter()
             state, record = source.play(state, self.agent.policy.module, self.settings.segment)
             data = source.assemble(record)
-            check_batch(data, pieces_of(self.env))
+            check_batch(data)
             collected = time.perf_counter()
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)

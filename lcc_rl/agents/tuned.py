@@ -21,7 +21,6 @@ from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, episode_statistics
 from lcc_rl.agents.simulated import SimulatedAgent, SimulatedLoop
 from lcc_rl.envs.rollout import DifferentiableRollout
-from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, how_to_install
 from lcc_rl.settings import Count, Positive
 
@@ -136,7 +135,7 @@ class SearchLoop(SimulatedLoop[Tuned]):
             network = self.agent.policy.module
             _, record = source.play(source.start(), network, self.horizon)
             data = source.assemble(record)
-            check_batch(data, pieces_of(self.env))
+            check_batch(data)
             running = 1.0 - (data["next", "terminated"].cumsum(1) > 0).double()
             objective = self.objective.score(data) * running
         shares = self.objective.missed(data, running)

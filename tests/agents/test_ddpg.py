@@ -12,7 +12,6 @@ from lcc_rl.agents import DDPG
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.off_policy import leaves
 from lcc_rl.config import load
-from lcc_rl.errors import ConfigError
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.policies import save_policy
 
@@ -185,16 +184,3 @@ def test_a_restored_agent_keeps_count_of_its_target_steps() -> None:
     second.load_state_dict(deepcopy(first.state_dict()))
     for step in range(4, 9):
         assert first.update(transitions(64, step)) == second.update(transitions(64, step))
-
-
-@pytest.mark.parametrize(
-    ("every", "words"),
-    [
-        ({"actor": 1}, "entries actor and critic, got actor"),
-        ({"actor": 1, "critic": 0}, "critic"),
-        ({"actor": 1, "critc": 1}, "critc"),
-    ],
-)
-def test_target_every_is_checked(every: dict[str, int], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        agent(target_every=every)
