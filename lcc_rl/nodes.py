@@ -71,7 +71,10 @@ def with_defaults(value: Any, where: str = "") -> Any:
     }
     kind = find_target(str(found[TARGET]), where) if TARGET in found else None
     if inspect.isclass(kind) and issubclass(kind, Settings):
-        found |= {key: x for key, x in defaults(kind).items() if key not in found}
+        for key, default in defaults(kind).items():
+            own = found.setdefault(key, default)
+            if isinstance(own, Mapping) and isinstance(default, Mapping):
+                found[key] = {**default, **own}
     return found
 
 
@@ -91,7 +94,7 @@ def check_nodes(value: Any, where: str) -> None:
             if inspect.isclass(kind) and issubclass(kind, Settings):
                 build(node, key)
             else:
-                _check_names(getattr(kind, "Settings", kind), node, key)
+                _check_names(kind, node, key)
 
 
 def build(
@@ -144,9 +147,6 @@ def build(
 def _made(kind: Any, given: dict[str, Any], where: str, resources: dict[str, Any]) -> Any:
     if inspect.isclass(kind) and issubclass(kind, Settings):
         return parse(kind, given, where)
-    own = getattr(kind, "Settings", None)
-    if own is not None:
-        resources, given = {**resources, "settings": _made(own, given, where, {})}, {}
     known = _check_names(kind, given, where)
     for key, value in given.items():
         if value == MISSING:

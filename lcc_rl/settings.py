@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from functools import wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
@@ -104,11 +104,31 @@ def values(settings: Settings) -> dict[str, Any]:
 
 
 def defaults(kind: type[Settings]) -> dict[str, Any]:
-    """Return the defaults of a class's settings by name."""
+    """Return the defaults of a class's settings by name, as plain containers."""
     found = {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         if field.default is not dataclasses.MISSING:
-            found[field.name] = field.default
+            found[field.name] = _plain(field.default)
         elif field.default_factory is not dataclasses.MISSING:
-            found[field.name] = field.default_factory()
+            found[field.name] = _plain(field.default_factory())
     return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Settings):
+        return values(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def given_as(kind: type[Settings]) -> Any:
+    """Return the annotation of a setting that has settings itself, given as a mapping."""
+
+    def made(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        try:
+            return kind(**value)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+
+    return Annotated[kind, BeforeValidator(made)]

@@ -34,6 +34,7 @@ from agent_results import (
 from limit_results import comparisons, figure_of_limits, table_of_limits
 from matplotlib.figure import Figure
 
+from lcc_rl.agents.rules import NETWORK
 from lcc_rl.commands.pipeline import root_key
 from lcc_rl.commands.training import POLICIES
 from lcc_rl.config import load
@@ -42,7 +43,6 @@ from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import trained
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.policies.rules import NETWORK
 from lcc_rl.results.drawing import save
 from lcc_rl.results.policies import load_policy
 from lcc_rl.runs.cli import main_guard

@@ -95,7 +95,7 @@ def calibrated(cfg: CalibrateConfig, episodes: pd.DataFrame, condition: str) -> 
     """Calibrate all episodes in both modes; one row per episode and mode."""
     calibrator = build(cfg.calibration, "calibration", CALLED)
     parts = []
-    for mode in cfg.calibration.modes:
+    for mode in cfg.calibration["modes"]:
         start = process_time()
         drivers = replace(calibrator, modes=[mode])(episodes, seed=cfg.seed).drivers
         spent = process_time() - start

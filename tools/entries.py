@@ -52,7 +52,7 @@ def configurations() -> Iterator[StudyConfig]:
         cfg = load("train", [f"variant={path.stem}", string])
         yield cfg
         if cfg.deployed is not None:
-            cfg.scenario.controllers.automated = cfg.deployed
+            cfg.scenario.controllers["automated"] = cfg.deployed
             yield cfg
     knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", *knowledge])

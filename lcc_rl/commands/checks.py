@@ -9,7 +9,6 @@ from typing import Any
 from tensordict import TensorDictBase
 
 from lcc_rl.agents.factory import build_agent, learns, make_trainer
-from lcc_rl.agents.sizes import check_length, check_window
 from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
@@ -78,8 +77,6 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if learns(cfg):
         agent = build_agent(cfg, population, cfg.device)
-        check_length(cfg.training, horizon)
-        check_window(cfg.agent.get("best_window"), cfg.training)
         trial.training.environments, trial.training.episodes = 2, 2
         make_trainer(trial, agent, profiles, population, folder)
     env = build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
 from lcc_rl.commands.evaluation import EPISODES, IDENTITY, evaluate_and_write
@@ -19,7 +20,6 @@ from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows, parquet_metadata
-from lcc_rl.policies import shared_policy
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
 from lcc_rl.results.string_tables import case_table

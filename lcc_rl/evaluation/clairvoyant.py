@@ -22,7 +22,6 @@ from lcc_rl.energy import Fleet, as_fleet, build_energy
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.envs.rollout import ACTION
-from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import any_leader, pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
@@ -105,7 +104,7 @@ def clairvoyant(
         share = iteration / iterations
         _, record = source.play(source.start(given), network, steps, shifts)
         data = source.assemble(record)
-        check_batch(data, pieces_of(env), who=strategy.title)
+        check_batch(data, who=strategy.title)
         energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
         missed = misses(data, string)
         _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)

@@ -17,6 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load
 from lcc_rl.envs.inputs import string_of
@@ -26,7 +27,6 @@ from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.nodes import TARGET, short_name
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.policies import shared_policy
 from lcc_rl.schemas import AUTO, StudyConfig
 
 log = logging.getLogger("lcc_rl")

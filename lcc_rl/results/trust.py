@@ -11,7 +11,7 @@ from lcc_rl.nodes import TARGET, find_target, forget_places, settings_at
 from lcc_rl.schemas import parse_config
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
-ROOMS = "agents data drivers energy evaluation functional pieces policies runs.loggers synthetic"
+ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
 

@@ -59,8 +59,8 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 
 @pytest.mark.parametrize("model", slow_but(["idm", "gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
-    cfg.calibration.model, cfg.calibration.objective = model, "both"
-    cfg.calibration.holdout = 0.3
+    cfg.calibration["model"], cfg.calibration["objective"] = model, "both"
+    cfg.calibration["holdout"] = 0.3
     out = io.StringIO()
     calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     for text in ("held out: RMSPE", "gap NRMSE [%], held out", "time gap [s]"):

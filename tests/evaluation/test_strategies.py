@@ -9,6 +9,7 @@ import torch
 from helpers import compose
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.agents.rules import ACCRule, IDMRule
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
@@ -24,7 +25,6 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.rules import idm_acc, linear_acc
 from lcc_rl.pieces import IDMACC, LinearACC
-from lcc_rl.policies.rules import ACCRule, IDMRule
 
 
 @pytest.mark.parametrize("name", TUNED)

@@ -51,7 +51,7 @@ def own_motion(driver: str) -> tuple[Tensor, Tensor]:
         policy = with_weights(own, weights, own.seed, driver, bootstrap()).policy
         cfg.observation = own.observation
     else:
-        cfg.scenario.controllers.automated = baseline_controller(driver)
+        cfg.scenario.controllers["automated"] = baseline_controller(driver)
         cfg.scenario.filters = {}
     profiles = from_records([leader_speed()], ["wave"], ["wave"], STEP)
     env = build_env(cfg, profiles, bootstrap(), 1, nominal=True)

@@ -30,6 +30,12 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
 import lcc_rl.pieces as room
+from lcc_rl.agents.controller import (
+    ControllerPolicy,
+    GaussianExploration,
+    make_actor,
+    shared_policy,
+)
 from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet
 from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.envs.step import Pieces
@@ -94,7 +100,6 @@ from lcc_rl.pieces import (
 )
 from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.world import World
-from lcc_rl.policies import ControllerPolicy, GaussianExploration, make_actor, shared_policy
 
 HORIZON, T = 12, 0.1
 FLEET = Fleet(

@@ -30,9 +30,9 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from lcc_rl import evaluate, train
+from lcc_rl.agents.actor import ConstantPolicy
 from lcc_rl.config import load
 from lcc_rl.envs.factory import build_agent, build_env, build_policy
-from lcc_rl.policies import ConstantPolicy
 from lcc_rl.results.files import read_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.schemas import TrainConfig

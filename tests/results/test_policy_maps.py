@@ -59,7 +59,7 @@ def test_signs_are_right_at_the_corners(name) -> None:
 def test_a_rule_does_what_its_law_says() -> None:
     rows = rows_of("idm tuned", ["variant=alcc"], [8.0])
     node = load("evaluate", ["variant=alcc", "controller@scenario.controllers.automated=idm_acc"])
-    own = node.scenario.controllers.automated
+    own = node.scenario.controllers["automated"]
     names = ("desired_speed", "time_gap", "acceleration", "deceleration", "min_gap")
     constants = [torch.tensor(float(own[name])) for name in names]
     gap, relative = (torch.tensor(rows[x].to_numpy()) for x in ("gap_m", "relative_speed_mps"))

@@ -22,7 +22,7 @@ TINY = ("experiment=smoke", "data.platoons=4", "data.recordings=2", "scenario.ho
 @pytest.mark.parametrize("name", ["alcc_limits", "alcc_mixture"])
 def test_policies_learned_within_limits_keep_their_filter_and_their_names(name, tmp_path) -> None:
     _, cfg = load_policy(f"pretrained/{name}")
-    assert cfg.scenario.filters.automated.time_gap == 2.45
+    assert cfg.scenario.filters["automated"]["time_gap"] == 2.45
     assert not {"data", "drivers", "leader", "split"} & set(cfg)
     how = ["variant=alcc", "policy=pretrained", f"compare=[pretrained/{name}]"]
     how += ["evaluation.baselines=[idm]"]

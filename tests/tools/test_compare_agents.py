@@ -198,8 +198,10 @@ def test_what_the_limits_would_run() -> None:
     runs = tool.runs_of_limits(options)
     assert len(runs) == 6
     configurations = [run.compose() for run in runs]
-    learned = {(cfg.agent.policy, cfg.agent._target_.split(".")[-1]) for cfg in configurations}
+    learned = {
+        (cfg.agent["policy"], cfg.agent["_target_"].split(".")[-1]) for cfg in configurations
+    }
     assert learned == {("network", "Analytic"), ("idm", "Tuned"), ("idm", "Analytic")}
     for cfg in configurations:
-        assert cfg.agent.limits == {"safety": None, "efficiency": 0.01}
-        assert cfg.scenario.filters.automated.time_gap == 2.45
+        assert cfg.agent["limits"] == {"safety": None, "efficiency": 0.01}
+        assert cfg.scenario.filters["automated"]["time_gap"] == 2.45

@@ -16,10 +16,11 @@ from benchmarks.harness import Row, Run, alternate, endings, first_calls, instal
 from benchmarks.plain import PlainLoop, alcc, check_resets, training
 from benchmarks.scalar import check_scalar, gymnasium_env
 from lcc_rl.agents import DDPG
+from lcc_rl.agents.actor import shared_policy
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.loop import REPORTED
 from lcc_rl.agents.replay import LEARNED_FROM
 from lcc_rl.envs import StringCollector
-from lcc_rl.policies import shared_policy
 
 OTHER = "stable-baselines3"
 BATCHED = "stable-baselines3, batched"
@@ -41,7 +42,7 @@ def collect(options: Namespace) -> list[Row]:
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     check_resets(options)
     batch, steps = (16, 10) if options.quick else (1024, 60)
-    policy = DDPG(observation_size=7, action_size=1, seed=0, device=options.device).policy
+    policy = DDPG().start(Scene(7, device=options.device)).policy
     runs: dict[str, Run] = {}
     for ending in endings(options):
         env = alcc(options, batch, 30)

@@ -15,6 +15,7 @@ from torchrl.envs import TransformedEnv
 
 from benchmarks.harness import TOLERANCE, Row, Run, alternate, endings, rows_of
 from benchmarks.plain import PlainLoop, study
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.evaluation.episodes import Episodes, Plan
 from lcc_rl.evaluation.metrics import LONG_TIME_GAP, PACE, UNSAFE_TTC
@@ -26,7 +27,6 @@ from lcc_rl.functional.power import acceleration_loss, motor_power, steady_power
 from lcc_rl.functional.random import uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.io.files import write_parquet
-from lcc_rl.policies import shared_policy
 
 OTHER = "plain loop"
 Sums = dict[str, Tensor]

@@ -28,7 +28,7 @@ class PlainUpdate:
     """
 
     def __init__(self, agent: DDPG, columns: Mapping[str, Tensor]) -> None:
-        settings, loss = agent.settings, agent.loss
+        settings, loss = agent, agent.loss
         self.settings, self.rows = settings, settings.batch_size
         self.columns = [columns[name] for name in COLUMNS]
         self.drawn = [column[: self.rows].clone() for column in self.columns]

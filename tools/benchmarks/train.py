@@ -16,7 +16,7 @@ from benchmarks.collect import OTHER, stable_baselines_model
 from benchmarks.harness import Row, Run, alternate, installed, rows_of
 from benchmarks.plain import alcc, study
 from lcc_rl.agents import DDPG
-from lcc_rl.agents.ddpg import DDPGSettings
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.replay import Trainer, transitions
 
 
@@ -57,8 +57,8 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path) -> Run:
     cfg.training.environments, cfg.training.segment = 20, steps // 20
     cfg.training.episodes, cfg.training.compiled = 10**6, options.compile
     env = short(options, 20, steps // 20)
-    settings = DDPGSettings(batch_size=batch, updates_per_transition=1.0)
-    agent = DDPG(7, 1, 0, settings, options.device)
+    agent = DDPG(batch_size=batch, updates_per_transition=1.0)
+    agent = agent.start(Scene(7, device=options.device))
     training = Trainer(agent, env, cfg.training, 0, folder, "benchmark")
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
     training.buffer.extend(transitions(played))

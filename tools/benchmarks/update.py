@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from argparse import Namespace
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +17,7 @@ from benchmarks.harness import Row, Run, alternate, installed, rows_of, times
 from benchmarks.plain import alcc
 from benchmarks.plain_update import PlainUpdate, check
 from lcc_rl.agents import DDPG
-from lcc_rl.agents.ddpg import DDPGSettings
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.replay import LEARNED_FROM, draws, transitions
 
 PLAIN = "plain update"
@@ -35,8 +34,8 @@ def update(options: Namespace) -> list[Row]:
     played = transitions(alcc(options, 1000).rollout(20, break_when_any_done=False))
     rows: list[Row] = []
     for batch, count in ((16, 2), (32, 2)) if options.quick else ((64, 60), (256, 40), (1024, 20)):
-        agent = DDPG(7, 1, 0, DDPGSettings(batch_size=batch), options.device)
-        storage = LazyTensorStorage(agent.settings.buffer_size, device=options.device)
+        agent = DDPG(batch_size=batch).start(Scene(7, device=options.device))
+        storage = LazyTensorStorage(agent.buffer_size, device=options.device)
         buffer = ReplayBuffer(storage=storage, batch_size=batch)
         buffer.extend(played)
         draw = draws(buffer, torch.Generator().manual_seed(0))
@@ -64,8 +63,8 @@ def plain_update(agent: DDPG, played: TensorDictBase) -> PlainUpdate:
     reached = {"reached": "observation", "reward": "reward", "terminated": "terminated"}
     columns = {name: played["next", key] for name, key in reached.items()}
     columns |= {name: played[name] for name in ("observation", "action")}
-    settings = replace(agent.settings, fused=False)
-    loss = DDPG(7, 1, 1, settings, agent.device)
+    plain = DDPG(batch_size=agent.batch_size, fused=False)
+    loss = plain.start(Scene(7, seed=1, device=agent.device))
     check(loss, PlainUpdate(loss, columns))
     return PlainUpdate(agent, columns)
 

@@ -15,10 +15,10 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from lcc_rl.errors import ConfigError, require_positive, unknown_name
+from lcc_rl.agents.actor import make_actor, seeded_mlp
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.rules import idm_acc, linear_acc
 from lcc_rl.pieces.observation import Observation
-from lcc_rl.policies.actor import make_actor, seeded_mlp
 
 SEEN = ("self.speed", "self.gap", "self.relative_speed")
 
@@ -50,7 +50,6 @@ class Rule(nn.Module, ABC):
             if name not in self.START:
                 raise unknown_name("constant of the rule", name, self.START)
         values = {**self.START, **given}
-        require_positive("agent.constants", **values)
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
         self.columns = [observation.column(name) for name in SEEN]

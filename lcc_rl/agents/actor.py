@@ -13,7 +13,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from lcc_rl.errors import require_whole
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.io.memory import require_memory
@@ -34,10 +33,8 @@ def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> M
         seed: seed of the weights.
 
     Raises:
-        ConfigError: if a size is no positive whole number, or the weights do not fit into memory.
+        ConfigError: if the weights do not fit into memory.
     """
-    for size in hidden:
-        require_whole(f"agent.hidden={list(hidden)}", 1, size=size)
     weights = sum(a * b for a, b in pairwise([inputs, *hidden, outputs]))
     require_memory({f"agent.hidden={list(hidden)}": WEIGHT * weights})
     with torch.random.fork_rng(devices=[]):
