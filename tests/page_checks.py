@@ -27,7 +27,7 @@ SHELL = {"source", "export", "ls"}
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 # Settings that a tool or command gives itself.
-ALWAYS = {"tools/compare_agents.py": ("agent=analytic",), "sumo": ("task=ring-22",)}
+ALWAYS = {"sumo": ("task=ring-22",)}
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
 LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
 CHOICES = set((ROOT / "conf").rglob("*.yaml"))

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import fleets
 import leaderboard
-from compare_lengths import figure_of_lengths
-from limit_results import figure_of_limits
+from kept_figures import figure_of_lengths, figure_of_limits
 from matplotlib.figure import Figure
 
 from lcc_rl.config import build, load, require
@@ -67,7 +66,7 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     assert ring is not None
     save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
     drawn = {
-        "limits.png": figure_of_limits(reference / "limits"),
+        "limits.png": figure_of_limits(read_parquet(reference / "limits" / "windows.parquet")),
         "record.png": figure_of_record(),
         "calibration.png": figure_of_lengths(read_parquet(reference / "calibration.parquet")),
     }
