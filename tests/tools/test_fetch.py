@@ -99,7 +99,7 @@ def test_a_location_arrives_whole_and_is_readable(portal, tmp_path) -> None:
 def test_an_interrupted_download_is_resumed(portal, tmp_path) -> None:
     output = tmp_path / "i80.csv"
     portal.spoil = lambda offset, content: None if offset == "20" else content
-    with pytest.raises(DataError, match="503.*run the same command again to resume"):
+    with pytest.raises(DataError, match=r"503.*run the same command again to resume"):
         run(portal, output, "--location", "i-80")
     assert not output.exists()
     portal.spoil, portal.offsets = lambda offset, content: content, []
