@@ -18,7 +18,7 @@ import leaderboard
 from kept_figures import figure_of_lengths, figure_of_limits
 from matplotlib.figure import Figure
 
-from lcc_rl.config import build, load, require
+from lcc_rl.config import build, load
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.io.files import read_parquet, write_parquet
@@ -56,8 +56,7 @@ def figure_of_record() -> Figure:
 
 def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     """Write the tables into the page and the figures; return the files written."""
-    code = leaderboard.main(["--reference", str(reference / "tasks"), "--page", str(page)])
-    require(code == 0, "the tables of the tasks could not be written")
+    leaderboard.write_tables(reference / "tasks", page)
     for task in fleets.SHOWN:
         where = ["--reference", str(reference / "tasks"), "--figures", str(figures)]
         fleets.main([task, *where])
