@@ -9,7 +9,6 @@ steps); it has no optimal velocity model, full velocity difference model or Gipp
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,7 +17,7 @@ import pandas as pd
 
 from lcc_rl.drivers.parameters import COLUMNS, IDM
 from lcc_rl.drivers.tables import load_drivers, models_of
-from lcc_rl.errors import DataError, LccError
+from lcc_rl.errors import DataError
 from lcc_rl.io.atomic import atomic_path
 
 # Attribute of a vType by parameter of the IDM; both are in m, s and m/s.
@@ -91,10 +90,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("target", help="XML file to write, for SUMO's --additional-files")
     parser.add_argument("--mode", help="local or global; by default the one that the table has")
     options = parser.parse_args(arguments)
-    try:
-        count = export(options.drivers, options.target, options.mode)
-    except LccError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    count = export(options.drivers, options.target, options.mode)
     print(f"{count} vehicle types in {options.target}")
     return 0
