@@ -149,8 +149,8 @@ def leave_out_foreign(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Leave out settings of a class that was replaced on the command line by another one.
 
     After ``scenario.controllers.automated._target_=mine.Rule`` the settings that the file gives
-    for its own class stay where the new one has them, too; what was typed always stays. So are
-    the settings that a recipe gives for an agent left out where nothing is learned.
+    for its own class stay where the new one has them, too; what was typed always stays.
+    A recipe's agent settings are dropped when nothing is learned.
     """
     if OmegaConf.is_dict(cfg.get("agent")) and TARGET not in cfg.agent:
         cfg.agent = None
@@ -292,7 +292,7 @@ def build_as(
     fits = isinstance(made, needed) if isinstance(needed, type) else None
     if fits is None:
         fits = all(hasattr(made, name) for name in typing.cast(Sequence[str], needed))
-    require(fits, f"{where}: expected {kind}, {type(made).__name__} is none ({node[TARGET]})")
+    require(fits, f"{where}: expected {kind}, got {type(made).__name__} ({node[TARGET]})")
     return made
 
 

@@ -1,4 +1,4 @@
-"""Limits of a training: their prices are learned until they are kept, no dearer than needed.
+"""Limits of a training: prices rise until the limits hold, and no further.
 
 A limit is a share of the time that must not be exceeded. Its smooth stand-in, which has a gradient,
 is priced by a multiplier; the multiplier follows the share that is really missed (a proxy
