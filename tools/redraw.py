@@ -15,14 +15,12 @@ from pathlib import Path
 
 import fleets
 import leaderboard
-from compare_lengths import figure_of_lengths
-from limit_results import figure_of_limits
+from kept_figures import figure_of_lengths, figure_of_limits
 from matplotlib.figure import Figure
 
 from lcc_rl.config import load
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.errors import require
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.nodes import build
 from lcc_rl.results.drawing import save
@@ -59,8 +57,7 @@ def figure_of_record() -> Figure:
 
 def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     """Write the tables into the page and the figures; return the files written."""
-    code = leaderboard.main(["--reference", str(reference / "tasks"), "--page", str(page)])
-    require(code == 0, "the tables of the tasks could not be written")
+    leaderboard.write_tables(reference / "tasks", page)
     for task in fleets.SHOWN:
         where = ["--reference", str(reference / "tasks"), "--figures", str(figures)]
         fleets.main([task, *where])
@@ -69,7 +66,7 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     assert ring is not None
     save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
     drawn = {
-        "limits.png": figure_of_limits(reference / "limits"),
+        "limits.png": figure_of_limits(read_parquet(reference / "limits" / "windows.parquet")),
         "record.png": figure_of_record(),
         "calibration.png": figure_of_lengths(read_parquet(reference / "calibration.parquet")),
     }

@@ -65,4 +65,3 @@ def test_export_leaves_out_what_belongs_to_one_machine(tmp_path) -> None:
     assert "variant: alcc\n" in content["config"]
     assert "/home/me" not in content["config"]
     assert content["provenance"].startswith("a trial")
-    assert tool.main([str(tmp_path / "missing.pt"), "nothing"]) == 1
