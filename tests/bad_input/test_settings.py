@@ -78,9 +78,9 @@ WRONG = {
 }
 # Options without effect on the variant, and why.
 IGNORED = {
-    "variant=cacc split=vehicle": "leader=trajectories",
+    "variant=cacc split.by=vehicle": "leader=trajectories",
     "variant=cacc drivers=kde": "there is no human driver",
-    "scenario=ring agent=none split=vehicle": "a ring road has no leader",
+    "scenario=ring agent=none split.by=vehicle": "a ring road has no leader",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "variant=idm training.episodes=20": "variant idm learns nothing",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",

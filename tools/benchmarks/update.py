@@ -57,8 +57,8 @@ def times(count: int, function: Run) -> Run:
 
 def own_update(agent: DDPG, played: TensorDictBase) -> Run:
     """Return the agent's update with batches from a buffer of its size."""
-    storage = LazyTensorStorage(agent.settings.buffer_size, device=agent.device)
-    buffer = ReplayBuffer(storage=storage, batch_size=agent.settings.batch_size)
+    storage = LazyTensorStorage(agent.buffer_size, device=agent.device)
+    buffer = ReplayBuffer(storage=storage, batch_size=agent.batch_size)
     buffer.extend(played)
     draw = draws(buffer, torch.Generator().manual_seed(0))
     return lambda: agent.update(next(draw))
