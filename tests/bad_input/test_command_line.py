@@ -55,9 +55,9 @@ def mine(tmp_path, monkeypatch) -> None:
 
 KINDS = (
     ("foreign_pieces.Raises", "Raises cannot be built: KeyError: 'inside'"),
-    ("foreign_pieces.Other", "expected an? .*, Other is none"),
+    ("foreign_pieces.Other", "expected an? .*, got Other"),
     ("foreign_broken.X", "cannot find 'foreign_broken.X': on import"),
-    ("os.getcwd", "expected an? .*, str is none"),
+    ("os.getcwd", "expected an? .*, got str"),
     ("os.sep", "'os.sep' is no class or function"),
     ("builtins.dict", "cannot be built from settings"),
 )
@@ -77,7 +77,7 @@ def test_a_node_of_the_wrong_kind_is_named(mine, tmp_path, node, target, words) 
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["+logger={_target_: os.getcwd}"], "logger: expected a logger, str is none"),
+        (["+logger={_target_: os.getcwd}"], "logger: expected a logger, got str"),
         (["scenario.start.automated._target_=os.getcwd"], "start.automated: expected a start, str"),
         (["reward.terms.safety._target_=builtins.print"], "reward.terms.safety: expected a piece"),
         (["reward.terms.hdv_energy=null"], "got None; to leave it out, say ~reward.terms.hdv_e"),
@@ -96,7 +96,7 @@ def test_nodes_of_other_kinds(tmp_path, overrides, words) -> None:
 
 
 def test_a_calibrator_that_is_none(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="calibration: expected a calibrator, str is none"):
+    with pytest.raises(ConfigError, match="calibration: expected a calibrator, got str"):
         calibration.run(load("calibrate", ["calibration._target_=os.getcwd"]), tmp_path)
 
 
