@@ -25,6 +25,78 @@ def finished(tmp_path_factory) -> Path:
     return folder / "run"
 
 
+<<<<<<< HEAD
+=======
+# -- nodes that describe something else ------------------------------------------------------------
+
+BROKEN = """
+class Raises:
+    def __init__(self, **settings):
+        raise KeyError("inside")
+
+class Other:
+    pass
+
+class Called:
+    __call__ = None
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch) -> None:
+    (tmp_path / "foreign_pieces.py").write_text(BROKEN)
+    (tmp_path / "foreign_broken.py").write_text("raise RuntimeError('on import')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+KINDS = (
+    ("foreign_pieces.Raises", "Raises cannot be built: KeyError: 'inside'"),
+    ("foreign_pieces.Other", "expected an? .*, got Other"),
+    ("foreign_broken.X", "cannot find 'foreign_broken.X': on import"),
+    ("os.getcwd", "expected an? .*, got str"),
+    ("os.sep", "'os.sep' is no class or function"),
+    ("builtins.dict", "cannot be built from settings"),
+)
+NODES = ("data", "split", "drivers", "observation", "agent", AUTO)
+
+
+@pytest.mark.parametrize(
+    ("node", "target", "words"),
+    [*(("split", *kind) for kind in KINDS), *((node, *KINDS[1]) for node in NODES[:1] + NODES[2:])],
+)
+def test_a_node_of_the_wrong_kind_is_named(mine, tmp_path, node, target, words) -> None:
+    cfg = load("train", ["experiment=smoke", "variant=alcc", f"{node}._target_={target}"])
+    with pytest.raises(ConfigError, match=rf"^{node}.*{words}.*$"):
+        training.run(cfg, tmp_path / "run", quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["+logger={_target_: os.getcwd}"], "logger: expected a logger, got str"),
+        (["scenario.start.automated._target_=os.getcwd"], "start.automated: expected a start, str"),
+        (["reward.terms.safety._target_=builtins.print"], "reward.terms.safety: expected a piece"),
+        (["reward.terms.hdv_energy=null"], "got None; to leave it out, say ~reward.terms.hdv_e"),
+        (
+            ["reward.terms.safety.weight=-1"],
+            "reward.terms.safety.weight must be greater than or equal to 0, got",
+        ),
+        (["scenario.pieces.ttc._target_=fractions.Fraction"], "pieces.ttc: expected a piece"),
+        (["variant=cacc", "leader._target_=os.getcwd"], "leader: expected a source of leaders"),
+    ],
+)
+def test_nodes_of_other_kinds(tmp_path, overrides, words) -> None:
+    base = ["variant=alcc"] if "variant=cacc" not in overrides else []
+    with pytest.raises(ConfigError, match=words):
+        training.run(load("train", ["experiment=smoke", *base, *overrides]), tmp_path, quiet=True)
+
+
+def test_a_calibrator_that_is_none(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="calibration: expected a calibrator, got str"):
+        calibration.run(load("calibrate", ["calibration._target_=os.getcwd"]), tmp_path)
+
+
+>>>>>>> tools
 # -- options ---------------------------------------------------------------------------------------
 
 

@@ -19,7 +19,6 @@ def test_everything_is_drawn_again_and_the_page_is_the_same(tmp_path) -> None:
     assert page.read_text() == (ROOT / "docs" / "tasks.md").read_text()
     images = [path for path in written if path.suffix == ".png"]
     assert {path.name for path in images} == {
-        "calibration.png",
         "fleets.png",
         "fleets_ring.png",
         "ring.png",
