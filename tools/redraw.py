@@ -22,14 +22,10 @@ from lcc_rl.config import load
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.io.files import read_parquet, write_parquet
-<<<<<<< HEAD
 from lcc_rl.nodes import build
-from lcc_rl.results.drawing import save
-=======
 from lcc_rl.results.drawing import in_words, legend_above, new_figure, save
 from lcc_rl.results.figures import style
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
->>>>>>> tools
 from lcc_rl.results.space_time import space_time
 from lcc_rl.results.string_figures import record_figure
 from lcc_rl.runs.cli import main_guard
