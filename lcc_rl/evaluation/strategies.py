@@ -183,12 +183,8 @@ def _target(cfg: StudyConfig) -> str:
 
 
 def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
-    """Return the nodes of the controllers of all baselines in which somebody is automated."""
-    return [
-        strategy.cfg.scenario.controllers[AUTOMATED]
-        for strategy in baselines(cfg)
-        if strategy.name != DIRECT
-    ]
+    automated = (one for one in baselines(cfg) if one.name != DIRECT)
+    return [one.cfg.scenario.controllers[AUTOMATED] for one in automated]
 
 
 def no_policy(cfg: StudyConfig) -> ConfigError:

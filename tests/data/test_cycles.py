@@ -93,7 +93,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, rows, words) -> None:
 @pytest.mark.parametrize(
     ("overrides", "error", "words"),
     [
-        (["leader=paper"], ConfigError, r"path is required"),
+        (["leader=paper"], ConfigError, "path is required"),
         (["leader=paper", "leader.path=nowhere.csv"], DataError, r"nowhere\.csv: no such file"),
         (["leader.cases.case_1.path=uds"], DataError, "no shipped cycle"),
         (["leader.cases.case_1.start_s=595"], DataError, "covers 0–600 s, not the stretch"),

@@ -17,7 +17,7 @@ from lcc_rl.nodes import build
 
 
 def configured(name: str, *overrides: str) -> NgsimSource | EpisodesSource:
-    return build(load("train", [f"data={name}", *overrides]).data, "data")
+    return build(load("calibrate", [f"data={name}", *overrides]).data, "data")
 
 
 @pytest.fixture
