@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field
 
-from lcc_rl.errors import LAST_SEED, ConfigError, require
+from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
 
@@ -81,13 +81,6 @@ class TrainingConfig(Settings):
     compiled: bool | None = None
     collector: Literal["string", "torchrl"] = "string"
     gap_range: list[float]
-
-    def settled(self) -> None:
-        require(
-            self.episodes % self.environments == 0,
-            f"training.episodes ({self.episodes}) must be a multiple of training.environments "
-            f"({self.environments})",
-        )
 
 
 class EvaluationConfig(Settings):

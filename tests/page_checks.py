@@ -28,7 +28,6 @@ MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 # Settings that a tool or command gives itself.
 ALWAYS = {"tools/sumo_ring.py": ("task=ring-22",)}
-OWN_AGENTS = ("tools/compare_agents.py",)  # their settings belong to the agents that they compare
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
 LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
 CHOICES = set((ROOT / "conf").rglob("*.yaml"))
@@ -54,9 +53,8 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
     elif program.endswith("python"):
         assert (ROOT / rest[0]).exists(), rest[0]
         settings = parsed(rest[0], rest[1:])
-        if rest[0] not in OWN_AGENTS:
-            typed = (word for word in settings if "=" in word)
-            once("train", (*ALWAYS.get(rest[0], ()), *typed))
+        typed = (word for word in settings if "=" in word)
+        once("train", (*ALWAYS.get(rest[0], ()), *typed))
     elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:
         composed(ENTRIES.get(rest[0], rest[0]), rest[1:], own, fails)
     elif program == "lcc-rl":

@@ -62,7 +62,6 @@ def make_trainer(
     Raises:
         ConfigError: naming the option at fault, or if no vehicle takes the agent's action.
     """
-    _check_lengths(cfg)
     env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
     if not list(env.full_action_spec.keys(True, True)):
         kind = short_name(cfg.scenario.controllers[AUTOMATED].get(TARGET))
@@ -76,9 +75,18 @@ def make_trainer(
     return trained
 
 
-def _check_lengths(cfg: StudyConfig) -> None:
-    """Check that the length of a training and those of its parts go together."""
+def check_lengths(cfg: StudyConfig) -> None:
+    """Check that the length of a training and those of its parts go together.
+
+    Raises:
+        ConfigError: naming the two that do not.
+    """
     settings, horizon = cfg.training, cfg.scenario.horizon
+    require(
+        settings.episodes % settings.environments == 0,
+        f"training.episodes ({settings.episodes}) must be a multiple of training.environments "
+        f"({settings.environments})",
+    )
     require(
         horizon % settings.segment == 0,
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})",

@@ -8,7 +8,7 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from lcc_rl.agents.factory import build_agent, learns, make_trainer
+from lcc_rl.agents.factory import build_agent, check_lengths, learns, make_trainer
 from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
@@ -76,6 +76,7 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if learns(cfg):
+        check_lengths(cfg)
         agent = build_agent(cfg, population, cfg.device)
         trial.training.environments, trial.training.episodes = 2, 2
         make_trainer(trial, agent, profiles, population, folder)

@@ -126,7 +126,7 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
         return build(cfg.leader, "leader", ("load",))
     loaded = _load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
     split = build(cfg.split, "split", CALLED)
-    # All windows count: what is left out of them is for platoons, whose errors are shares.
+    # Every window is kept: the low-variation filter is for platoons, whose errors are relative.
     return TrajectoryLeaders(
         source=loaded, split=split, source_step=cfg.scenario.time_step, least_variation=0.0
     )

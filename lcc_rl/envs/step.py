@@ -23,7 +23,7 @@ from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
-# Where none of these is lost after a step, nothing that matters is.
+# If these entries are finite after a step, all others that matter are.
 TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
 
 

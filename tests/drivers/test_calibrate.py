@@ -77,9 +77,6 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     [
         ("data.path", "/no/such", DataError, "/no/such: no such file"),
         ("data.path", "???", ConfigError, "data.path"),
-        ("seed", "abc", ConfigError, "seed"),
-        ("threads", 0, ConfigError, "threads"),
-        ("device", "abacus", ConfigError, "abacus"),
         ("calibration.modes", ["locl"], ConfigError, "local"),
         ("calibration.bounds.time_gap", [2.0, 1.0], ConfigError, "time_gap"),
         ("calibration.local_genetic.population", 2, ConfigError, "population"),

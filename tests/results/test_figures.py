@@ -14,7 +14,6 @@ from study_frames import episodes, training
 
 from lcc_rl.config import identity, load
 from lcc_rl.data.leaders import Case, stretch
-from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results import drawing, training_figures
 from lcc_rl.results import figures as study_figures
@@ -228,14 +227,6 @@ def test_further_formats_lie_beside_the_image(tmp_path) -> None:
     assert save(figure, tmp_path / "x.png", formats=["png", "pdf", "svg"]) == tmp_path / "x.png"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.pdf", "x.png", "x.svg"]
     assert (tmp_path / "x.pdf").read_bytes().startswith(b"%PDF")
-
-
-@pytest.mark.parametrize("entry", ["train", "evaluate", "pipeline", "calibrate"])
-def test_unknown_formats_are_refused_before_anything_begins(entry) -> None:
-    with pytest.raises(ConfigError, match="'bmp'; valid: pdf, png, svg"):
-        load(entry, ["figure_formats=[png,bmp]"])
-    with pytest.raises(ConfigError, match="must name png"):
-        load(entry, ["figure_formats=[svg]"])
 
 
 def test_formats_do_not_make_another_run() -> None:

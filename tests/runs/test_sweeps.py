@@ -10,7 +10,6 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-import compare_launchers
 import pandas as pd
 import pytest
 from commands import DATA, HORIZON, run_command, tiny
@@ -240,13 +239,20 @@ def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit", "ray"])
-def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, capsys) -> None:
-    if not compare_launchers.installed(compare_launchers.LAUNCHERS[launcher][1]):
-        pytest.skip("extras sweeps, ray")
-    arguments = ["serial", launcher, "--seeds=1", f"--out={tmp_path}"]
-    assert compare_launchers.main(arguments) == 0
-    assert capsys.readouterr().out.count("those of serial") == 2
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
+def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher) -> None:
+    package = f"hydra_{launcher.removesuffix('_local')}_launcher"
+    pytest.importorskip(f"hydra_plugins.{package}", reason="extras sweeps, ray")
+    small = ["experiment=smoke", "agent.batch_size=64", "agent.hidden=[16,16]"]
+    words = ["-m", *small, "training.episodes=24", "variant=alcc,reference", "seed=0"]
+    for name in ("basic", f"lcc_{launcher}"):
+        where = [f"hydra/launcher={name}", f"hydra.sweep.dir={tmp_path / name}"]
+        subprocess.run([sys.executable, "-m", "lcc_rl.train", *words, *where], check=True)
+    for table in ("training", "episodes", "steps"):
+        serial, other = (
+            results.load(tmp_path / name, table) for name in ("basic", f"lcc_{launcher}")
+        )
+        pd.testing.assert_frame_equal(other, serial, check_exact=True)
 
 
 @pytest.mark.slow

@@ -11,15 +11,6 @@ import pytest
 from lcc_rl.drivers.tables import load_drivers
 from lcc_rl.errors import DataError
 
-NETWORK = """<net version="1.9">
-  <location netOffset="0,0" convBoundary="0,0,100,0" origBoundary="0,0,100,0" projParameter="!"/>
-  <edge id="e" from="a" to="b">
-    <lane id="e_0" index="0" speed="50" length="100" shape="0,0 100,0"/>
-  </edge>
-  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0"/>
-  <junction id="b" type="dead_end" x="100" y="0" incLanes="e_0" intLanes="" shape="100,0"/>
-</net>"""
-
 
 @pytest.fixture
 def drivers(tmp_path) -> str:
@@ -43,23 +34,19 @@ def test_the_file_holds_what_the_table_holds(drivers, tmp_path) -> None:
             assert float(found.get(key)) == pytest.approx(row[column], rel=1e-5), key
 
 
-def test_the_types_are_those_that_sumo_knows(drivers, tmp_path) -> None:
-    libsumo = pytest.importorskip("libsumo", reason="extra sumo")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: t.assign(model="gipps", leader_deceleration_mps2=3.0), "row 0"),
+        (lambda t: t.assign(time_gap_s=-1.0), "row 0, column 'time_gap_s'"),
+    ],
+)
+def test_bad_drivers_end_in_one_line_and_leave_the_old_file(
+    drivers, tmp_path, change, words
+) -> None:
     target = tmp_path / "vtypes.xml"
-    assert export_drivers.main([drivers, str(target)]) == 0
-    (tmp_path / "net.xml").write_text(NETWORK)
-    libsumo.start(["sumo", "-n", str(tmp_path / "net.xml"), "-a", str(target)])
-    try:
-        known = libsumo.vehicletype.getIDList()
-        assert {f"driver{i}" for i in range(5)} <= set(known)
-        expected = load_drivers(drivers)["time_gap_s"][0]
-        assert libsumo.vehicletype.getTau("driver0") == pytest.approx(expected, rel=1e-5)
-    finally:
-        libsumo.close()
-
-
-def test_drivers_of_another_model_are_refused(drivers, tmp_path) -> None:
-    table = pd.read_parquet(drivers).assign(model="gipps", leader_deceleration_mps2=3.0)
-    table.to_parquet(drivers)
-    with pytest.raises(DataError, match="row 0"):
-        export_drivers.main([drivers, str(tmp_path / "vtypes.xml")])
+    target.write_text("before")
+    change(pd.read_parquet(drivers)).to_parquet(drivers)
+    with pytest.raises(DataError, match=words):
+        export_drivers.main([drivers, str(target)])
+    assert target.read_text() == "before"

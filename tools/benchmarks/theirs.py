@@ -1,17 +1,23 @@
-"""Benchmarks, the study as a vectorised environment of stable-baselines3 over the plain loop."""
+"""The ALCC study as a VecEnv of stable-baselines3 over the plain loop, and its DDPG."""
 
 from __future__ import annotations
 
+from argparse import Namespace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from benchmarks.harness import Run
 from benchmarks.plain import PlainLoop
+
+SEEN = gymnasium.spaces.Box(-np.inf, np.inf, (7,), np.float32)
+ACTS = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
 class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
@@ -24,8 +30,7 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
 
     def __init__(self, env: TransformedEnv, compiled: bool) -> None:
         self.env, self.plain = env, PlainLoop(env)
-        seen = gymnasium.spaces.Box(-np.inf, np.inf, (7,), np.float32)
-        super().__init__(self.plain.rows, seen, gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32))
+        super().__init__(self.plain.rows, SEEN, ACTS)
         self.play = self.plain.player(compiled)
 
     def reset(self) -> Any:
@@ -47,12 +52,8 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
                 "terminal_observation": written["observation"][row].numpy(),
                 "TimeLimit.truncated": not written["terminated"][row],
             }
-        return (
-            seen.numpy(),
-            written["reward"].flatten().numpy(),
-            written["done"].flatten().numpy(),
-            infos,
-        )
+        ends = (written[name].flatten().numpy() for name in ("reward", "done"))
+        return seen.numpy(), *ends, infos
 
     def close(self) -> None:
         """Nothing is open."""
@@ -71,3 +72,22 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No environment is wrapped."""
         return [False] * self.num_envs
+
+
+def their_agent(options: Namespace, vector: VecEnv, **how: Any) -> DDPG:
+    """Return stable-baselines3's DDPG with the paper's layers."""
+    layers = {"net_arch": [200, 100, 50]}
+    settings = {"policy_kwargs": layers, "gamma": 0.9, "device": options.device, **how}
+    return DDPG("MlpPolicy", vector, **settings)
+
+
+def predicting(options: Namespace, vector: VecEnv, steps: int) -> Run:
+    """Return so many steps of ``predict`` and the environment; nothing is kept."""
+    model, state = their_agent(options, vector), {"seen": vector.reset()}
+
+    def run() -> None:
+        for _ in range(steps):
+            action, _ = model.predict(state["seen"], deterministic=True)
+            state["seen"], *_ = vector.step(action)
+
+    return run
