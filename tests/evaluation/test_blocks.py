@@ -249,7 +249,7 @@ def test_a_compiled_step_names_what_is_not_a_number() -> None:
 
     policy.in_keys = [*good.in_keys, ("episode", "step")]
     player = Player(env, policy, [("vehicles", "gap")], "strategy x", compiled=True)
-    words = "strategy x: automated.action, written by the policy, is nan at step 6 of episode 0"
+    words = "strategy x: automated.action is nan at step 6 of episode 0"
     ids = torch.arange(4)
     with pytest.raises(Diverged, match=words):
         player.play(reset_options(env, ids, ids, 1, 249))
