@@ -22,7 +22,8 @@ HEAD = """# Settings
 
 A node of the configuration names its class by `_target_`; its other keys are the settings below.
 `lcc-rl train agent.gamma=0.95 reward.terms.safety.margin=0.5` sets two of them. A run's
-`config.yaml` holds the values of all settings. Files of `conf/` hold what differs from the defaults.
+`config.yaml` holds the values of all settings. The files of `conf/` hold what differs from the
+defaults.
 """
 
 
@@ -40,7 +41,7 @@ def classes() -> Iterator[type[Settings]]:
 
 def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
     """Yield name, type, default and meaning of each setting that a class itself declares."""
-    lines, start = inspect.getsourcelines(kind)
+    lines, _ = inspect.getsourcelines(kind)
     (body,) = ast.parse("".join(lines)).body
     assert isinstance(body, ast.ClassDef)
     for node in body.body:
