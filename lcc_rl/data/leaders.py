@@ -26,7 +26,7 @@ from lcc_rl.data.profiles import (
 )
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
-from lcc_rl.data.tables import check_names, factors
+from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
@@ -261,11 +261,11 @@ class DriveLeaders(Settings):
     plausible: Plausible | None = None  # None for the defaults
 
     def settled(self) -> None:
-        check_names(self.columns, FIELDS, "leader.columns")
-        factors(self.units, FIELDS, "leader.units")
+        self.columns = {**COLUMNS, **self.columns}
+        check_map(FIELDS, self.columns, self.units, "leader")
         if self.tuning and self.evaluation_share == 1:
             raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
-        if self.together and self.columns.get("drive", "") is None:
+        if self.together and self.columns["drive"] is None:
             raise ConfigError("leader.together divides drives by name; the table holds one record")
         try:
             re.compile(self.together or "")
@@ -274,34 +274,23 @@ class DriveLeaders(Settings):
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read everything; see :meth:`RecordLeaders.load`."""
-        columns = {**COLUMNS, **self.columns}
-        profiles, report = read_drives(self.path, columns, time_step, self.plausible, self.units)
-        divide = self._by_time if columns["drive"] is None else self._by_name
+        single = self.columns["drive"] is None
+        profiles, report = read_drives(
+            self.path, self.columns, time_step, self.plausible, self.units
+        )
+        divide = self._by_time if single else self._by_name
         training, held_out = divide(profiles)
         if self.tuning:
             training, held_out = divide(training, again=True)
-        self._check_lengths(profiles, (training, held_out), horizon)
-        windows = varying(held_out.at_least(horizon).windows(horizon), self.least_variation)
-        if self.fastest is not None:
-            windows = slow(windows, self.fastest)
         if len(training):
             training = training.at_least(horizon)
-        by = "at the end" if columns["drive"] is None else "by name"
+        windows = varying(held_out.windows(horizon), self.least_variation)
+        if self.fastest is not None:
+            windows = slow(windows, self.fastest)
+        by = "at the end" if single else "by name"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
         return Leaders(training, windows, report=(*report, line))
-
-    def _check_lengths(self, all_: Profiles, parts: Sequence[Profiles], horizon: int) -> None:
-        """Check that both sides hold a record of an episode's length; say what can be done."""
-        whole, *sides = (int(x.lengths.max()) - 1 if len(x) else horizon for x in (all_, *parts))
-        if min(sides) >= horizon:
-            return
-        raise DataError(
-            f"{self.path}: shorter than the horizon: an episode needs {horizon} steps, the longest "
-            f"record has {whole}, its parts for training and evaluation {sides[0]} and {sides[1]}; "
-            f"lower scenario.horizon to at most {max(1, min(whole, *sides))}, give longer records, "
-            "or say leader.evaluation_share=1 to evaluate on all of it"
-        )
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; once more for tuning."""

@@ -32,11 +32,9 @@ def per_distance(kj_per_km: float, unit: str, energy: Fleet) -> float:
     if unit in ELECTRIC:
         return kj_per_km * ELECTRIC[unit]
     model = energy.models[0]
-    assert model.heating_value is not None
     grams = kj_per_km * 1e3 / model.heating_value
     if unit == "g/km":
         return grams
-    assert model.density is not None
     litres = grams / model.density / 10.0  # g/km over g/L, times 100 km
     return litres if unit == "L/100km" else MPG / litres
 
@@ -56,7 +54,7 @@ def check_unit(unit: str, energy: Fleet) -> None:
         )
 
 
-def _fuels(models: Sequence[EnergyModel]) -> set[tuple[float, float | None]]:
+def _fuels(models: Sequence[EnergyModel]) -> set[tuple[float, float]]:
     """Return heating value and density of every fuel; of none where a vehicle has no fuel."""
-    found = {(round(m.heating_value or 0.0, 3), m.density) for m in models}
+    found = {(round(m.heating_value, 3), m.density) for m in models}
     return set() if any(not value for value, _ in found) else found

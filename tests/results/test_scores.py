@@ -9,7 +9,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.results.scores import Task, as_rich, scores
 from lcc_rl.results.units import per_distance
 
-CAR, LORRY, MOTOR = as_fleet(CirclesFuel()), CirclesFuel("Class8Tractor"), as_fleet(None)
+CAR, LORRY, MOTOR = as_fleet(CirclesFuel()), CirclesFuel(vehicle="Class8Tractor"), as_fleet(None)
 
 
 def rows(strategy: str, energy: list[float], metres: float = 1000.0, **more: float) -> pd.DataFrame:
