@@ -123,7 +123,9 @@ class Profiles:
         return self.select(long)
 
     def _too_short(self, horizon: int) -> str:
-        longest = max(range(len(self)), key=lambda i: int(self.lengths[i]))
+        if not len(self):
+            return NONE_LEFT
+        longest = int(self.lengths.argmax())
         steps = int(self.lengths[longest]) - 1
         return (
             f"profile shorter than the horizon: the longest of {len(self)} speed profiles, "
