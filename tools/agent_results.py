@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from lcc_rl import results
 from lcc_rl.config import short_name
 from lcc_rl.errors import ResultsError
+from lcc_rl.figures.drawing import INK, in_words, legend_above, new_figure, style
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.drawing import INK, in_words, legend_above, new_figure
-from lcc_rl.results.figures import style
 
 PREVIEWS = (1.0, 2.0, 5.0, 10.0)  # [s]
 KNOWN = ("none", "memory", *(f"preview_{seconds:g}s" for seconds in PREVIEWS))

@@ -40,9 +40,9 @@ from lcc_rl.config import load, require
 from lcc_rl.envs import load_inputs
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import trained
+from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.policies.rules import NETWORK
-from lcc_rl.results.drawing import save
 from lcc_rl.results.policies import load_policy
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.runs.precision import prepare_torch

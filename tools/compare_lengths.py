@@ -28,10 +28,10 @@ from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.envs.inputs import build_source
+from lcc_rl.figures.calibration import COLOURS
+from lcc_rl.figures.drawing import INK, new_figure, save, unbox
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.calibration_figures import COLOURS
-from lcc_rl.results.drawing import INK, new_figure, save, unbox
 from lcc_rl.results.intervals import bounds, weights
 from lcc_rl.runs.cli import main_guard
 

@@ -17,7 +17,7 @@ import pandas as pd
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.statistics import ROLES, compare_statistics, leader_statistics
 from lcc_rl.errors import LccError
-from lcc_rl.results.stream_figures import save_leaders
+from lcc_rl.figures.leaders import save_leaders
 from lcc_rl.synthetic.stream import StreamSource
 
 

@@ -19,10 +19,9 @@ from lcc_rl.commands.tasks import task_of
 from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.envs.inputs import string_of
+from lcc_rl.figures.drawing import legend_above, new_figure, save, style
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.drawing import legend_above, new_figure, save
-from lcc_rl.results.figures import style
 from lcc_rl.results.runs import load_config
 from lcc_rl.results.scores import scores
 from lcc_rl.runs.cli import main_guard

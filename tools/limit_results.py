@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 
 from lcc_rl import results
 from lcc_rl.errors import ResultsError
+from lcc_rl.figures.drawing import in_words, legend_above, new_figure, style
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.drawing import in_words, legend_above, new_figure
-from lcc_rl.results.figures import style
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, energy_at, front, points, saving_at
 
 WINDOWS, EPISODES = "windows.parquet", "episodes.parquet"

@@ -22,10 +22,10 @@ from matplotlib.figure import Figure
 from lcc_rl.config import build, load, require
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.platoon import record_figure
+from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.drawing import save
-from lcc_rl.results.space_time import space_time
-from lcc_rl.results.string_figures import record_figure
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.studies.hcfs import report as hcfs_report
 

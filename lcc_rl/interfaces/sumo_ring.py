@@ -18,12 +18,12 @@ from omegaconf import DictConfig
 
 from lcc_rl.config import load, require
 from lcc_rl.errors import ConfigError, require_in, require_whole
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.space_time import space_time
 from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.drawing import save
-from lcc_rl.results.space_time import space_time
 from lcc_rl.targets import TARGET
 
 HUMAN, FIRST = "human", "car0"

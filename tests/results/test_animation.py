@@ -17,9 +17,9 @@ from PIL import Image
 from lcc_rl.commands import animate as command
 from lcc_rl.console import COMMANDS
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.figures.animation import COLOURS, LARGEST, animate, frames, page
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results import animation
-from lcc_rl.results.animation import COLOURS, LARGEST, animate, frames, page
 from lcc_rl.results.motion import Motion
 
 TIME = 0.1 * np.arange(1, 13)

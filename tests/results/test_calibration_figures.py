@@ -4,8 +4,8 @@ import pytest
 
 from lcc_rl.drivers.population import load_drivers
 from lcc_rl.errors import DataError, ResultsError
-from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
-from lcc_rl.results.drawing import save
+from lcc_rl.figures.calibration import calibration_figure, joint_figure
+from lcc_rl.figures.drawing import save
 
 
 @pytest.fixture

@@ -15,11 +15,11 @@ from study_frames import episodes, training
 from lcc_rl.config import identity, load
 from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.errors import ConfigError
+from lcc_rl.figures.drawing import in_words, save
+from lcc_rl.figures.platoon import jerks, record_figure, velocities
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results import drawing, training_figures
 from lcc_rl.results import figures as study_figures
-from lcc_rl.results.drawing import in_words, save
-from lcc_rl.results.string_figures import jerks, record_figure, velocities
 from lcc_rl.studies.alcc import comparison_figures
 from lcc_rl.studies.alcc import figures as alcc_figures
 

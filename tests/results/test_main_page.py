@@ -6,7 +6,7 @@ from rich.console import Console
 from study_frames import episodes
 
 from lcc_rl.config import load
-from lcc_rl.results.main_page import AGAINST, CAPTION, as_rich, caption_of, headline
+from lcc_rl.figures.main_page import AGAINST, CAPTION, as_rich, caption_of, headline
 from lcc_rl.results.tables import summary
 
 

@@ -17,12 +17,12 @@ from lcc_rl.commands.maps import write_responses
 from lcc_rl.config import load
 from lcc_rl.evaluation.responses import responses
 from lcc_rl.evaluation.strategies import baseline, trained
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.platoon import PARENTS
+from lcc_rl.figures.policy_maps import accelerations, winners, write_maps
 from lcc_rl.functional.rules import idm_acc
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.drawing import save
 from lcc_rl.results.policies import load_policy
-from lcc_rl.results.policy_maps import accelerations, winners, write_maps
-from lcc_rl.results.string_figures import PARENTS
 from lcc_rl.schemas import FORMATS
 
 GAPS, RELATIVE = [1.0, 8.0, 60.0], [-4.0, 0.0, 4.0]

@@ -19,9 +19,9 @@ from matplotlib.image import imread
 from PIL import Image
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.figures.drawing import new_figure, save
+from lcc_rl.figures.page import Section, heading, made, write_report
 from lcc_rl.io.files import processor, write_parquet
-from lcc_rl.results.drawing import new_figure, save
-from lcc_rl.results.report import Section, heading, made, write_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

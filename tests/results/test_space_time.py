@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from lcc_rl.results.drawing import save
-from lcc_rl.results.space_time import space_time
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.space_time import space_time
 
 TIME = 0.1 * np.arange(1, 101)
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.stream_figures import figure_leaders, save_leaders
+from lcc_rl.figures.leaders import figure_leaders, save_leaders
 
 
 def episodes(shift: float) -> pd.DataFrame:

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measure
-from lcc_rl.results.string_figures import PARENTS, switching
+from lcc_rl.figures.platoon import PARENTS, switching
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.studies.hcfs.tables import win_rates
 

@@ -10,7 +10,7 @@ import redraw
 from matplotlib.image import imread
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.studies.page import Page
+from lcc_rl.figures.page import Page
 
 ROOT = Path(__file__).parents[2]
 
