@@ -19,12 +19,12 @@ import pandas as pd
 
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.space_time import space_time
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.drawing import save
-from lcc_rl.results.space_time import space_time
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.schemas import StudyConfig, as_plain
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
+from lcc_rl.figures.animation import FORMS, animate, check_ending
+from lcc_rl.figures.drawing import in_file, in_words
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.animation import FORMS, animate, check_ending
-from lcc_rl.results.drawing import in_file, in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 from lcc_rl.results.runs import CONFIG, stored_config
 
@@ -35,7 +35,7 @@ def run(
         folder: of an evaluation, a training or a main job.
         strategy: whose episode; None for the last one of the table.
         episode: which of its sample episodes, from 0.
-        out: the file, see :func:`lcc_rl.results.animation.animate`; by default a page in the
+        out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
             run's folder ``figures``.
         start: when the animation begins [s].
         duration: how long it is [s]; None for to the end.

@@ -20,11 +20,11 @@ from lcc_rl.drivers.fit import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source
+from lcc_rl.figures.calibration import calibration_figure, joint_figure
+from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
 from lcc_rl.nodes import CALLED, build
-from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
-from lcc_rl.results.drawing import save
-from lcc_rl.results.report import MISSING
+from lcc_rl.results.cells import MISSING
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import claim

@@ -130,12 +130,9 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
 def draw(folder: Path, rows: str = "episodes") -> None:
     """Draw the figures of an evaluation, whose rows are ``episodes`` or ``vehicles``."""
     # Here: a training, which draws nothing, need not load matplotlib.
-    from lcc_rl.results.figures import write_study_figures
-    from lcc_rl.results.policy_maps import write_maps
-    from lcc_rl.results.string_figures import write_platoon_figures
+    from lcc_rl.figures.evaluation import write_figures
 
-    (write_study_figures if rows == "episodes" else write_platoon_figures)(folder)
-    write_maps(folder)
+    write_figures(folder, rows)
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:

@@ -24,14 +24,14 @@ from lcc_rl.config import load, raw
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import Interrupted, ResultsError, require
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.main_page import as_rich, caption_of, write_page
+from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_json
 from lcc_rl.nodes import forget_places
-from lcc_rl.results.drawing import save
-from lcc_rl.results.main_page import as_rich, caption_of, write_page
 from lcc_rl.results.tables import show
-from lcc_rl.results.training_figures import training_figure
 from lcc_rl.results.trust import check_targets
 from lcc_rl.runs.cli import root_key
 from lcc_rl.runs.console import tell

@@ -16,10 +16,10 @@ from study_frames import episodes
 from lcc_rl.commands import evaluation
 from lcc_rl.data.profiles import from_records
 from lcc_rl.evaluation.rows import leader_faster
+from lcc_rl.figures.page import Page
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.tables import FASTER, leader_too_fast, summary
-from lcc_rl.studies.alcc.report_main import add_main
-from lcc_rl.studies.page import Page
+from lcc_rl.studies.alcc.report import add_main
 
 
 def test_the_share_of_time_by_hand() -> None:

@@ -31,7 +31,7 @@ from lcc_rl.drivers.genetic import GeneticSettings, minimise
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.errors import DataError, Diverged
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.results.report import Section, write_report
+from lcc_rl.figures.page import Page
 from lcc_rl.results.tables import strategies_side_by_side
 
 MODULE = """
@@ -249,7 +249,9 @@ def test_a_calibration_without_any_fit_names_the_episode() -> None:
 def test_no_table_shows_what_is_no_number(number, tmp_path) -> None:
     frame = pd.DataFrame({"strategy": ["a", "b"], "x": [1.0, number], "n": [1, 2]})
     frame = frame.assign(x_low=[number, number], x_high=[2.0, number])
-    page = write_report(tmp_path, "t", [Section("s", tables=[("c", frame)])]).read_text()
+    made = Page(tmp_path)
+    made.add("s", tables=[("", "c", frame)])
+    page = made.write("t").read_text()
     assert ">–<" in page
     rows = [("x", "x", "{:.2f}"), ("n", "n", "{:d}")]
     console = Console(file=StringIO(), width=80)

@@ -20,11 +20,11 @@ from lcc_rl.drivers.observed import observe
 from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, PLAUSIBLE, fitted
 from lcc_rl.drivers.population import bootstrap, from_table, kde
 from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
-from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
 THOROUGH = GeneticSettings(population=128, generations=150, patience=20)

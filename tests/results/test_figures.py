@@ -1,26 +1,39 @@
-"""Every figure of a study draws from a tiny table, and says and shows what it should."""
+"""Every figure draws from a tiny table, and says and shows what it should."""
 
-from dataclasses import replace
+from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from commands import tiny
+from helpers import POPULATION
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 from study_frames import episodes, training
 
-from lcc_rl.config import identity, load
+from lcc_rl.commands import evaluation
+from lcc_rl.config import load
 from lcc_rl.data.leaders import Case, stretch
+from lcc_rl.drivers.population import load_drivers
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.evaluation.responses import responses
+from lcc_rl.evaluation.strategies import baseline, trained
+from lcc_rl.figures import evaluation as run_figures
+from lcc_rl.figures.calibration import calibration_figure, joint_figure
+from lcc_rl.figures.drawing import colour, in_file, save
+from lcc_rl.figures.leaders import figure_leaders, save_leaders
+from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
+from lcc_rl.figures.policy_maps import accelerations, winners
+from lcc_rl.figures.space_time import space_time
+from lcc_rl.figures.training import learning_curve, training_figure
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results import drawing, training_figures
-from lcc_rl.results import figures as study_figures
-from lcc_rl.results.drawing import in_words, save
-from lcc_rl.results.string_figures import jerks, record_figure, velocities
-from lcc_rl.studies.alcc import comparison_figures
-from lcc_rl.studies.alcc import figures as alcc_figures
+from lcc_rl.results.policies import load_policy
+from lcc_rl.studies.alcc import figures as alcc
 
 
 def texts(figure: Figure) -> str:
@@ -29,76 +42,79 @@ def texts(figure: Figure) -> str:
     return "\n".join(item.get_text() for item in figure.findobj(Text))
 
 
+def pixels(figure: Figure, path: Path) -> np.ndarray:
+    with Image.open(save(figure, path, dpi=80)) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def count(image: np.ndarray, hue: str, alpha: float = 1.0) -> int:
+    """How many pixels have a colour, or a transparent one on white."""
+    mixed = 255 * (alpha * np.array(to_rgb(hue)) + 1.0 - alpha)
+    return int((np.abs(image - mixed).max(-1) <= 3).sum())
+
+
 def steps() -> pd.DataFrame:
+    """One sample episode of two seeds; the car drives at 5 m/s and its seed more."""
     time = np.arange(1, 6) * 0.1
-    return pd.concat(
-        pd.DataFrame(
-            {
-                "strategy": "alcc",
-                "training_seed": pd.array([seed] * 5, dtype="Int64"),
-                "profile": "rec/1@0.0s",
-                "driver_id": 0,
-                "desired_speed_mps": 20.0,
-                "time_gap_s": 1.0,
-                "time_s": time,
-                "leader_speed": 5.0 + time,
-                "leader_acceleration": 1.0,
-                "cav_speed": 5.0 + seed,
-                "cav_acceleration": 0.0,
-                "cav_gap": 8.0,
-                "hdv_speed": 5.0,
-                "hdv_acceleration": 0.0,
-                "hdv_gap": 8.0,
-            }
-        )
-        for seed in (3, 1)
-    )
+    table = {"strategy": "alcc", "profile": "rec/1@0.0s", "driver_id": 0, "time_s": time}
+    table |= {"desired_speed_mps": 20.0, "time_gap_s": 1.0, "leader_speed": 5.0 + time}
+    table |= {f"{x}_acceleration": 0.0 for x in ("leader", "cav", "hdv")}
+    table |= {"hdv_speed": 5.0, "cav_gap": 8.0, "hdv_gap": 8.0}
+    seeds = (pd.DataFrame({**table, "training_seed": n, "cav_speed": 5.0 + n}) for n in (3, 1))
+    return pd.concat(seeds).astype({"training_seed": "Int64"})
 
 
-def ablated() -> pd.DataFrame:
-    return pd.concat([episodes().assign(ablation=name) for name in ("none", "no_safety")])
+def parts(column: str, *values: object, **size: int) -> pd.DataFrame:
+    return pd.concat([episodes(**size).assign(**{column: value}) for value in values])
 
 
-def strings() -> pd.DataFrame:
-    return pd.concat([episodes().assign(followers=number) for number in (1, 5)])
+def drivers() -> pd.DataFrame:
+    return pd.concat([load_drivers(mode=mode).head(6) for mode in ("local", "global")])
 
 
-def single() -> pd.DataFrame:
-    return pd.concat([episodes(profiles=1).assign(study_profile=number) for number in (3, 12)])
+def leaders(shift: float) -> pd.DataFrame:
+    time = 0.1 * np.arange(400)
+    speeds = {n: 5 + shift + 3 * np.sin(time / (1 + n)) for n in range(3)}
+    found = ({"episode": n, "time_s": time, "leader_speed_mps": x} for n, x in speeds.items())
+    return pd.concat(map(pd.DataFrame, found), ignore_index=True)
 
 
+SETS = {"real": leaders(0.0), "stream": leaders(1.0)}
 FIGURES = {
-    "power_map": (lambda: alcc_figures.power_map(), ["kW", "speed [m/s]"]),
-    "learning_curve": (lambda: training_figures.learning_curve(training()), ["n = 2 seeds, 95 %"]),
-    "reward_terms": (lambda: alcc_figures.reward_terms(training()), ["HDV energy", "safety"]),
-    "sample_episode": (lambda: study_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
+    "power_map": (alcc.power_map, ["kW", "speed [m/s]"]),
+    "learning_curve": (lambda: learning_curve(training()), ["n = 2 seeds, 95 %"]),
+    "reward_terms": (lambda: alcc.reward_terms(training()), ["HDV energy", "n = 2 seeds"]),
+    "sample_episode": (lambda: run_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
     "human_energy": (
-        lambda: study_figures.human_energy(episodes(), "reference"),
+        lambda: run_figures.human_energy(episodes(), "reference"),
         ["n = 3 drivers", "+17.5 %", "kJ"],
     ),
     "improvement": (
-        lambda: study_figures.paired_improvement(episodes(), "alcc", "reference"),
+        lambda: run_figures.paired_improvement(episodes(), "alcc", "reference"),
         ["1 of 3 drivers", "33 % of (window, driver) pairs", "over windows and seeds"],
     ),
-    "distributions": (
-        lambda: alcc_figures.distributions(episodes()),
-        ["n = 3 drivers", "reference", "75.0", "kJ"],
-    ),
+    "distributions": (lambda: alcc.distributions(episodes()), ["n = 3 drivers", "75.0"]),
     "generalization": (
-        lambda: alcc_figures.generalization_figure(episodes()),
+        lambda: alcc.generalization_figure(episodes()),
         ["paper, 4 profiles", "n = 2", "mean of 2 seeds", "human driver"],
     ),
     "ablations": (
-        lambda: comparison_figures.comparison_figure(ablated()),
+        lambda: alcc.comparison_figure(parts("ablation", "none", "no_safety")),
         ["no safety", "n = 2 seeds"],
     ),
-    "followers": (
-        lambda: comparison_figures.followers_figure(strings()),
-        ["human drivers", "2 seeds"],
-    ),
+    "followers": (lambda: alcc.followers_figure(parts("followers", 1, 5)), ["2 seeds"]),
     "single": (
-        lambda: comparison_figures.single_profile_figure(single()),
+        lambda: alcc.single_profile_figure(parts("study_profile", 3, 12, profiles=1)),
         ["profile 12", "idm", "kJ"],
+    ),
+    "calibration": (
+        lambda: calibration_figure(drivers()),
+        ["local\nn = 6", "global\nn = 6", "RMSPE [%]", "held at 1.5", "on a bound"],
+    ),
+    "joint": (lambda: joint_figure(drivers()), ["6 drivers (local calibration)", "correlation"]),
+    "leaders": (
+        lambda: figure_leaders(SETS),
+        ["leader energy in 30 s [kJ]", "real, 1,200 samples", "real: 3 of 3 leaders"],
     ),
 }
 
@@ -110,156 +126,220 @@ def test_a_figure_draws_and_says_what_it_shows(name, tmp_path) -> None:
     written = texts(figure)
     for words in expected:
         assert words in written, written
-    assert save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
+    save(figure, tmp_path / f"{name}.png", formats=["svg"])
+    assert (tmp_path / f"{name}.png").stat().st_size > 5000
+    assert b"<svg" in (tmp_path / f"{name}.svg").read_bytes()[:1000]
+
+
+def test_what_cannot_be_drawn_is_named(tmp_path) -> None:
+    for wrong, words in ((drivers().drop(columns="rmspe"), "rmspe"), (drivers()[:0], "no drivers")):
+        with pytest.raises(DataError, match=words):
+            calibration_figure(wrong)
+    with pytest.raises(ConfigError, match=r"ending must be one of.*png"):
+        save_leaders(SETS, tmp_path / "a.nonsense")
+    assert in_file("pi_saturation ../x: y") == "pi_saturation_.._x__y"
 
 
 def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
     frame = episodes()
-    frame = frame[~(frame["training_seed"] == 1).fillna(False)]
-    assert "1 training seed" in texts(study_figures.paired_improvement(frame, "alcc", "reference"))
-    frame = frame[frame["profile_id"] == 0]
+    frame = frame[(frame["training_seed"] != 1).fillna(True) & (frame["profile_id"] == 0)]
     for figure in (
-        study_figures.paired_improvement(frame, "alcc", "reference"),
-        study_figures.human_energy(frame, "alcc"),
-        alcc_figures.generalization_figure(frame),
+        run_figures.paired_improvement(frame, "alcc", "reference"),
+        run_figures.human_energy(frame, "alcc"),
+        alcc.generalization_figure(frame),
     ):
         assert "1 training seed" in (found := texts(figure)) or "1 seed" in found
         assert "95 %" not in found
 
 
-def test_a_sample_episode_is_of_one_seed_only() -> None:
-    figure = study_figures.sample_episode(steps(), "alcc")
-    lines = {line.get_label(): line.get_ydata() for line in figure.axes[0].lines}
-    assert np.asarray(lines["controlled car"]).tolist() == [6.0] * 5  # seed 1, once
-
-
-def test_seeds_of_different_length_share_the_shorter_curve() -> None:
+def test_lines_hold_the_rows_of_one_seed_and_the_shorter_curve() -> None:
+    (line,) = (
+        line.get_ydata()
+        for line in run_figures.sample_episode(steps(), "alcc").axes[0].lines
+        if line.get_label() == "controlled car"
+    )
+    assert np.asarray(line).tolist() == [6.0] * 5  # seed 1, once
     frame = training()
-    short = frame[~((frame["seed"] == 1) & (frame["iteration"] > 12))]
-    figure = training_figures.learning_curve(short)
+    figure = learning_curve(frame[(frame["seed"] != 1) | (frame["iteration"] <= 12)])
     assert len(figure.axes[0].lines[0].get_xdata()) == 12
 
 
 def test_of_a_training_with_limits_the_shares_are_shown_with_the_limit() -> None:
     frame = training().assign(loss_actor=3.0, share_efficiency=0.02)
-    frame["agent.limits.efficiency"] = 0.01
-    figure = training_figures.training_figure(frame)
+    figure = training_figure(frame.assign(**{"agent.limits.efficiency": 0.01}))
     assert "limit 1 %" in texts(figure)
     assert figure.axes[1].lines[0].get_ydata() == pytest.approx(2.0)
-    assert len(training_figures.training_figure(training()).axes) == 1
+    assert len(training_figure(training()).axes) == 1
 
 
-def shown(figure: Figure, path) -> np.ndarray:
-    """The colours of a figure's pixels, ``[n, 3]``."""
-    with Image.open(save(figure, path, dpi=70)) as image:
-        return np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
-
-
-def count(pixels: np.ndarray, colour: str, alpha: float = 1.0) -> int:
-    """How many pixels have a colour, or a transparent one on white."""
-    mixed = 255 * (alpha * np.array(to_rgb(colour)) + 1.0 - alpha)
-    return int((np.abs(pixels - mixed).max(-1) <= 3).sum())
-
-
-def test_the_overview_has_a_bar_per_strategy_and_the_legend_covers_none(tmp_path) -> None:
+def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tmp_path) -> None:
     frame = episodes().assign(strategy=lambda x: x["strategy"].replace("alcc", "own_energy"))
-    figure = study_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
+    figure = run_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
     right = figure.axes[1]
     assert [x.get_text() for x in right.get_yticklabels()] == ["idm", "own energy", "reference"]
-    assert len(right.patches) == 6
-    pixels = shown(figure, tmp_path / "x.png")
-    assert count(pixels, study_figures.VEHICLES["cav"][1]) > 500
-    assert count(pixels, study_figures.VEHICLES["hdv"][1]) > 500
-    for axis in figure.axes:
-        legend, frame_of_data = axis.get_legend(), axis.get_window_extent()
-        assert legend.get_window_extent().y0 >= frame_of_data.y1 - 1.0
-    labels = [label.get_window_extent() for label in right.get_yticklabels()]
-    assert not any(a.overlaps(b) for i, a in enumerate(labels) for b in labels[:i])
-
-
-def test_the_colours_of_all_strategies_are_on_the_image(tmp_path) -> None:
-    figure = study_figures.paired_improvement(episodes(), "alcc", "reference")
-    pixels = shown(figure, tmp_path / "x.png")
-    assert count(pixels, study_figures.colour("alcc"), 0.8) > 300
-    assert count(pixels, study_figures.colour("reference"), 0.45) > 50
-    curves = shown(training_figures.learning_curve(training()), tmp_path / "y.png")
-    for name in dict.fromkeys(training()["variant"]):
-        assert count(curves, study_figures.colour(str(name))) > 10
+    image = pixels(figure, tmp_path / "x.png")
+    assert all(count(image, run_figures.VEHICLES[name][1]) > 500 for name in ("cav", "hdv"))
+    for axis in figure.axes:  # the legend covers no data
+        assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0
+    image = pixels(
+        run_figures.paired_improvement(episodes(), "alcc", "reference"), tmp_path / "y.png"
+    )
+    assert count(image, colour("alcc"), 0.8) > 300
+    assert count(image, colour("reference"), 0.45) > 50
 
 
 def platoon(jerk: float) -> pd.DataFrame:
-    parts = []
-    for name in ("cacc paper_like", "hcfs"):
-        for follower in range(4):
-            time = 0.2 * np.arange(1, 31)
-            table = {"strategy": name, "case": "case 1", "follower": follower, "time_s": time}
-            table |= {"speed_mps": 5.0 + follower + time, "jerk_mps3": jerk * np.sin(time)}
-            parts.append(pd.DataFrame(table))
-    return pd.concat(parts, ignore_index=True)
+    time = 0.2 * np.arange(1, 31)
+    found = [
+        {"strategy": name, "case": "case 1", "follower": follower, "time_s": time}
+        | {"speed_mps": 5.0 + follower + time, "jerk_mps3": jerk * np.sin(time)}
+        for name in ("cacc paper_like", "hcfs")
+        for follower in range(4)
+    ]
+    return pd.concat(map(pd.DataFrame, found), ignore_index=True)
 
 
-def test_jerk_has_its_own_scale_and_the_bound_is_drawn_where_it_is_named() -> None:
-    small, large = (jerks(platoon(jerk), "case 1", 30.0) for jerk in (2.0, 29.0))
-    assert small.axes[0].get_ylim()[1] < 3.0
-    assert large.axes[0].get_ylim()[1] > 30.0
-    for figure, dotted, said in ((small, 0, "beyond the scale"), (large, 2, "dotted: bound ±30")):
+def test_jerk_has_its_own_scale_and_followers_their_own_colours() -> None:
+    for jerk, dotted, said in ((2.0, 0, "beyond the scale"), (29.0, 2, "dotted: bound ±30")):
+        figure = jerks(platoon(jerk), "case 1", 30.0)
+        assert (figure.axes[0].get_ylim()[1] > 30.0) == (dotted > 0)
         assert [x.get_linestyle() for x in figure.axes[0].lines].count(":") == dotted
         assert said in texts(figure)
-
-
-def test_followers_have_different_colours_and_names_are_words(tmp_path) -> None:
     figure = velocities(platoon(1.0), "case 1")
     assert "cacc paper like" in texts(figure)
-    assert "_" not in texts(figure)
-    colours = {line.get_color() for line in figure.axes[0].lines}
-    assert len(colours) == 4  # three followers and the leader
-    assert len(np.unique(shown(figure, tmp_path / "x.png"), axis=0)) > 50
+    assert len({line.get_color() for line in figure.axes[0].lines}) == 4  # with the leader
 
 
-def test_names_are_read_aloud() -> None:
-    assert in_words("preview_10s") == "preview 10 s"
-    assert in_words("pi_saturation") == "pi saturation"
-    assert drawing.in_file("pi_saturation ../x: y") == "pi_saturation_.._x__y"
-
-
-def test_further_formats_lie_beside_the_image(tmp_path) -> None:
-    figure = velocities(platoon(1.0), "case 1")
-    assert save(figure, tmp_path / "x.png", formats=["png", "pdf", "svg"]) == tmp_path / "x.png"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.pdf", "x.png", "x.svg"]
-    assert (tmp_path / "x.pdf").read_bytes().startswith(b"%PDF")
-
-
-def test_formats_do_not_make_another_run() -> None:
-    one, other = (load("train", words) for words in ([], ["figure_formats=[png,pdf]"]))
-    assert identity(one) == identity(other)
-
-
-@pytest.mark.slow
-def test_figures_of_a_run_with_pieces_of_ones_own_need_no_trust(tmp_path) -> None:
-    write_parquet(episodes(), tmp_path / "episodes.parquet")
-    both = pd.concat([steps(), steps().assign(strategy="reference")])
-    write_parquet(both, tmp_path / "steps.parquet")
-    scenario = {"string": "automated human", "road": "open", "vehicle_length": 5.0}
-    scenario["pieces"] = {"mine": {"_target_": "not_installed.Mine"}}
-    settings = {"scenario": scenario, "figure_formats": ["png", "svg"]}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
-    drawn = study_figures.write_study_figures(tmp_path)
-    names = {path.name for path in drawn}
-    assert {"overview.png", "episode_alcc.png", "improvement_reference_vs_idm.png"} <= names
-    assert all(path.with_suffix(".svg").exists() for path in drawn)
+def test_switching_has_the_colour_of_the_controller_that_drives() -> None:
+    winner = np.array([[0, 0, 1, 1], [1, 0, 0, 0], [0, 1, 0, 1]])  # follower × time
+    rows = [
+        {"strategy": "hcfs", "case": "case 1", "follower": f + 1, "time_s": 0.2 * (t + 1)}
+        | {"winner": float(winner[f, t])}
+        for f in range(3)
+        for t in range(4)
+    ]
+    figure = switching(pd.DataFrame(rows), "case 1")
+    figure.canvas.draw()
+    image = np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255.0
+    colours = np.array([to_rgb(hue) for hue in PARENTS.values()])
+    centres = [(0.2 * t + 0.1, f + 1) for f in range(3) for t in range(4)]
+    places = figure.axes[0].transData.transform(centres).astype(int)
+    drawn = np.array([image[len(image) - y, x] for x, y in places])
+    np.testing.assert_allclose(drawn, colours[winner.ravel()], atol=1 / 255)
 
 
 def test_the_record_is_drawn_with_its_training_part_and_the_cases() -> None:
     record = stretch("udds", 0.2, 0.5)
     case = Case("case 1", stretch("us06", 0.2, 0.5, 126.0, 146.0), 8)
-    figure = record_figure(record, 600.0, [case, replace(case, name="case 2")])
-    whole, first, second = figure.axes
-    line = whole.lines[0]
-    np.testing.assert_array_equal(line.get_ydata(), record.record(0).numpy())
-    np.testing.assert_allclose(line.get_xdata()[[0, 1, -1]], [0.0, 0.2, 1369.0])
+    figure = record_figure(record, 600.0, [case])
+    whole, window = figure.axes
+    np.testing.assert_array_equal(whole.lines[0].get_ydata(), record.record(0).numpy())
     part = whole.patches[0].get_path().get_extents(whole.patches[0].get_patch_transform())
     np.testing.assert_allclose(part.intervalx, [600.0, 1369.0])
-    for axis in (first, second):
-        np.testing.assert_array_equal(axis.lines[0].get_ydata(), case.profile.record(0).numpy())
-    assert [len(axis.lines) for axis in (first, second)] == [2, 1]  # the paper's ends of case 1
+    np.testing.assert_array_equal(window.lines[0].get_ydata(), case.profile.record(0).numpy())
     assert "US06 from 126 s on" in texts(figure)
+
+
+RING = {"string": "automated human*2", "road": "ring", "circumference": 60.0, "vehicle_length": 5.0}
+
+
+def string_steps(name: str, stops: float) -> pd.DataFrame:
+    time = 0.1 * np.arange(1, 101)
+    table = {"strategy": name, "training_seed": pd.NA, "profile": "p", "driver_id": 0}
+    table |= {"time_s": time, "leader_speed": 10.0}
+    for vehicle, kind in enumerate(("cav", "hdv1", "hdv2")):
+        slow = (3.0 + vehicle < time) & (6.0 + vehicle > time)
+        table |= {f"{kind}_speed": np.where(slow, 10.0 - stops, 10.0)}
+        table |= {f"{kind}_gap": 10.0 + vehicle}
+    return pd.DataFrame(table)
+
+
+ROWS = pd.concat([string_steps("human", 9.0), string_steps("alcc", 0.5)])
+
+
+def test_space_time_lines_stand_behind_the_leader_by_gaps_and_lengths() -> None:
+    figure = space_time(ROWS, ["human", "alcc"], {"scenario": {**RING, "road": "open"}})
+    assert figure is not None
+    first, last = (axis.collections[-1] for axis in figure.axes[:2])
+    start = last.get_segments()[0][0]
+    assert start == pytest.approx([0.1, -(10.0 + 11.0 + 12.0 + 3 * 5.0)])
+    assert first.get_array().min() == pytest.approx(1.0)
+    assert first.get_clim() == last.get_clim() == (0.0, 10.0)
+    short = ROWS.drop(columns=[name for name in ROWS if name.startswith("hdv2")])
+    two = {**RING, "road": "open", "string": "automated human"}
+    assert space_time(short, ["human"], {"scenario": two}) is None
+
+
+def test_a_ring_closes_and_no_line_crosses_it() -> None:
+    figure = space_time(ROWS, ["human"], {"scenario": RING})
+    assert figure is not None
+    for lines in figure.axes[0].collections:
+        segments = np.array(lines.get_segments())[..., 1]
+        assert segments.min() >= 0.0
+        assert segments.max() <= 60.0
+        assert np.abs(np.diff(segments, axis=1)).max() < 30.0
+
+
+def grid() -> pd.DataFrame:
+    """Two strategies that brake below 10 m, one with a winner."""
+    gap, relative = (x.ravel() for x in np.meshgrid(np.linspace(1, 20, 15), np.linspace(-3, 3, 15)))
+    found = [
+        {"strategy": name, "speed_mps": speed, "gap_m": gap, "relative_speed_mps": relative}
+        | {"acceleration_mps2": 0.2 * (gap - 10.0) + 0.1 * relative}
+        | {"winner": (gap > 12) * 1.0 if name == "alcc" else np.nan}
+        for name in ("alcc", "idm tuned")
+        for speed in (2.0, 6.0)
+    ]
+    return pd.concat(map(pd.DataFrame, found), ignore_index=True)
+
+
+def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
+    figure = accelerations(grid(), pd.DataFrame(columns=steps().columns), {"scenario": {}})
+    titles = [axis.get_title(loc="right") for axis in figure.axes[:4]]
+    assert titles == ["alcc at 2 m/s", "alcc at 6 m/s", "idm tuned at 2 m/s", "idm tuned at 6 m/s"]
+    image = pixels(figure, tmp_path / "map.png")
+    for axis in figure.axes[:4]:
+        box = axis.get_window_extent()
+        left, right, low, high = (
+            int(80 / figure.dpi * x) for x in (box.x0, box.x1, box.y0, box.y1)
+        )
+        above = image[len(image) - high + 8, left + 8 : right - 8].mean(0)
+        below = image[len(image) - low - 16, left + 8 : right - 8].mean(0)
+        assert above[2] > above[0] + 40  # blue
+        assert below[0] > below[2] + 40  # red
+    image = pixels(winners(grid()), tmp_path / "winners.png")
+    assert all(count(image, hue) > 1000 for hue in PARENTS.values())
+
+
+@pytest.mark.parametrize("name", ["idm tuned", "pretrained/alcc", "cacc tuned"])
+def test_responses_have_the_right_signs_at_the_corners(name) -> None:
+    cfg = load("evaluate", [f"variant={'hcfs' if name.startswith('cacc') else 'alcc'}"])
+    learned = name.startswith("pretrained")
+    strategy = trained(cfg, name, load_policy(name), POPULATION) if learned else baseline(cfg, name)
+    rows = responses(strategy, POPULATION, [8.0, 3.0], [1.0, 8.0, 60.0], [-4.0, 0.0, 4.0])
+    assert len(rows) == 9 + 6  # at 3 m/s nobody ahead can be 4 m/s slower
+    found = rows.set_index(["speed_mps", "gap_m", "relative_speed_mps"])["acceleration_mps2"]
+    assert found[8.0, 1.0, -4.0] < -1.0
+    assert found[8.0, 60.0, 4.0] > 0.3
+    assert found[8.0, 1.0, -4.0] <= found[8.0, 8.0, 0.0] <= found[8.0, 60.0, 4.0]
+
+
+def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
+    learned = ("variant=alcc", "policy=pretrained", "evaluation.baselines=[idm]")
+    cfg = tiny("evaluate", *learned, "figure_formats=[png,svg]", agent=False)
+    evaluation.run(cfg, tmp_path)
+    drawn = [path.name.rpartition(".") for path in (tmp_path / "figures").iterdir()]
+    stems = {kind: {stem for stem, _, own in drawn if own == kind} for kind in ("png", "svg")}
+    assert {"policy_map", "overview", "improvement_alcc_vs_idm"} <= stems["png"]
+    assert stems["png"] == stems["svg"]
+
+
+def test_figures_of_a_run_with_pieces_of_ones_own_need_no_trust(tmp_path) -> None:
+    write_parquet(episodes(), tmp_path / "episodes.parquet")
+    both = pd.concat([steps(), steps().assign(strategy="reference")])
+    write_parquet(both, tmp_path / "steps.parquet")
+    scenario = {**RING, "road": "open", "string": "automated human"}
+    scenario["pieces"] = {"mine": {"_target_": "not_installed.Mine"}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"scenario": scenario}))
+    names = {path.name for path in run_figures.write_figures(tmp_path)}
+    assert {"overview.png", "episode_alcc.png", "improvement_reference_vs_idm.png"} <= names

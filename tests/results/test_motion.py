@@ -1,13 +1,24 @@
-"""Where vehicles are follows from stored speeds and gaps, on roads, rings and in platoons."""
+"""Where vehicles are follows from stored speeds and gaps; animations hold their motion."""
 
 from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from matplotlib.animation import FFMpegWriter
+from matplotlib.colors import to_rgb
+from PIL import Image
 
-from lcc_rl.errors import ResultsError
-from lcc_rl.results.motion import motion_of, sample_episodes, visited
+from lcc_rl.commands import animate as command
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.figures.animation import COLOURS, LARGEST, animate, frames, page
+from lcc_rl.io.files import write_parquet
+from lcc_rl.results.motion import Motion, motion_of, sample_episodes, visited
 
 OPEN = {"string": "automated human", "road": "open", "circumference": None, "vehicle_length": 5.0}
 RING = {**OPEN, "road": "ring", "circumference": 40.0}
@@ -28,6 +39,7 @@ def test_vehicles_stand_behind_the_leader_by_gaps_and_lengths() -> None:
     assert motion.position[0].tolist() == [-12.0, -26.0]
     assert motion.ahead[0].tolist() == [10.0, 8.0]
     assert visited(motion)[0].tolist() == [8.0, 7.0, 2.0]
+    assert motion_of(rows(cav_speed=np.nan, cav_gap=np.nan), OPEN).roles == ("human",)
 
 
 def test_on_a_ring_the_first_follows_the_last() -> None:
@@ -35,53 +47,133 @@ def test_on_a_ring_the_first_follows_the_last() -> None:
     motion = motion_of(rows(leader_speed=np.nan, hdv_gap=23.0), RING)
     assert motion.leader is None
     assert motion.position[:, 0].tolist() == [0.0, 4.0, 8.0, 12.0]
-    around = motion.position[:, 0] + 12.0 - motion.position[:, 1]
-    assert around == pytest.approx(40.0)
+    assert motion.position[:, 0] + 12.0 - motion.position[:, 1] == pytest.approx(40.0)
     assert motion.ahead[0].tolist() == [6.0, 8.0]
 
 
-def test_a_baseline_without_automated_vehicles_has_fewer() -> None:
-    motion = motion_of(rows(cav_speed=np.nan, cav_gap=np.nan), OPEN)
-    assert motion.roles == ("human",)
-    assert motion.speed.tolist() == [[6.0]] * 4
-
-
-def test_drawn_places_are_read_and_missed() -> None:
-    drawn = {**OPEN, "string": {"size": 2, "penetration": 0.5}}
-    assert motion_of(rows(cav_place=1), drawn).roles == ("human", "automated")
-    with pytest.raises(ResultsError, match="places"):
-        motion_of(rows(), drawn)
-
-
 def test_a_platoon_has_a_row_per_vehicle() -> None:
-    table = pd.DataFrame(
-        {
-            "strategy": "hcfs",
-            "case": "case 1",
-            "time_s": np.repeat(TIME, 3),
-            "follower": np.tile([0, 1, 2], 4),
-            "speed_mps": np.tile([4.0, 3.0, 2.0], 4),
-            "gap_m": np.tile([np.nan, 5.0, 6.0], 4),
-        }
-    )
-    episodes = sample_episodes(table, "hcfs")
-    motion = motion_of(episodes["case 1"], {**OPEN, "string": "automated*6"})
+    table = {"strategy": "hcfs", "case": "case 1", "time_s": np.repeat(TIME, 3)}
+    table |= {"follower": np.tile([0, 1, 2], 4), "speed_mps": np.tile([4.0, 3.0, 2.0], 4)}
+    table |= {"gap_m": np.tile([np.nan, 5.0, 6.0], 4)}
+    found = sample_episodes(pd.DataFrame(table), "hcfs")["case 1"]
+    motion = motion_of(found, {**OPEN, "string": "automated*6"})
     assert motion.roles == ("automated", "automated")
     assert motion.position[0].tolist() == [-10.0, -21.0]
     assert motion.ahead[0].tolist() == [4.0, 3.0]
 
 
-def test_sample_episodes_are_of_one_seed_and_missing_ones_are_said() -> None:
+def test_drawn_places_are_read_and_sample_episodes_are_of_one_seed() -> None:
+    drawn = {**OPEN, "string": {"size": 2, "penetration": 0.5}}
+    assert motion_of(rows(cav_place=1), drawn).roles == ("human", "automated")
     both = pd.concat([rows(training_seed=seed, profile=name) for seed in (3, 1) for name in "ab"])
     found = sample_episodes(both, "alcc")
     assert list(found) == ["profile a, driver 0", "profile b, driver 0"]
     assert all((part["training_seed"] == 1).all() for part in found.values())
-    with pytest.raises(ResultsError, match="no sample episode of idm"):
-        sample_episodes(both, "idm")
-    with pytest.raises(ResultsError, match="no sample episode"):
-        sample_episodes(pd.DataFrame(), "alcc")
+    for wrong, words in (
+        (lambda: motion_of(rows(), drawn), "places"),
+        (lambda: motion_of(rows(), {**OPEN, "string": "automated*3 human"}), "lacks vehicles"),
+        (lambda: sample_episodes(both, "idm"), "no sample episode of idm"),
+    ):
+        with pytest.raises(ResultsError, match=words):
+            wrong()
 
 
-def test_rows_that_lack_vehicles_are_refused() -> None:
-    with pytest.raises(ResultsError, match="lacks vehicles"):
-        motion_of(rows(), {**OPEN, "string": "automated*3 human"})
+def drifting(vehicles: int = 2, ring: bool = False, seconds: float = 1.2) -> Motion:
+    """Vehicles that drift apart, so that every moment looks different."""
+    time = 0.1 * np.arange(1, round(10 * seconds) + 1)
+    gap = 5.0 + np.outer(time, np.arange(1, vehicles + 1))
+    speed = 3.0 + np.arange(vehicles) + np.sin(time)[:, None]
+    roles = ("automated", *["human"] * (vehicles - 1))
+    around = 500.0 if ring else None
+    return Motion(time, roles, speed, gap, 20.0 * time, None if ring else 2 * time, 5.0, around)
+
+
+def data_of(text: str) -> dict:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert found is not None
+    return json.loads(found[1])
+
+
+@pytest.mark.parametrize("ring", [False, True])
+def test_a_page_holds_the_motion_of_all_vehicles_and_needs_nothing_else(ring) -> None:
+    shown = drifting(3, ring)
+    text = page(shown, "a </script> title")
+    found = data_of(text)
+    assert found["title"] == "a </script> title"
+    assert found["roles"] == ["automated", "human", "human"]
+    for name in ("speed", "gap"):
+        assert pytest.approx(getattr(shown, name), abs=0.005) == np.array(found[name]).T
+    assert (found["leader"] is None) == (found["circumference"] is not None) == ring
+    assert not re.search(r"(src|href)=|https?:|@import", text)
+    long = data_of(page(drifting(100, seconds=600.0), "a fleet"))
+    assert len(long["time"]) * 100 <= LARGEST
+
+
+@pytest.mark.parametrize("ring", [False, True])
+def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
+    with Image.open(animate(drifting(2, ring), "drifting", tmp_path / "x.gif")) as image:
+        assert image.n_frames == 11
+        shown = []
+        for frame in (0, 10):
+            image.seek(frame)
+            shown.append(np.asarray(image.convert("RGB")).astype(int))
+    road = slice(0, shown[0].shape[0] // 4)
+    assert np.abs(shown[0][road] - shown[1][road]).sum() > 1000
+    for role in ("automated", "human", *([] if ring else ["leader"])):
+        near = np.abs(shown[0] - 255 * np.array(to_rgb(COLOURS[role]))).max(-1) < 24
+        assert near.sum() > 30, role
+
+
+def test_a_long_episode_plays_faster_and_an_mp4_is_one(tmp_path, monkeypatch) -> None:
+    assert "4.0 × as fast" in next(frames(drifting(seconds=60.0), "long"))._suptitle.get_text()
+    if FFMpegWriter.isAvailable():
+        assert animate(drifting(), "x", tmp_path / "x.mp4").read_bytes()[4:8] == b"ftyp"
+    monkeypatch.setattr(FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
+    with pytest.raises(ConfigError, match="ffmpeg"):
+        animate(drifting(), "x", tmp_path / "y.mp4")
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """An evaluation's folder with two strategies, two sample episodes each."""
+    found = [
+        rows(strategy=name, driver_id=driver, cav_speed=8.0 + driver)
+        for name in ("idm", "alcc")
+        for driver in (0, 1)
+    ]
+    write_parquet(pd.concat(found), tmp_path / "run" / "steps.parquet")
+    (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump({"scenario": OPEN}))
+    return tmp_path / "run"
+
+
+def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
+    assert command.main([str(run_folder)]) == 0
+    name = capsys.readouterr().out.splitlines()[-1]
+    assert name == str(run_folder / "figures" / "animation_alcc_0.html")
+    assert "alcc: profile p, driver 0" in Path(name).read_text()
+    out = run_folder.parent / "there.html"
+    words = ["--strategy", "idm", "--episode", "1", "--start", "1", "--duration", "0.5"]
+    assert command.main([str(run_folder), *words, "--out", str(out)]) == 0
+    found = data_of(out.read_text())
+    assert (found["title"], found["time"]) == ("idm: profile p, driver 1", [1.0, 1.5])
+    assert found["speed"][0] == [9.0] * 2
+    job = run_folder.parent / "job"
+    job.mkdir()
+    run_folder.rename(job / "evaluation")
+    assert command.run(job).parent == job / "evaluation" / "figures"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--strategy", "alccc"], "'alccc'"),
+        (["--episode", "2"], "from 0 to 1, got 2"),
+        (["--out", "x.avi"], "'.avi'"),
+        (["--start", "9"], "from 0.5 to 2 s"),
+    ],
+)
+def test_mistakes_are_named(words, said, run_folder) -> None:
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        command.main([str(run_folder), *words])
+    with pytest.raises(ConfigError, match="not a run folder"):
+        command.run(run_folder / "nothing")

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from study_frames import episodes, training
 
-from lcc_rl.results.report import column_cells
+from lcc_rl.results.cells import column_cells
 from lcc_rl.results.savings import per_seed, savings
 from lcc_rl.studies.alcc import paper_tables
 from lcc_rl.studies.alcc import tables as alcc_tables

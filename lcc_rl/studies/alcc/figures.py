@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lcc_rl.figures.drawing import (
+    INK,
+    SOFT,
+    colour,
+    footnote,
+    grid,
+    in_words,
+    legend_above,
+    new_figure,
+    rows_of,
+    style,
+    whiskers,
+)
+from lcc_rl.figures.training import draw_curves
 from lcc_rl.functional.power import motor_power
-from lcc_rl.results.drawing import in_words, legend_above, new_figure
-from lcc_rl.results.figures import colour, style
-from lcc_rl.results.savings import by_driver, savings
-from lcc_rl.results.training_figures import draw_curve
-from lcc_rl.studies.alcc.comparison_figures import INK, SOFT, whiskers
+from lcc_rl.results.savings import UNTRAINED, by_driver, per_seed, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
+from lcc_rl.studies.alcc.tables import comparison
 
 TERMS = {
     "episode_reward": "total reward",
@@ -23,6 +36,11 @@ TERMS = {
     "reward_cav_energy": "CAV energy",
     "reward_hdv_energy": "HDV energy",
     "reward_collision": "collision",
+}
+PANELS = {
+    "path_saving_against_idm_pct": ("path energy saved\nagainst idm [%]", 0.0),
+    "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
+    "long_time_gap_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
 }
 
 
@@ -33,9 +51,8 @@ def power_map() -> Figure:
     figure = new_figure(6.6, 4.2)
     axis = figure.subplots()
     limit = float(np.abs(power).max())
-    mesh = axis.pcolormesh(
-        speed, acceleration, power, cmap="RdBu_r", vmin=-limit, vmax=limit, rasterized=True
-    )
+    look: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "rasterized": True}
+    mesh = axis.pcolormesh(speed, acceleration, power, **look)
     levels = [-150, -100, -50, -20, 0, 20, 50, 100, 150, 200]
     lines = axis.contour(speed, acceleration, power, levels, colors=INK, linewidths=0.7)
     axis.clabel(lines, fmt="%d kW", fontsize=8)
@@ -51,27 +68,23 @@ def reward_terms(training: pd.DataFrame) -> Figure:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
     """
     shown = {name: label for name, label in TERMS.items() if name in training}
-    columns = 3
-    lines = -(-len(shown) // columns)
+    lines = -(-len(shown) // 3)
     figure = new_figure(10.0, 0.5 + 2.7 * lines)
-    axes = np.atleast_1d(figure.subplots(lines, columns, sharex=True)).ravel()
-    labels: dict[str, str] = {}
+    axes = figure.subplots(lines, 3, sharex=True, squeeze=False).ravel()
     for axis, (name, label) in zip(axes, shown.items(), strict=False):
-        floor, top = 0.0, 0.0
-        for variant, rows in training.groupby("variant", sort=False):
-            if rows[name].isna().all():
-                continue
-            line, labels[str(variant)] = draw_curve(axis, rows, name, str(variant))
-            floor = min(floor, float(line.iloc[len(line) // 5 :].min()))
-            top = max(top, float(line.max()))
-        # The first, random episodes would set the scale.
+        floor, top = draw_curves(axis, training, name)
         axis.set_ylim(1.5 * floor - 0.2, top + 0.05 * (top - floor) + 0.05)
-        style(axis, "", "")
+        style(axis)
         axis.set_title(label, fontsize=10)
     for axis in axes[len(shown) :]:
         axis.remove()
-    handles = [axes[0].plot([], [], color=colour(v), label=text)[0] for v, text in labels.items()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False, fontsize=9)
+    look: dict[str, Any] = {
+        "loc": "outside upper center",
+        "ncols": 2,
+        "frameon": False,
+        "fontsize": 9,
+    }
+    figure.legend(handles=axes[0].get_lines(), **look)
     figure.supxlabel("training episodes", fontsize=10)
     figure.supylabel("sum per episode", fontsize=10)
     return figure
@@ -87,19 +100,16 @@ def distributions(episodes: pd.DataFrame) -> Figure:
     figure = new_figure(9.0, 0.9 + 0.62 * len(names))
     axes = figure.subplots(1, 2)
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
-    for axis, vehicle in zip(axes, ("cav", "hdv"), strict=True):
+    for axis, (vehicle, title) in zip(axes, titles.items(), strict=True):
         energy = by_driver(episodes, f"{vehicle}_path_energy_kj")
         for place, name in enumerate(names):
             if name in energy:
                 _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
-        labels = [in_words(name) if vehicle == "cav" else "" for name in names]
-        axis.set_yticks(range(len(names)), labels)
-        axis.set_ylim(len(names) - 0.4, -0.6)
+        rows_of(axis, names if vehicle == "cav" else [""] * len(names))
         axis.margins(x=0.12)
-        style(axis, "path energy [kJ per episode]", "")
-        axis.set_title(f"{titles[vehicle]}, n = {len(energy)} drivers", fontsize=10)
-    note = "box: quartiles; whiskers: 5th to 95th percentile; diamond and number: mean"
-    figure.supxlabel(note, fontsize=8, color=SOFT)
+        style(axis, "path energy [kJ per episode]")
+        axis.set_title(f"{title}, n = {len(energy)} drivers", fontsize=10)
+    footnote(figure, "box: quartiles; whiskers: 5th to 95th percentile; diamond and number: mean")
     return figure
 
 
@@ -109,15 +119,10 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
     axis.hlines(place, lowest, highest, color=hue, lw=1.2)
     axis.barh(place, high - low, 0.5, low, color=hue, alpha=0.35, edgecolor=hue)
     axis.vlines(median, place - 0.25, place + 0.25, color=hue, lw=2.0)
-    axis.plot(values.mean(), place, marker="D", color=INK, markersize=4)
-    axis.annotate(
-        f"{values.mean():.1f}",
-        (values.mean(), place),
-        xytext=(0, 13),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-    )
+    mean = values.mean()
+    above: dict[str, Any] = {"xytext": (0, 13), "textcoords": "offset points"}
+    axis.plot(mean, place, marker="D", color=INK, markersize=4)
+    axis.annotate(f"{mean:.1f}", (mean, place), ha="center", fontsize=8, **above)
 
 
 def generalization_figure(
@@ -130,7 +135,9 @@ def generalization_figure(
     _energies_by_profile(above, episodes, table["profile_id"].tolist(), (baseline, strategy))
     values, places = table["path_saving_pct"].to_numpy(float), np.arange(len(table))
     whiskers(below, places, table, "path_saving_pct", colour(strategy), upright=True)
-    below.plot(places, values, "o", color=colour(strategy), label=_label(episodes, strategy))
+    seeds = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
+    sure = f"mean of {seeds} seeds, 95 % interval" if seeds > 1 else "1 seed (no interval)"
+    below.plot(places, values, "o", color=colour(strategy), label=f"this study, {sure}")
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
     label = "paper, 4 profiles, energy as drawn"
     below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
@@ -154,8 +161,8 @@ def _energies_by_profile(
 ) -> None:
     """Draw the path energy of car and human driver on every profile under two strategies."""
     places = np.arange(len(order))
+    columns = ["cav_path_energy_kj", "hdv_path_energy_kj"]
     for name, offset in zip(names, (-0.21, 0.21), strict=True):
-        columns = [f"{vehicle}_path_energy_kj" for vehicle in ("cav", "hdv")]
         rows = episodes[episodes["strategy"] == name].groupby("profile_id")[columns].mean()
         car, human = (rows.loc[order, column].to_numpy(float) for column in columns)
         axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{in_words(name)}: car")
@@ -169,22 +176,117 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
     """Scale an axis by most of its values, and write the outliers at its border."""
     limit = 2.0 * max(float(np.percentile(np.abs(values), 85)), max(PAPER_GENERALIZATION))
     axis.set_ylim(-limit, limit)
+    look: dict[str, Any] = {
+        "xytext": (-4, 0),
+        "textcoords": "offset points",
+        "ha": "right",
+        "fontsize": 8,
+    }
     for place, value in zip(places, values, strict=True):
         if abs(value) > limit:
-            up = value > 0
-            axis.annotate(
-                f"{value:+.0f} % {'▲' if up else '▼'}",
-                (place, limit if up else -limit),
-                xytext=(-4, 0),
-                textcoords="offset points",
-                ha="right",
-                va="top" if up else "bottom",
-                fontsize=8,
-            )
+            mark, end, side = ("▲", limit, "top") if value > 0 else ("▼", -limit, "bottom")
+            axis.annotate(f"{value:+.0f} % {mark}", (place, end), va=side, **look)
 
 
-def _label(episodes: pd.DataFrame, strategy: str) -> str:
-    seeds = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
-    if seeds > 1:
-        return f"this study, mean of {seeds} seeds, 95 % interval"
-    return "this study, 1 seed (no interval)"
+def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
+    """Energy, safety and efficiency under each change of the study (no counterpart).
+
+    Args:
+        episodes: rows of the evaluations; those of the study itself come first.
+        by: the column that names the change.
+    """
+    table = comparison(episodes, by)
+    names, strategies = (list(dict.fromkeys(table[name])) for name in (by, "strategy"))
+    figure = new_figure(10.0, 1.3 + 0.42 * len(names))
+    axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
+    for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
+        for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
+            part, hue = table[table["strategy"] == strategy], colour(strategy)
+            rows = [names.index(name) + offset for name in part[by]]
+            whiskers(axis, rows, part, column, hue)
+            axis.plot(part[column], rows, "o", color=hue, ms=5, label=in_words(strategy))
+        axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
+        axis.axhline(0.5, color=SOFT, lw=0.6)
+        grid(axis, "x")
+        style(axis, label)
+        axis.tick_params(axis="y", length=0)
+    rows_of(axes[0], list(map(str, names)))
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
+    seeds = _how_many(table["seeds"])
+    footnote(figure, f"n = {seeds}; lines: 95 % interval; dashed: the study's limit")
+    return figure
+
+
+def followers_figure(episodes: pd.DataFrame) -> Figure:
+    """Energy saved against the number of human drivers behind (no counterpart).
+
+    Args:
+        episodes: rows of the evaluations of all trained strategies, with the column
+            ``followers``.
+    """
+    table = comparison(episodes, "followers")
+    table = table[table["strategy"] != "reference"]
+    column = "path_saving_against_reference_pct"
+    figure = new_figure(6.5, 3.8)
+    axis = figure.subplots()
+    names = list(dict.fromkeys(table["strategy"]))
+    for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
+        part = table[table["strategy"] == name]
+        label = f"{in_words(name)}, {_how_many(part['seeds'])}"
+        places = part["followers"].to_numpy(float) + offset
+        axis.plot(places, part[column], "o-", color=colour(name), label=label)
+        whiskers(axis, places, part, column, colour(name), upright=True)
+    axis.axhline(0.0, color=INK, lw=0.8)
+    legend_above(axis)
+    words = "path energy saved\nagainst reference [%]"
+    style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
+    return figure
+
+
+def single_profile_figure(episodes: pd.DataFrame) -> Figure:
+    """Total energy of every seed trained and evaluated on one profile (no counterpart).
+
+    Args:
+        episodes: rows of the evaluations, with the column ``study_profile``.
+    """
+    groups = dict(iter(episodes.groupby("study_profile", sort=True)))
+    figure = new_figure(max(7.5, 1.8 + 1.9 * len(groups)), 4.2)
+    axis = figure.subplots()
+    labels, legend = [], {}
+    for place, (profile, part) in enumerate(groups.items()):
+        energy = per_seed(part, "total_energy_kj")
+        human, hue = float(energy["idm"].mean()), colour("idm")
+        axis.hlines(human, place - 0.36, place + 0.36, color=hue, lw=2.5)
+        legend["idm (human driver)"] = axis.plot([], [], "-", color=hue)[0]
+        learned = sorted((name for name in energy if name not in UNTRAINED), reverse=True)
+        for number, strategy in enumerate(learned):
+            values, hue = energy[strategy].to_numpy(float), colour(strategy)
+            centre = place - 0.16 + 0.32 * number
+            jitter = centre + _abreast(len(values), 0.1)
+            axis.plot(jitter, values, "o", color=hue, ms=5, alpha=0.6, mew=0)
+            axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=hue, lw=2)
+            legend[f"{in_words(strategy)}: seeds and mean"] = axis.plot([], [], "o", color=hue)[0]
+        label = f"profile {profile!s}\n"
+        if {"alcc", "reference"} <= set(energy):
+            # Not a percentage: in a jam a profile's energy can be near zero.
+            gain = energy["alcc"].mean() - energy["reference"].mean()
+            label += f"alcc {gain:+.1f} kJ\nagainst reference"
+        labels.append(label)
+    axis.set_xticks(range(len(groups)), labels, fontsize=9)
+    axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
+    style(axis, "profile used for training and evaluation", "total energy [kJ per episode]")
+    look: dict[str, Any] = {"loc": "outside upper center", "frameon": False, "ncols": 3}
+    figure.legend(legend.values(), legend.keys(), **look)
+    return figure
+
+
+def _how_many(seeds: pd.Series) -> str:
+    """Return the distinct numbers of seeds in a column, in words."""
+    counts = sorted({int(count) for count in seeds if str(count).isdigit()})
+    return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
+
+
+def _abreast(count: int, reach: float) -> np.ndarray:
+    """Return evenly spaced offsets in ±``reach``; zero for a single one."""
+    return reach * np.linspace(-1.0, 1.0, count) * (count > 1)

@@ -9,25 +9,24 @@ import pandas as pd
 
 from lcc_rl import results
 from lcc_rl.errors import ResultsError
+from lcc_rl.figures import evaluation as run_figures
+from lcc_rl.figures.calibration import calibration_figure, joint_figure
+from lcc_rl.figures.page import Page
+from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.calibration_figures import calibration_figure, joint_figure
 from lcc_rl.results.runs import CONFIG
-from lcc_rl.results.training_figures import learning_curve
-from lcc_rl.studies.alcc import figures, tables
-from lcc_rl.studies.alcc.comparison_figures import (
-    comparison_figure,
-    followers_figure,
-    single_profile_figure,
-)
-from lcc_rl.studies.alcc.paper_tables import human_energy
-from lcc_rl.studies.alcc.report_main import MAIN, add_main, size
+from lcc_rl.results.savings import LEADER
+from lcc_rl.results.tables import leader_too_fast
+from lcc_rl.studies.alcc import figures, paper_tables, tables
+from lcc_rl.studies.alcc.paper_tables import PAPER_HUMAN, PAPER_TABLE_IV
 from lcc_rl.studies.alcc.settings import ABLATIONS, FILTERS
-from lcc_rl.studies.page import Page
 from lcc_rl.studies.runner import read_notes
 
 TITLE = "Adaptive Leading Cruise Control: the study"
+MAIN = Path("evaluation", "episodes.parquet")
 ITSELF = "none (the recipe itself)"
 NO_FILTER = "without"
+BOTH = {"alcc", "reference"}
 
 
 def write_results(
@@ -53,11 +52,127 @@ def write_results(
         raise ResultsError(
             f"{folder}: no evaluation/episodes.parquet; lcc-rl reproduce alcc makes it"
         )
-    for add in (add_main, _filter, _learning, _ablations, _single, _followers, _people):
+    if (page.folder / MAIN).exists():
+        add_main(page)
+    for add in (_filter, _learning, _ablations, _single, _followers, _people):
         add(page)
     if target is not None:
         page.fill(target)
     return _made(page)
+
+
+def add_main(page: Page) -> None:
+    """Add the sections of the main evaluation."""
+    episodes = read_parquet(page.folder / MAIN)
+    _headline(page, episodes)
+    text = """The study asks for no collision in any episode, time with TTC < 4 s of at most 0.1 %,
+        and time with a time gap > 2.5 s of at most 1 %, for every seed. Columns: unsafe TTC is the
+        share of time with TTC < 4 s, long time gap that with a time gap > 2.5 s, also only above
+        1 m/s, where it is not a matter of a few metres in a jam; no least TTC means that the car
+        never closed in."""
+    shown = [
+        ("constraints", f"All episodes, {size(episodes)}", tables.constraints(episodes)),
+        ("constraints_by_seed", "Every seed", tables.constraints_by_seed(episodes)),
+    ]
+    page.add("Safety and efficiency", text, shown)
+    if set(episodes["strategy"]) >= BOTH:
+        _awareness(page, episodes)
+        _generalization(page, episodes)
+    _human(page, episodes)
+
+
+def size(episodes: pd.DataFrame) -> str:
+    """Return the number of profiles and drivers of an evaluation, in words."""
+    return (
+        f"{episodes['profile_id'].nunique()} held-out profiles × "
+        f"{episodes['driver_id'].nunique()} drivers"
+    )
+
+
+def _headline(page: Page, episodes: pd.DataFrame) -> None:
+    text = f"""alcc saves energy for itself and for the human driver behind; reference is the same
+        without regard for the driver behind; own_energy is reference whose own energy counts as
+        often as alcc's reward has terms of energy: what it saves is due to that weight, not to
+        regard for others; idm is one human driver in the car's place, human are drivers of the
+        population in that place, without noise of their own; direct is the human driver directly
+        behind the leader, without the car.
+
+        All meet the same {size(episodes)} with the same noise. Energies are means per episode,
+        over all seeds; savings are positive where energy is saved. Path energy is what the speeds
+        driven take and accelerating loses; energy as drawn (the paper's) also counts what the last
+        speed stores more than the first, and so rewards ending slower than one began. Intervals of
+        savings are 95 % intervals of a bootstrap that resamples held-out windows (with all drivers,
+        the same for both sides) and training seeds (of each side on its own); other intervals are
+        over seeds only."""
+    if episodes["training_seed"].nunique() < 2:
+        text += """ Every controller was trained with one seed only: intervals are over windows,
+            and single seeds differ by about as much as the controllers do."""
+    text += "".join(f"\n\nWarning: {line}." for line in leader_too_fast(episodes))
+    caption = """Counterpart of Fig. 11: path energy of controlled car and human driver by strategy;
+        a driver's value is its mean over profiles and seeds."""
+    drawn = [("distributions", caption, figures.distributions(episodes))]
+    path = page.folder / "evaluation" / "steps.parquet"
+    steps = read_parquet(path) if path.exists() else pd.DataFrame({"strategy": []})
+    if (steps["strategy"] == "alcc").any():
+        caption = "Counterpart of Fig. 7: one held-out episode of alcc, first seed."
+        drawn.append(("sample_episode", caption, run_figures.sample_episode(steps, "alcc")))
+    shown = [
+        ("headline", f"Energy of both saved, {size(episodes)}", tables.headline(episodes)),
+        ("energies", f"Energy per episode, {size(episodes)}", tables.energies(episodes)),
+    ]
+    if set(LEADER) <= set(episodes):
+        caption = "Path energy saved in thirds of the windows, by the leader's energy and speed"
+        shown.append(("strata", caption, tables.strata(episodes)))
+    page.add("At a glance", text, shown, drawn)
+
+
+def _awareness(page: Page, episodes: pd.DataFrame) -> None:
+    text = f"""The paper's main claim: regard for the driver behind saves energy in total, alcc
+        against reference. The paper shows one profile and 923 drivers, energy as drawn. Its
+        reference is weak: the car draws {PAPER_TABLE_IV["mean", "reference"][0]} kJ, where a human
+        driver behind the same leader draws {PAPER_HUMAN["B"]} kJ (Fig. 9)."""
+    beside = f"Table IV beside this study ({size(episodes)})"
+    shown = [
+        ("table_iv", beside, paper_tables.table_iv(episodes)),
+        ("holistic", "Saving per driver", paper_tables.holistic(episodes)),
+    ]
+    caption = """Counterpart of Fig. 10: path energy of both vehicles, and its saving, with every
+        driver behind, mean over profiles and seeds."""
+    figure = run_figures.paired_improvement(episodes, "alcc", "reference")
+    heading = "Does regard for the driver behind pay?"
+    page.add(heading, text, shown, [("improvement", caption, figure)])
+
+
+def _generalization(page: Page, episodes: pd.DataFrame) -> None:
+    text = """The paper tries its controller on four profiles it was not trained on. Here every
+        profile is held out: no recording is in both training and evaluation. A percentage of a
+        profile's small energy as drawn, as in a jam, says little; together is the saving of all
+        profiles' energy."""
+    caption = "Saving of alcc against reference over profiles, beside the paper's 4"
+    shown = [
+        ("generalization_row", caption, paper_tables.generalization_row(episodes)),
+        ("generalization", "Every held-out profile", paper_tables.generalization(episodes)),
+    ]
+    caption = "Counterpart of Fig. 12: energies and saving on every held-out profile."
+    figure = figures.generalization_figure(episodes)
+    page.add("Generalization", text, shown, [("generalization", caption, figure)])
+
+
+def _human(page: Page, episodes: pd.DataFrame) -> None:
+    text = """Scenario A: the human driver follows a controlled car. Scenario B: the same driver
+        directly follows the leader. In A the driver is one place further back, so part of the
+        saving comes from the place and not from the controller: the rows idm and human show how
+        much a human in the car's place saves."""
+    table = paper_tables.human_energy(episodes)
+    caption = """Counterpart of Fig. 9: human driver's path energy behind {}, and the saving of
+        every driver, mean over profiles and seeds."""
+    drawn = [
+        (f"human_energy_{name}", caption.format(name), run_figures.human_energy(episodes, name))
+        for name in ("alcc", "reference")
+        if (episodes["strategy"] == name).any()
+    ]
+    shown = [("human_energy", f"Human driver's energy, {size(episodes)}", table)]
+    page.add("Human driver's energy, with and without the car", text, shown, drawn)
 
 
 def _filter(page: Page) -> None:
@@ -66,24 +181,22 @@ def _filter(page: Page) -> None:
     if not frames:
         return
     episodes, first = _beside_main(page, frames, filter=NO_FILTER), frames[0]
-    text = (
-        "The same policies, with +filter=cbf between them and the car: nothing is trained. "
-        "The filter keeps the time-to-collision above 4 s and, as far as that leaves room, the "
-        "time gap below 2.45 s; at speeds below scenario.filters.automated.full_speed, in m/s, by "
-        "which the lines differ, below proportionally less. The strategy cbf is the filter by "
-        "itself, moving a car that always brakes a little: what the policies add is the difference "
-        f"to it. The further tables are those of the default, {FILTERS[0]} m/s."
-    )
+    text = f"""The same policies, with +filter=cbf between them and the car: nothing is trained. The
+        filter keeps the time-to-collision above 4 s and, as far as that leaves room, the time gap
+        below 2.45 s; at speeds below scenario.filters.automated.full_speed, in m/s, by which the
+        lines differ, below proportionally less. The strategy cbf is the filter by itself, moving a
+        car that always brakes a little: what the policies add is the difference to it. The further
+        tables are those of the default, {FILTERS[0]} m/s."""
     caption = f"Without and with the filter, {size(first)}"
     shown = [
         ("filter", caption, tables.comparison(episodes, "filter")),
         ("filter_headline", "Energy of both saved", tables.headline(first)),
         ("filter_constraints", "All episodes", tables.constraints(first)),
         ("filter_by_seed", "Every seed", tables.constraints_by_seed(first)),
-        ("filter_human", "Human driver's energy", human_energy(first)),
+        ("filter_human", "Human driver's energy", paper_tables.human_energy(first)),
     ]
     caption = "Energy, safety and efficiency without and with the filter."
-    drawn = [("filter", caption, comparison_figure(episodes, "filter"))]
+    drawn = [("filter", caption, figures.comparison_figure(episodes, "filter"))]
     page.add("A filter that keeps the time-to-collision", text, shown, drawn)
 
 
@@ -91,11 +204,9 @@ def _learning(page: Page) -> None:
     if not any((page.folder / "train").rglob("training.parquet")):
         return
     training = results.load(page.folder / "train", "training", strict=True)
-    text = (
-        "Rewards are sums per episode as played in training, where agents other than "
-        "analytic add noise to their actions, mean over the episodes of a batch. drop: how far "
-        "the mean of a tenth of the training ever falls below the best tenth before it."
-    )
+    text = """Rewards are sums per episode as played in training, where agents other than analytic
+        add noise to their actions, mean over the episodes of a batch. drop: how far the mean of a
+        tenth of the training ever falls below the best tenth before it."""
     shown = [("learning", "Learning curves, every seed", tables.learning(training))]
     caption = "Counterpart of Fig. 6: reward per episode over training."
     drawn = [
@@ -110,56 +221,69 @@ def _ablations(page: Page) -> None:
     if not frames:
         return
     episodes = _beside_main(page, frames, ablation=ITSELF)
-    text = (
-        "Each line changes one thing of the recipe by an override and trains anew; savings are "
-        "against the humans in the same scenario, so that a change of the scenario (no "
-        "recuperation) is compared with itself."
-    )
+    text = """Each line changes one thing of the recipe by an override and trains anew; savings are
+        against the humans in the same scenario, so that a change of the scenario (no recuperation)
+        is compared with itself."""
     caption = "Energy, safety and efficiency under each change."
     shown = [("ablations", "Ablations", tables.comparison(episodes))]
-    page.add("Ablations", text, shown, [("ablations", caption, comparison_figure(episodes))])
+    drawn = [("ablations", caption, figures.comparison_figure(episodes))]
+    page.add("Ablations", text, shown, drawn)
 
 
 def _single(page: Page) -> None:
-    episodes = _numbered(page.folder / "single", "study_profile")
-    if episodes is None:
+    frames = _numbered(page.folder / "single", "study_profile")
+    if not frames:
         return
-    text = (
-        "The paper's probable protocol: the same stretch of one leader in training and evaluation. "
-        "Each profile has its own controllers, trained on nothing else."
-    )
+    episodes = pd.concat(frames, ignore_index=True)
+    text = """The paper's probable protocol: the same stretch of one leader in training and
+        evaluation. Each profile has its own controllers, trained on nothing else."""
     heading = "One profile for training and evaluation"
     shown = [("single_profile", heading, tables.single_profile(episodes))]
     caption = "Total energy on the profile that was trained on: every seed, beside the human."
-    drawn = [("single_profile", caption, single_profile_figure(episodes))]
+    drawn = [("single_profile", caption, figures.single_profile_figure(episodes))]
     page.add(heading, text, shown, drawn)
 
 
 def _followers(page: Page) -> None:
-    episodes = _numbered(page.folder / "followers", "followers")
-    if episodes is None:
+    frames = _numbered(page.folder / "followers", "followers")
+    if not frames:
         return
-    text = (
-        "Energies are those of the controlled car and of all human drivers behind it. Unless "
-        "the study's overrides say otherwise, the controllers learn by the gradient through the "
-        "simulator (agent=analytic), which is more precise than DDPG, and are evaluated on every "
-        f"held-out window ({size(episodes)}). Time gaps and times-to-collision tell "
-        "whether a saving is bought with distance or risk."
-    )
+    episodes = pd.concat(frames, ignore_index=True)
+    text = f"""Energies are those of the controlled car and of all human drivers behind it. Unless
+        the study's overrides say otherwise, the controllers learn by the gradient through the
+        simulator (agent=analytic), which is more precise than DDPG, and are evaluated on every
+        held-out window ({size(episodes)}). Time gaps and times-to-collision tell whether a saving
+        is bought with distance or risk."""
     table = tables.comparison(episodes, "followers")
     shown = [("followers", "Against the number of human drivers behind", table)]
     drawn = []
-    if {"alcc", "reference"} <= set(episodes["strategy"]):
-        caption = (
-            "Energy saved by regard for the human drivers behind (alcc) and by counting one's own "
-            "energy as often (own_energy), against their number."
-        )
-        drawn.append(("followers", caption, followers_figure(episodes)))
+    if set(episodes["strategy"]) >= BOTH:
+        caption = """Energy saved by regard for the human drivers behind (alcc) and by counting
+            one's own energy as often (own_energy), against their number."""
+        drawn.append(("followers", caption, figures.followers_figure(episodes)))
     page.add("More human drivers behind", text, shown, drawn)
 
 
+def _people(page: Page) -> None:
+    """Add the calibration and the power map."""
+    caption = "Counterpart of Fig. 2: the motor's power map (A2)."
+    drawn = [("power_map", caption, figures.power_map())]
+    path = page.folder / "calibration" / "drivers.parquet"
+    text = "The motor's power map is the paper's polynomial."
+    if path.exists():
+        drivers = read_parquet(path)
+        text += """ Drivers are calibrated on the study's trajectories; a third of them typically
+            reach the upper bound of the desired speed, which congested traffic does not
+            identify."""
+        caption = "Counterpart of Fig. 4: calibration error and parameters."
+        drawn.append(("calibration", caption, calibration_figure(drivers)))
+        caption = "Counterpart of Fig. 5: joint distribution of desired speed and time gap."
+        drawn.append(("joint_distribution", caption, joint_figure(drivers)))
+    page.add("Drivers and power", text, figures=drawn)
+
+
 def _beside_main(page: Page, frames: Sequence[pd.DataFrame], **column: str) -> pd.DataFrame:
-    """Join evaluations to that of the main part, where there is one."""
+    """Join evaluations to that of the main part, if there is one."""
     path = page.folder / MAIN
     main = [read_parquet(path).assign(**column)] if path.exists() else []
     return pd.concat([*main, *frames], ignore_index=True)
@@ -172,38 +296,16 @@ def _evaluations(root: Path, column: str, order: Sequence[str] = ()) -> list[pd.
     return [read_parquet(found[name]).assign(**{column: name}) for name in names]
 
 
-def _numbered(root: Path, column: str) -> pd.DataFrame | None:
-    """Join the evaluations of parts whose names are numbers, in their order; None without any."""
-    frames = _evaluations(root, column)
-    if not frames:
-        return None
-    episodes = pd.concat(frames, ignore_index=True)
-    episodes[column] = episodes[column].astype(int)
-    return episodes.sort_values(column, kind="stable")
-
-
-def _people(page: Page) -> None:
-    """Add the calibration and the power map."""
-    caption = "Counterpart of Fig. 2: the motor's power map (A2)."
-    drawn = [("power_map", caption, figures.power_map())]
-    path = page.folder / "calibration" / "drivers.parquet"
-    text = "The motor's power map is the paper's polynomial."
-    if path.exists():
-        drivers = read_parquet(path)
-        text += (
-            " Drivers are calibrated on the study's trajectories; a third of them typically reach "
-            "the upper bound of the desired speed, which congested traffic does not identify."
-        )
-        caption = "Counterpart of Fig. 4: calibration error and parameters."
-        drawn.append(("calibration", caption, calibration_figure(drivers)))
-        caption = "Counterpart of Fig. 5: joint distribution of desired speed and time gap."
-        drawn.append(("joint_distribution", caption, joint_figure(drivers)))
-    page.add("Drivers and power", text, figures=drawn)
+def _numbered(root: Path, column: str) -> list[pd.DataFrame]:
+    """Read the evaluations of parts whose names are numbers, in the order of these."""
+    frames = [frame.astype({column: int}) for frame in _evaluations(root, column)]
+    return sorted(frames, key=lambda frame: int(frame[column].iloc[0]))
 
 
 def _made(page: Page) -> Path:
     """Write the page, with the configurations and problems of the study."""
-    problems = read_notes(page.folder).get("problems", {})
+    notes = read_notes(page.folder)
+    problems = notes.get("problems", {})
     listed = "\n".join(f"{name}: {problem}" for name, problem in problems.items())
     details = [("Problems", listed)] if problems else []
     configs = sorted((page.folder / "train").glob(f"*/*/{CONFIG}"))
@@ -215,4 +317,4 @@ def _made(page: Page) -> Path:
     seeds = [f"{p.parents[1].name}/{p.parent.name}" for p in configs]
     more = f"\n\nTrainings behind the main part: {', '.join(seeds)}." if seeds else ""
     more += f"\n\n{len(problems)} runs failed or were left out, see below." if problems else ""
-    return page.write(TITLE, details, more)
+    return page.write(TITLE, notes.get("commands", ()), details, more)

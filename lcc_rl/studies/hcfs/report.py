@@ -8,19 +8,24 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.figures import platoon
+from lcc_rl.figures.page import Page
+from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results import string_figures
 from lcc_rl.results.string_tables import case_table
-from lcc_rl.results.training_figures import learning_curve
 from lcc_rl.studies.hcfs import tables
 from lcc_rl.studies.hcfs.study import STEPS, TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
-from lcc_rl.studies.page import Page
-from lcc_rl.studies.runner import EPISODES
+from lcc_rl.studies.runner import EPISODES, read_notes
 
 LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
 TITLE = "Hybrid Car-Following Strategy: the study"
-CASES = {"case 1": "Table IV", "case 2": "Table V", "case 3": "Table VI"}
+# The paper's table and figures of each case: speeds, jerk, and who drives.
+CASES = {
+    "case 1": ("Table IV", 4, 5, 6),
+    "case 2": ("Table V", 7, 8, 9),
+    "case 3": ("Table VI", 10, 11, 12),
+}
 RULES = ("cacc path", "cacc paper_like", "cacc tuned")
 HYBRIDS = ("hcfs", "hcfs oracle", "hcfs untuned")
 PARENTS = ("cacc tuned", LEARNED)
@@ -47,8 +52,7 @@ def write_results(
         ResultsError: if a table is missing or cannot be read.
     """
     made = Page(folder, formats)
-    episodes = read_parquet(made.folder / EPISODES)
-    steps = read_parquet(made.folder / STEPS)
+    episodes, steps = (read_parquet(made.folder / name) for name in (EPISODES, STEPS))
     _windows(made, episodes)
     for case in CASES:
         _case(made, episodes, steps, case)
@@ -60,18 +64,7 @@ def write_results(
     made.add("Weights of the reward", text, [shown])
     if page is not None:
         made.fill(page)
-    return made.write(TITLE, ())
-
-
-def _training(made: Page) -> None:
-    text, listed = "", []
-    if (made.folder / LENGTHS).exists():  # only where several studies were put side by side
-        text = "The same study with trainings of other lengths; intervals over windows and seeds."
-        table = tables.lengths(read_parquet(made.folder / LENGTHS))
-        listed.append(("lengths", "Σ reward per window by the length of the training", table))
-    curve = learning_curve(read_parquet(made.folder / TRAINING))
-    drawn = [("learning_curve", "Learning curve", curve)]
-    made.add("Training of the DDPG parent", text, listed, drawn)
+    return made.write(TITLE, read_notes(made.folder).get("commands", ()))
 
 
 def _windows(made: Page, episodes: pd.DataFrame) -> None:
@@ -88,35 +81,46 @@ def _windows(made: Page, episodes: pd.DataFrame) -> None:
         acceleration; it bounds what a causal controller can be expected to earn. The oracle knows
         the leader's next speed."""
     untuned = tables.win_rates(episodes, "hcfs untuned", ["cacc paper_like", LEARNED, "hcfs"])
+    cases = tables.over_cases(episodes, tuple(CASES), IN_CASES)
     listed = [
         ("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES)),
         ("win_rates", "HCFS (rule: CACC tuned) against every other", gained),
         ("win_rates_untuned", "HCFS with the CACC of Table IV", untuned),
         ("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOWS)),
-        (
-            "cases",
-            "Σ reward in the cases of the paper",
-            tables.over_cases(episodes, tuple(CASES), IN_CASES),
-        ),
+        ("cases", "Σ reward in the cases of the paper", cases),
     ]
     made.add("HCFS against its parents", text, listed)
 
 
 def _case(made: Page, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
-    stem, table = case.replace(" ", "_"), case_table(episodes, case)
+    stem, (table, speeds, jerk, switching) = case.replace(" ", "_"), CASES[case]
     followers = int(steps[steps["case"] == case]["follower"].max())
-    listed = [(stem, f"{case} ({CASES[case]} of the paper)", table)]
+    listed = [(stem, f"{case} ({table} of the paper)", case_table(episodes, case))]
     if case == "case 1":
         listed.append(("table_iv", "Table IV as printed, on another record", tables.printed()))
-    speeds, jerks = string_figures.velocities(steps, case), string_figures.jerks(steps, case, 30.0)
+    like = "counterpart of the paper's Fig. {}"
     drawn = [
-        (f"{stem}_velocities", f"{case}: speeds", speeds),
-        (f"{stem}_jerk", f"{case}: jerk and its bound", jerks),
+        (
+            f"{stem}_velocities",
+            f"{case}: speeds; {like.format(speeds)}",
+            platoon.velocities(steps, case),
+        ),
+        (
+            f"{stem}_jerk",
+            f"{case}: jerk and its bound; {like.format(jerk)}",
+            platoon.jerks(steps, case, 30.0),
+        ),
+        (
+            f"{stem}_switching_hcfs",
+            f"{case}: who drives, hcfs; {like.format(switching)}",
+            platoon.switching(steps, case),
+        ),
+        (
+            f"{stem}_switching_hcfs_oracle",
+            f"{case}: who drives, hcfs oracle",
+            platoon.switching(steps, case, "hcfs oracle"),
+        ),
     ]
-    for name in ("hcfs", "hcfs oracle"):
-        figure = string_figures.switching(steps, case, name)
-        stem_of = f"{stem}_switching_{name.replace(' ', '_')}"
-        drawn.append((stem_of, f"{case}: who drives, {name}", figure))
     text = f"""{followers} followers, 20 s. Sums run over all followers and frames and are means
         over trainings; the figures show the first training. The record is not the paper's, which
         is unpublished."""
@@ -134,3 +138,14 @@ def _whole(made: Page, episodes: pd.DataFrame) -> None:
         ("whole_gains", "HCFS against its parents", tables.whole_gains(episodes, PARENTS)),
     ]
     made.add("Whole records", text, listed)
+
+
+def _training(made: Page) -> None:
+    text, listed = "", []
+    if (made.folder / LENGTHS).exists():  # only where several studies were put side by side
+        text = "The same study with trainings of other lengths; intervals over windows and seeds."
+        table = tables.lengths(read_parquet(made.folder / LENGTHS))
+        listed.append(("lengths", "Σ reward per window by the length of the training", table))
+    curve = learning_curve(read_parquet(made.folder / TRAINING))
+    drawn = [("learning_curve", "Learning curve", curve)]
+    made.add("Training of the DDPG parent", text, listed, drawn)

@@ -3,49 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull, QhullError
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.io.files import read_parquet
-from lcc_rl.results.drawing import INK, in_words, legend_above, new_figure, save, unbox
-from lcc_rl.results.motion import RESPONSES, motion_of, sample_episodes, visited
-from lcc_rl.results.runs import stored_config
-from lcc_rl.results.string_figures import PARENTS
+from lcc_rl.figures.drawing import INK, in_words, legend_above, new_figure, unbox
+from lcc_rl.figures.platoon import PARENTS, WHO_DRIVES
+from lcc_rl.results.motion import motion_of, sample_episodes, visited
 
 NEAR = 1.0  # of a map's speed: what an outline shows [m/s]
 NOTE = f"""Vehicles ahead at constant speed, those behind following steadily, no past.
 Black line: no acceleration; dashed: sample episodes within {NEAR:g} m/s."""
 
 
-def write_maps(folder: Path) -> list[Path]:
-    """Draw the maps of an evaluation that has their rows, responses.parquet.
+def policy_maps(
+    rows: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any]
+) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of the maps of an evaluation.
 
     Args:
-        folder: the evaluation's.
-
-    Returns:
-        The figures' paths; none where there are no rows.
-
-    Raises:
-        ResultsError: if a table cannot be read or a figure cannot be written.
+        rows: of responses.parquet.
+        steps: rows of steps.parquet, whose sample episodes are outlined.
+        cfg: the evaluation's configuration.
     """
-    if not (folder / RESPONSES).is_file():
-        return []
-    rows, cfg = read_parquet(folder / RESPONSES), stored_config(folder)
-    steps, formats = read_parquet(folder / "steps.parquet"), cfg.get("figure_formats", ())
-    found = {"policy_map": accelerations(rows, steps, cfg)}
+    yield "policy_map", accelerations(rows, steps, cfg)
     if "winner" in rows and rows["winner"].notna().any():
-        found["policy_map_switching"] = winners(rows)
-    figures = folder / "figures"
-    return [save(x, figures / f"{name}.png", formats=formats) for name, x in found.items()]
+        yield "policy_map_switching", winners(rows)
 
 
 def accelerations(rows: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any]) -> Figure:
@@ -80,36 +68,32 @@ def winners(rows: pd.DataFrame) -> Figure:
     """
     figure, panels = _panels(rows[rows["winner"].notna()])
     for axis, _, _, part in panels:
-        x, y, z = _grid(part, "winner")
-        colours = ListedColormap(list(PARENTS.values()))
-        axis.pcolormesh(x, y, z, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True)
-    for name, colour in PARENTS.items():
-        figure.axes[0].plot([], [], "s", color=colour, label=name)
+        axis.pcolormesh(
+            *_grid(part, "winner"), cmap=WHO_DRIVES, vmin=0.0, vmax=1.0, rasterized=True
+        )
+    for name, hue in PARENTS.items():
+        figure.axes[0].plot([], [], "s", color=hue, label=name)
     legend_above(figure.axes[0])
     return figure
 
 
-def _panels(
-    rows: pd.DataFrame,
-) -> tuple[Figure, Iterator[tuple[Axes, str, float, pd.DataFrame]]]:
+def _panels(rows: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, float, pd.DataFrame]]]:
     """Return a figure, and panel, strategy, speed and rows of each map."""
     names = list(dict.fromkeys(rows["strategy"]))
     speeds = sorted(rows["speed_mps"].unique())
     figure = new_figure(1.8 + 3.4 * len(speeds), 1.0 + 2.5 * len(names))
     axes = figure.subplots(len(names), len(speeds), sharex=True, sharey=True, squeeze=False)
-
-    def panels() -> Iterator[tuple[Axes, str, float, pd.DataFrame]]:
-        for line, name in zip(axes, names, strict=True):
-            for axis, speed in zip(line, speeds, strict=True):
-                own = (rows["strategy"] == name) & (rows["speed_mps"] == speed)
-                axis.set_title(f"{in_words(name)} at {speed:g} m/s", fontsize=10, loc="right")
-                unbox(axis)
-                yield axis, name, float(speed), rows[own]
-            line[0].set_ylabel("gap [m]")
-        for axis in axes[-1]:
-            axis.set_xlabel("relative speed [m/s]; left: closing")
-
-    return figure, panels()
+    panels = []
+    for line, name in zip(axes, names, strict=True):
+        for axis, speed in zip(line, speeds, strict=True):
+            own = (rows["strategy"] == name) & (rows["speed_mps"] == speed)
+            axis.set_title(f"{in_words(name)} at {speed:g} m/s", fontsize=10, loc="right")
+            unbox(axis)
+            panels.append((axis, name, float(speed), rows[own]))
+        line[0].set_ylabel("gap [m]")
+    for axis in axes[-1]:
+        axis.set_xlabel("relative speed [m/s]; left: closing")
+    return figure, panels
 
 
 def _grid(rows: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

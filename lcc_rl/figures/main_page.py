@@ -9,8 +9,10 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
+from lcc_rl.figures.drawing import in_file
+from lcc_rl.figures.page import Page
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.report import MISSING, Section, column_cells, made, write_report
+from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.savings import UNTRAINED
 from lcc_rl.results.tables import PATH, ROWS, summary
 from lcc_rl.schemas import StudyConfig
@@ -39,20 +41,26 @@ HEADINGS = {
     "long_time_gap_pct": "long\ntime gap\n[%]",
     "collisions": "colli-\nsions",
 }
-HELD = "Held-out windows"
-NAMES = {"who": "the car is driven by"}
 CAPTION = (
     "Energy of both cars per episode without what their motion stores; 95 % intervals over "
     "windows. Shares of the time: time-to-collision < 4 s; time gap > 2.5 s above 1 m/s."
 )
-
-
 LIMIT = "efficiency"
 HELD_TO = (
     f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
     "time; rows with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these "
     "data."
 )
+# Files of figures, in the job's folder and without their ending, and their captions.
+RESULTS = {
+    "evaluation/figures/overview": "A held-out episode, and the path energy of both cars",
+    "evaluation/figures/policy_map": "What the networks and a tuned rule do",
+    "evaluation/figures/learning_curve": "The trainings: what they minimise, and their limit",
+}
+DRIVERS = {
+    "calibration/calibration": "Calibrated drivers: error and parameters",
+    "calibration/joint_distribution": "Desired speed and time gap of the drivers",
+}
 
 
 def caption_of(trainings: Iterable[StudyConfig]) -> str:
@@ -104,7 +112,7 @@ def as_rich(table: pd.DataFrame, title: str, caption: str = CAPTION) -> Table:
 
 
 def _cells(table: pd.DataFrame, name: str) -> list[str]:
-    """Return the cells of a column; of savings with one decimal, sign and interval."""
+    """Return the cells of a column; savings have one decimal, sign and interval."""
     if f"{name}_low" not in table:
         return column_cells(table, name)
     bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
@@ -127,51 +135,31 @@ def write_page(
         The page's path, and the headline.
 
     Raises:
-        ResultsError: if a table or a figure is missing, or the page cannot be written.
+        ResultsError: if a table is missing, or the page cannot be written.
     """
-    folder = Path(folder)
-    found = summary(read_parquet(folder / "evaluation" / "episodes.parquet"))
+    page = Page(folder)
+    found = summary(read_parquet(page.folder / "evaluation" / "episodes.parquet"))
     table = headline(found)
-    sections = [
-        Section(
-            "Results",
-            caption,
-            [("Held-out windows", table.rename(columns=NAMES))],
-            _figures(folder, FIRST),
-        ),
-        Section("By driver", "", (), _figures(folder, _by_driver(table))),
-        Section("Drivers", "", (), _figures(folder, DRIVERS)),
-        Section("All measures", "", [("Means per strategy", _transposed(found))]),
-        made(commands, runs=sorted(folder.glob("*/training.parquet"))),
-    ]
-    kept = [section for section in sections if section.tables or section.figures]
-    return write_report(folder, TITLE, kept), table
 
+    def figures(names: dict[str, str]) -> list[tuple[str, str, Path]]:
+        paths = {page.folder / f"{name}.png": caption for name, caption in names.items()}
+        return [("", caption, path) for path, caption in paths.items() if path.exists()]
 
-FIRST = {
-    "evaluation/figures/overview.png": "A held-out episode, and the path energy of both cars",
-    "evaluation/figures/policy_map.png": "What the networks and a tuned rule do",
-    "evaluation/figures/learning_curve.png": "The trainings: what they minimise, and their limit",
-}
-DRIVERS = {
-    "calibration/calibration.png": "Calibrated drivers: error and parameters",
-    "calibration/joint_distribution.png": "Desired speed and time gap of the drivers",
-}
-
-
-def _by_driver(table: pd.DataFrame) -> dict[str, str]:
-    """Name the figures of what each driver saves by the learned strategies."""
-    learned = [name for name in table["strategy"] if name not in UNTRAINED]
-    stems = {name: f"improvement_{learned[-1]}_vs_{name.replace(' ', '_')}" for name in AGAINST}
-    return {
-        f"evaluation/figures/{stem}.png": f"{learned[-1]} against {name}, driver by driver"
-        for name, stem in stems.items()
+    shown = table.rename(columns={"who": HEADINGS["who"]})
+    page.add("Results", caption, [("", "Held-out windows", shown)], figures(RESULTS))
+    learned = [str(name) for name in table["strategy"] if name not in UNTRAINED]
+    improvements = {
+        f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
+            f"{own} against {name}, driver by driver"
+        )
+        for own in learned[-1:]
+        for name in AGAINST
     }
-
-
-def _figures(folder: Path, names: dict[str, str]) -> list[tuple[str, Path]]:
-    paths = {folder / name: caption for name, caption in names.items()}
-    return [(caption, path) for path, caption in paths.items() if path.exists()]
+    for heading, names in {"By driver": improvements, "Drivers": DRIVERS}.items():
+        if drawn := figures(names):
+            page.add(heading, figures=drawn)
+    page.add("All measures", tables=[("", "Means per strategy", _transposed(found))])
+    return page.write(TITLE, commands), table
 
 
 def _transposed(found: pd.DataFrame) -> pd.DataFrame:

@@ -13,8 +13,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
+from lcc_rl.figures.drawing import in_words, new_figure
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.results.drawing import in_words, new_figure
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
@@ -38,36 +38,32 @@ def space_time(
         every: rows between the points of a line.
 
     Returns:
-        The figure; None of strings with fewer than :data:`FEWEST` vehicles.
+        The figure; None for strings with fewer than :data:`FEWEST` vehicles.
     """
-    found = {name: _motion(steps, name, cfg, every) for name in names}
-    most = max((len(m.roles) for m in found.values() if m), default=0)
-    # Of strategies that drive all of the string.
-    motions = {name: m for name, m in found.items() if m and len(m.roles) == most >= FEWEST}
-    motions = dict(list(motions.items())[:WIDEST])
-    if not motions:
+    first = steps.iloc[0]
+    same = (steps["profile"] == first["profile"]) & (steps["driver_id"] == first["driver_id"])
+    found = {}
+    for name in names:
+        try:
+            rows = next(iter(sample_episodes(steps[same], name).values()))
+            found[name] = motion_of(rows, cfg["scenario"]).at(slice(None, None, every))
+        except ResultsError:  # the strategy does not drive this episode
+            continue
+    most = max((len(motion.roles) for motion in found.values()), default=0)
+    # Strategies that drive all of the string.
+    whole = [name for name, m in found.items() if len(m.roles) == most >= FEWEST][:WIDEST]
+    if not whole:
         return None
-    top = max(float(motion.speed.max()) for motion in motions.values())
-    figure = new_figure(1.5 + 4.0 * len(motions), 4.2)
-    axes = figure.subplots(1, len(motions), sharey=True, squeeze=False)[0]
-    for axis, (name, motion) in zip(axes, motions.items(), strict=True):
-        lines = _panel(axis, motion, top)
+    top = max(float(found[name].speed.max()) for name in whole)
+    figure = new_figure(1.5 + 4.0 * len(whole), 4.2)
+    axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
+    for axis, name in zip(axes, whole, strict=True):
+        lines = _panel(axis, found[name], top)
         axis.set_title(in_words(name), fontsize=10)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
     figure.colorbar(lines, ax=axes, label="speed [m/s]; framed in black: automated")
     return figure
-
-
-def _motion(steps: pd.DataFrame, name: str, cfg: Mapping[str, Any], every: int) -> Motion | None:
-    """Return a strategy's motion in the first episode of all; None where it does not drive it."""
-    first = steps.iloc[0]
-    same = (steps["profile"] == first["profile"]) & (steps["driver_id"] == first["driver_id"])
-    try:
-        rows = next(iter(sample_episodes(steps[same], name).values()))
-        return motion_of(rows, cfg["scenario"]).at(slice(None, None, every))
-    except ResultsError:
-        return None
 
 
 def _panel(axis: Axes, motion: Motion, top: float) -> LineCollection:

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from PIL import Image  # comes with matplotlib
 
 from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.figures.drawing import INK, new_figure, unbox
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.results.drawing import INK, new_figure, unbox
 from lcc_rl.results.motion import Motion, Series
 
 COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}

@@ -1,0 +1,140 @@
+"""Creating, styling and saving figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lcc_rl.io.atomic import atomic_path
+
+INK, SOFT = "#222222", "#8a8a8a"
+# Distinct without colour vision and in grey.
+COLOURS = {
+    "alcc": "#0072b2",
+    "reference": "#d55e00",
+    "own_energy": "#009e73",
+    "idm": "#6b6b6b",
+    "human": "#b0a080",
+    "direct": INK,
+}
+OTHERS = ("#cc79a7", "#e69f00", "#56b4e9")
+
+
+def colour(strategy: str) -> str:
+    """Return the colour that a strategy has in every figure."""
+    return COLOURS.get(strategy) or OTHERS[sum(strategy.encode()) % len(OTHERS)]
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that needs no display; sizes in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def unbox(axis: Axes) -> None:
+    """Remove the top and right line of the frame."""
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def style(axis: Axes, xlabel: str = "", ylabel: str = "") -> None:
+    """Label an axis and remove the top and right line of its frame."""
+    axis.set_xlabel(xlabel)
+    axis.set_ylabel(ylabel)
+    unbox(axis)
+
+
+def grid(axis: Axes, lines: str = "both") -> None:
+    """Draw a light grid behind the data; ``lines`` are ``x``, ``y`` or ``both``."""
+    axis.grid(visible=True, axis=lines, color="#e6e6e6", linewidth=0.8)  # type: ignore[arg-type]
+    axis.set_axisbelow(True)
+
+
+def footnote(figure: Figure, text: str) -> None:
+    """Write how to read a figure below it."""
+    figure.supxlabel(text, fontsize=8, color=SOFT)
+
+
+def legend_above(axis: Axes, columns: int = 3) -> None:
+    """Put the legend above the frame, where it covers no data."""
+    axis.legend(
+        frameon=False,
+        fontsize=9,
+        ncols=columns,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+    )
+
+
+def rows_of(axis: Axes, names: Sequence[str]) -> None:
+    """Label the rows of a chart, the first at the top; without a name no label is drawn."""
+    axis.set_yticks(range(len(names)), [in_words(name) for name in names])
+    axis.set_ylim(len(names) - 0.4, -0.6)
+
+
+def whiskers(
+    axis: Axes,
+    places: Sequence[float] | np.ndarray,
+    table: pd.DataFrame,
+    column: str,
+    hue: str,
+    upright: bool = False,
+) -> None:
+    """Draw the intervals of a column.
+
+    Args:
+        axis: the axes.
+        places: position of every row, on the vertical axis or, if upright, the horizontal one.
+        table: rows with the columns ``<column>_low`` and ``<column>_high``.
+        column: name of the column.
+        hue: colour of the lines.
+        upright: draw vertical lines.
+    """
+    low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
+    draw = axis.vlines if upright else axis.hlines
+    draw(places, low, high, color=hue, lw=2.0, alpha=0.6)
+
+
+def in_words(name: str) -> str:
+    """Return a name as it is read aloud.
+
+    Examples:
+        >>> in_words("preview_10s"), in_words("cacc paper_like")
+        ('preview 10 s', 'cacc paper like')
+    """
+    return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
+
+
+def in_file(name: str) -> str:
+    """Return a name as part of a file's: without spaces, or what would lead elsewhere."""
+    return re.sub(r"[^\w.+-]", "_", name)
+
+
+def save(figure: Figure, path: str | Path, dpi: int = 150, formats: Iterable[str] = ()) -> Path:
+    """Write a figure atomically; the format follows the file's suffix.
+
+    Args:
+        figure: the figure.
+        path: the file.
+        dpi: pixels per inch of what is drawn as pixels.
+        formats: further formats, each a file beside it (``figure_formats``).
+
+    Returns:
+        The path.
+
+    Raises:
+        ResultsError: if a file cannot be written.
+    """
+    path = Path(path)
+    for suffix in dict.fromkeys([path.suffix or ".png", *(f".{kind}" for kind in formats)]):
+        with atomic_path(path if suffix == path.suffix else path.with_suffix(suffix)) as temporary:
+            figure.savefig(temporary, dpi=dpi, format=suffix[1:])
+    return path

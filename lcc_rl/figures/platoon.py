@@ -1,0 +1,172 @@
+"""A platoon over time: its leader's record, speeds, jerks and switching (HCFS Figs. 3–12)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+
+from lcc_rl.data.leaders import Case
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.figures.drawing import INK, in_words, legend_above, new_figure, style, unbox
+
+SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
+HYBRIDS = ("hcfs", "hcfs oracle")
+NEAR, FAR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
+BOUND = "#b00020"
+PAPER = {"case 1": (0.37, 10.76)}  # first and last speed in the paper [m/s]
+PARENTS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
+WHO_DRIVES = ListedColormap(list(PARENTS.values()))
+
+
+def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of every case.
+
+    Args:
+        steps: rows of steps.parquet.
+        bound: of the jerk [m/s³].
+    """
+    for case in dict.fromkeys(steps["case"]) if len(steps) else ():
+        yield f"{case} velocities", velocities(steps, case)
+        yield f"{case} jerk", jerks(steps, case, bound)
+        for strategy in HYBRIDS:
+            if (steps["strategy"] == strategy).any():
+                yield f"{case} switching {strategy}", switching(steps, case, strategy)
+
+
+def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Figure:
+    """Draw the leader's record with the part for training, and the cases' windows (Fig. 3).
+
+    Args:
+        record: the record that the training takes a part of, whole.
+        from_s: where that part begins [s].
+        cases: the windows for tests.
+    """
+    figure = new_figure(7.2, 4.6)
+    grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
+    axis, windows = grid.pop("record"), list(grid.values())
+    seconds = _speeds(axis, record)
+    axis.axvspan(from_s, seconds[-1], color=PARENTS["DDPG"], alpha=0.15, lw=0, label="training")
+    axis.set_title(_in_record(record), fontsize=10, loc="right")
+    legend_above(axis)
+    for window, case in zip(windows, cases, strict=True):
+        ends = _speeds(window, case.profile)[[0, -1]]
+        window.set_ylim(-0.5, 13.0)
+        window.set_title(f"{case.name}\n{_in_record(case.profile)}", fontsize=10)
+        if case.name in PAPER:
+            window.plot(ends, PAPER[case.name], "o", color=BOUND, label="paper", clip_on=False)
+            window.legend(frameon=False, fontsize=8, loc="upper left")
+    for left in (axis, windows[0]):
+        left.set_ylabel("speed [m/s]")
+    return figure
+
+
+def _speeds(axis: Axes, profile: Profiles) -> np.ndarray:
+    """Draw a record over time; return its times [s]."""
+    seconds = profile.time_step * np.arange(int(profile.lengths[0]))
+    axis.plot(seconds, profile.record(0).numpy(), color=INK, lw=1.0)
+    style(axis, "time [s]")
+    axis.margins(x=0.01)
+    return seconds
+
+
+def _in_record(profile: Profiles) -> str:
+    """Return a profile's record, and where in it the profile begins."""
+    record, _, start = profile.names[0].partition("@")
+    name = in_words(record).upper()
+    return name if start == "0s" else f"{name} from {in_words(start)} on"
+
+
+def velocities(steps: pd.DataFrame, case: str) -> Figure:
+    """Speeds of leader and followers, a panel per strategy (Figs. 4, 7, 10)."""
+    figure, panels = _panels(steps[steps["case"] == case], f"{case}: speed [m/s]")
+    for axis, rows in panels:
+        leader = rows[rows["follower"] == 0]
+        _lines(axis, rows, "speed_mps")
+        axis.plot(leader["time_s"], leader["speed_mps"], color=INK, ls="--", label="leader")
+    legend_above(panels[0][0])
+    return figure
+
+
+def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
+    """Jerk of the followers, a panel per strategy, and its bound where they come near it.
+
+    The scale is that of the data (Figs. 5, 8, 11).
+    """
+    rows = steps[steps["case"] == case]
+    own = rows[rows["strategy"].isin(shown(rows)) & (rows["follower"] > 0)]
+    top = 1.1 * max(float(own["jerk_mps3"].abs().max()), 0.1)
+    near = top > 0.5 * bound
+    where = f"dotted: bound ±{bound:g}" if near else f"bound ±{bound:g}, beyond the scale"
+    figure, panels = _panels(rows, f"{case}: jerk [m/s³]; {where}")
+    for axis, part in panels:
+        _lines(axis, part, "jerk_mps3")
+        for side in (-bound, bound) if near else ():
+            axis.axhline(side, color=BOUND, lw=0.8, ls=":")
+    scale = max(top, 1.1 * bound) if near else top
+    panels[0][0].set_ylim(-scale, scale)
+    legend_above(panels[0][0])
+    return figure
+
+
+def shown(steps: pd.DataFrame) -> list[str]:
+    """Return the strategies of :data:`SHOWN` that there are; all if there is none of them."""
+    names = list(dict.fromkeys(steps["strategy"]))
+    return [name for name in SHOWN if name in names] or names
+
+
+def _panels(rows: pd.DataFrame, title: str) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
+    """Return a figure with a panel per strategy, and each panel with its rows."""
+    names = shown(rows)
+    figure = new_figure(8.0, 1.2 + 2.0 * len(names))
+    axes = figure.subplots(len(names), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for axis, name in zip(axes, names, strict=True):
+        axis.set_title(in_words(name), fontsize=10, loc="right")
+        unbox(axis)
+    axes[-1].set_xlabel("time [s]")
+    figure.suptitle(title, fontsize=11)
+    parts = (rows[rows["strategy"] == name] for name in names)
+    return figure, list(zip(axes, parts, strict=True))
+
+
+def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
+    """Draw a line per follower, from blue (the first) to orange (the last)."""
+    followers = int(rows["follower"].max())
+    for follower in range(1, followers + 1):
+        own = rows[rows["follower"] == follower]
+        label = f"follower {follower}" if follower in (1, followers) else None
+        share = (follower - 1) / max(followers - 1, 1)
+        hue = tuple((1.0 - share) * NEAR + share * FAR)
+        axis.plot(own["time_s"], own[column], color=hue, lw=1.0, label=label)
+
+
+def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
+    """The controller that drives each follower over time, CACC or DDPG (Figs. 6, 9, 12).
+
+    Args:
+        steps: rows of steps.parquet; ``winner`` is 0 for CACC and 1 for DDPG.
+        case: name of the case.
+        strategy: name of a hybrid strategy.
+    """
+    rows = steps[(steps["case"] == case) & (steps["strategy"] == strategy)]
+    rows = rows[rows["follower"] > 0]
+    raster = rows.pivot_table(index="follower", columns="time_s", values="winner")
+    figure = new_figure(8.0, 1.4 + 0.25 * len(raster))
+    axis = figure.subplots()
+    step = float(raster.columns[0])
+    edges = np.append(raster.columns.to_numpy(float) - step, raster.columns[-1])
+    rims = np.arange(len(raster) + 1) + 0.5
+    axis.pcolormesh(edges, rims, raster.to_numpy(), cmap=WHO_DRIVES, vmin=0.0, vmax=1.0)
+    for name, hue in PARENTS.items():
+        axis.plot([], [], "s", color=hue, label=name)
+    axis.set_yticks(raster.index)
+    style(axis, "time [s]", "follower")
+    share = float(np.nanmean(raster.to_numpy()))
+    title = f"{case}: who drives in {in_words(strategy)} (DDPG {100 * share:.0f} %)"
+    axis.set_title(title, fontsize=10, loc="right")
+    legend_above(axis)
+    return figure

@@ -1,0 +1,98 @@
+"""Figures of trainings: what is learned, and limits kept, over the episodes (ALCC Fig. 6)."""
+
+from __future__ import annotations
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lcc_rl.figures.drawing import INK, colour, in_words, legend_above, new_figure, style
+from lcc_rl.results.intervals import band
+
+WINDOW = 10  # iterations of the rolling mean
+SHARE = "share_"  # prefix of the columns of limits
+# What a limit's share of the time is spent in.
+LIMITS = {
+    "safety": "unsafe time-to-collision",
+    "efficiency": "long time gap",
+    "gap": "long gap",
+    "time_gap": "short time gap",
+}
+
+
+def training_figure(training: pd.DataFrame) -> Figure:
+    """What a training minimises, and how it keeps its limits; without limits the reward.
+
+    Args:
+        training: rows of training.parquet of one or more runs, with ``variant``, ``seed`` and
+            their settings (:func:`lcc_rl.results.load`).
+    """
+    limits = [name for name in map(str, training) if name.startswith(SHARE)]
+    limits = [name for name in limits if training[name].notna().any()]
+    if not limits:
+        return learning_curve(training)
+    figure = new_figure(9.0, 3.8)
+    first, *others = figure.subplots(1, 1 + len(limits))
+    draw_curves(first, training, "loss_actor")
+    style(first, "training episodes", "objective, less is better")
+    legend_above(first, 1)
+    for axis, name in zip(others, limits, strict=True):
+        draw_curves(axis, training.assign(percent=100.0 * training[name]), "percent")
+        for line in axis.lines:
+            line.set_label("")
+        what = name.removeprefix(SHARE)
+        bound = training.get(f"agent.limits.{what}")
+        if bound is not None and bound.nunique() == 1:  # all runs have the same limit
+            percent = 100.0 * float(bound.iloc[0])
+            axis.axhline(percent, color=INK, lw=0.8, ls="--", label=f"limit {percent:g} %")
+            axis.set_ylim(0.0, max(4.0 * percent, 1e-3))  # the first batches would set the scale
+            legend_above(axis)
+        style(axis, "training episodes", f"{LIMITS.get(what, what)} [% of the time]")
+    return figure
+
+
+def learning_curve(training: pd.DataFrame) -> Figure:
+    """Episode reward over episodes, see :func:`draw_curves` (Fig. 6).
+
+    Args:
+        training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
+    """
+    figure = new_figure(7.0, 4.0)
+    axis = figure.subplots()
+    floor, _ = draw_curves(axis, training, "episode_reward")
+    axis.set_ylim(bottom=1.6 * floor - 1.0)
+    style(axis, "training episodes", "mean reward per episode")
+    title = f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included"
+    figure.suptitle(title, fontsize=10)
+    legend_above(axis, 2)
+    return figure
+
+
+def draw_curves(axis: Axes, training: pd.DataFrame, column: str) -> tuple[float, float]:
+    """Draw the rolling mean of every variant's column with a band.
+
+    With several seeds the line is the mean and the band its 95 % bootstrap interval, as far as all
+    seeds have trained; with one seed the band spans the 5th to 95th percentile of the window.
+
+    Returns:
+        Limits of the scale: the least value after the first fifth, whose episodes are random, and
+        the largest value; at most and at least 0.
+    """
+    floor = top = 0.0
+    for variant, rows in training.groupby("variant", sort=False):
+        if rows[column].isna().all():
+            continue
+        curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
+        smooth = curves.rolling(WINDOW, min_periods=1)
+        line = smooth.mean().mean(axis=1)
+        if curves.shape[1] > 1:
+            low, high = band(smooth.mean().to_numpy(float))
+            label = f"{in_words(str(variant))} (n = {curves.shape[1]} seeds, 95 % band)"
+        else:
+            low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
+            label = f"{in_words(str(variant))} (1 seed; band: 5–95 % of {WINDOW} batches)"
+        axis.fill_between(line.index, low, high, color=colour(str(variant)), alpha=0.2, lw=0)
+        axis.plot(line.index, line, color=colour(str(variant)), label=label)
+        floor = min(floor, float(line.iloc[len(line) // 5 :].min()))
+        top = max(top, float(line.max()))
+    return floor, top

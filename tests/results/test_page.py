@@ -1,0 +1,101 @@
+"""The page: escaped, self-contained, numbers with units and intervals; the main job's headline."""
+
+from __future__ import annotations
+
+import base64
+import re
+from io import BytesIO
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from rich.console import Console
+from study_frames import episodes
+
+from lcc_rl.figures.drawing import new_figure
+from lcc_rl.figures.main_page import as_rich, headline
+from lcc_rl.figures.page import Page
+from lcc_rl.io.files import processor, read_parquet, write_parquet
+from lcc_rl.results.cells import as_markdown, heading
+from lcc_rl.results.tables import summary
+
+TABLE = pd.DataFrame(
+    {
+        "strategy": ["alcc", "<b>"],
+        "saving_pct": [4.384, -1.0],
+        "saving_pct_low": [4.1, np.nan],
+        "saving_pct_high": [4.6, np.nan],
+        "episodes": [4980, 12],
+        "total_energy_kj": [270.123, np.nan],
+        "within_limits": [True, False],
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    figure = new_figure(2.0, 1.0)
+    figure.subplots().plot([0, 1], [0, 1])
+    made = Page(tmp_path_factory.mktemp("page"), formats=["svg"])
+    write_parquet(pd.DataFrame({"a": [1]}), made.folder / "run" / "training.parquet")
+    shown = [("energies", "A table", TABLE)]
+    made.add("First & last", "One < two.\n\nNext.", shown, [("line", "A line", figure)])
+    made.write("A study", ["lcc-rl reproduce alcc"], [("Configuration", "seed: 0")])
+    return made
+
+
+def test_a_page_holds_everything_and_fetches_nothing(page) -> None:
+    html = (page.folder / "report.html").read_text()
+    links = re.findall(r'(?:src|href|action)="([^"]*)"', html)
+    assert all(link.startswith(("#", "data:image/")) for link in links)
+    assert not re.search(r"<script|<link|url\(|@import|https?://", html)
+    assert "default-src 'none'" in html
+    assert html.count("<table>") == html.count("<details>") == 2
+    for words in (
+        "First &amp; last",
+        "One &lt; two.</p>",
+        "lcc-rl reproduce alcc",
+        "<td>torch</td>",
+    ):
+        assert words in html
+    assert f"Its trainings ran on: {processor()} (1)." in html
+
+
+def test_cells_are_formatted_for_readers(page) -> None:
+    html = (page.folder / "report.html").read_text()
+    for cell in ("4.38 (4.10 … 4.60)", "−1.00", "4,980", "270.1"):
+        assert f'<td class="number">{cell}</td>' in html
+    for cell in ("<th>strategy</th>", "saving [%]</th>", "<td>yes</td>", ">–</td>", "&lt;b&gt;"):
+        assert cell in html
+    assert "saving pct low" not in html
+    assert heading("energy_kj_per_km") == "energy [kJ/km]"
+    assert (
+        as_markdown(TABLE).splitlines()[2] == "| alcc | 4.38 (4.10 … 4.60) | 4,980 | 270.1 | yes |"
+    )
+
+
+def test_tables_and_figures_are_files_too_and_pictures_keep_every_pixel(page) -> None:
+    pd.testing.assert_frame_equal(read_parquet(page.folder / "tables" / "energies.parquet"), TABLE)
+    drawn = page.folder / "figures" / "line.png"
+    assert drawn.with_suffix(".svg").exists()
+    html = (page.folder / "report.html").read_text()
+    (data,) = re.findall(r"data:image/webp;base64,([^\"]+)", html)
+    shown = Image.open(BytesIO(base64.b64decode(data))).convert("RGBA")
+    assert shown.tobytes() == Image.open(drawn).convert("RGBA").tobytes()
+
+
+def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> None:
+    found = summary(episodes())
+    table = headline(found)
+    cars = found.set_index("strategy").loc[table["strategy"]]
+    assert list(table["strategy"]) == ["idm", "reference", "alcc"]
+    np.testing.assert_array_equal(table["path_energy_kj"], cars["total_path_energy_kj"])
+    table["saved_against_human_pct"] = [np.nan, 1.0, 1.0]
+    table["saved_against_human_pct_low"] = table["saved_against_human_pct_high"] = 1.0
+    console = Console(width=120)
+    with console.capture() as shown:
+        console.print(as_rich(table, "title [x]"))
+    assert "title [x]" in shown.get()
+    assert "–" in shown.get()
+    assert "nan" not in shown.get()

@@ -1,0 +1,236 @@
+"""Summaries, cases of a platoon and scores of a task, by hand."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from rich.console import Console
+
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, as_fleet
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.cases import measure
+from lcc_rl.results.scores import Task, scores
+from lcc_rl.results.string_tables import case_table
+from lcc_rl.results.tables import as_rich, summary
+from lcc_rl.results.units import per_distance
+from lcc_rl.studies.hcfs.tables import win_rates
+
+CARS = {"direct": [np.nan] * 2, "idm": [100.0, 100.0], "reference": [90.0, 100.0]}
+CARS["alcc"] = [95.0, 80.0]  # energy of the controlled car by driver [kJ]
+
+
+def episodes() -> pd.DataFrame:
+    own = pd.Series(np.concatenate(list(CARS.values())))
+    energies = {"cav": own, "hdv": 50.0, "total": own + 50.0}
+    table: dict[str, object] = {
+        "strategy": np.repeat(list(CARS), 2),
+        "profile_id": 0,
+        "driver_id": [0, 1] * 4,
+        **{f"{name}_energy_kj": energy for name, energy in energies.items()},
+        **{f"{name}_net_energy_kj": energy - 10.0 for name, energy in energies.items()},
+        "total_path_energy_kj": own + 40.0,
+        "cav_distance_m": own.where(own.isna(), 500.0),
+        "hdv_distance_m": 500.0,
+        "collided": False,
+        "min_ttc_s": [5.0, 6.0] * 4,
+        "share_ttc_unsafe": [0.0, 0.1] * 4,
+        "share_time_gap_long": 0.0,
+        "rms_jerk_mps3": 1.0,
+    }
+    return pd.DataFrame(table)
+
+
+def test_summary_by_hand() -> None:
+    table = summary(episodes()).set_index("strategy")
+    alcc = table.loc["alcc"]
+    assert alcc["total_energy_kj"] == pytest.approx(137.5)  # (145 + 130)/2
+    assert alcc["saving_vs_idm"] == pytest.approx(1 - 137.5 / 150)
+    assert alcc["path_saving_vs_reference"] == pytest.approx(1 - 127.5 / 135)
+    # Driver 0: 145 against 140 with the reference, worse; driver 1: 130 against 150, better.
+    assert (alcc["drivers_worse_than_reference"], alcc["drivers_worse_than_idm"]) == (0.5, 0.0)
+    assert np.isnan(alcc["path_saving_vs_idm_low"])  # one window, no seeds: nothing to resample
+    assert (alcc["min_ttc_s"], alcc["share_ttc_unsafe"]) == (5.0, pytest.approx(0.05))
+    # 275 kJ over two episodes of two vehicles and 0.5 km each: 2 km.
+    assert alcc["kj_per_km"] == pytest.approx(137.5)
+    assert table.loc["direct", "kj_per_km"] == pytest.approx(100.0)
+    assert np.isnan(table.loc["idm", "saving_vs_idm"])
+
+
+def test_a_driver_that_gains_in_the_mean_may_lose_in_single_windows() -> None:
+    first = episodes()
+    # In the second window alcc costs driver 1 what it gains in the first, and half of it more.
+    second = first.assign(profile_id=1)
+    second.loc[second.index[-1], "total_path_energy_kj"] += 30.0
+    row = summary(pd.concat([first, second])).set_index("strategy").loc["alcc"]
+    assert (row["drivers_worse_than_idm"], row["pairs_worse_than_idm"]) == (0.0, 0.25)
+    low, high = (row[f"path_saving_vs_idm_{end}"] for end in ("low", "high"))
+    # One window of two is drawn: 127.5 or 142.5 kJ against 140.
+    assert (low, high) == pytest.approx((1 - 142.5 / 140, 1 - 127.5 / 140))
+
+
+def test_the_table_fits_a_terminal_and_shows_a_dash_where_nothing_was_measured() -> None:
+    frame = episodes()
+    frame.loc[frame["strategy"] == "idm", "min_ttc_s"] = np.nan
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(as_rich(summary(frame), "title [x]"))
+    text = console.export_text()
+    for words in ("energy as drawn [kJ]", "title [x]", "+8.3%"):
+        assert words in text
+    assert "…" not in text
+    (row,) = (line for line in text.splitlines() if "time-to-collision [s]" in line)
+    assert row.count("–") == 1
+
+
+def series() -> dict[str, torch.Tensor]:
+    """Two followers, one run, three frames."""
+    error = [[1.0, 0.5], [-1.0, 0.5], [2.0, -0.5]]
+    found = {
+        "leader_speed_error": error,
+        "gap_error": [[0.0, -1.0], [-2.0, 0.5], [-1.0, -5.1]],
+        "speed_error": [[1.0, 2.0], [1.0, 0.0], [0.0, 0.0]],
+        "jerk": [[4.0, 0.0], [-6.0, 1.0], [0.0, 0.0]],
+        "reward": (-torch.tensor(error).abs()).tolist(),
+        "gap": [[5.0, 4.0], [3.0, 4.0], [4.0, -0.1]],
+        "winner": [[0, 1], [1, 1], [1, 1]],
+        "switches": [[0, 0], [1, 0], [1, 0]],
+        "clamps": [[0, 0]] * 3,
+        "cap_interventions": [[0, 0]] * 3,
+    }
+    return {name: torch.tensor(values).view(3, 1, 2) for name, values in found.items()}
+
+
+def test_measures_of_a_platoon_by_hand() -> None:
+    first, second = measure(series()).to_dict("records")
+    assert (first["speed_error_sum"], second["speed_error_sum"]) == (4.0, 1.5)
+    assert (first["jerk_sum"], first["peak_jerk_mps3"]) == (10.0, 6.0)
+    assert (first["min_gap_m"], first["collided"], second["collided"]) == (3.0, False, True)
+    assert (first["max_gap_error_m"], second["max_gap_error_m"]) == (2.0, pytest.approx(5.1))
+    assert pd.isna(first["energy_ratio"])
+    assert second["energy_ratio"] == pytest.approx(4.0 / 2.0)
+    assert first["learned_share"] == pytest.approx(2 / 3)
+    assert (first["switches"], second["switches"], first["frames"]) == (1, 0, 3)
+
+
+def test_case_table_by_hand() -> None:
+    rows = measure(series()).assign(
+        strategy="hcfs", training_seed=pd.Series([0, 0], dtype="Int64"), case="case 1", profile="a"
+    )
+    (row,) = case_table(rows, "case 1").to_dict("records")
+    errors = pd.Series([1.0, 1.0, 2.0, 0.5, 0.5, 0.5])
+    assert row["speed_error_sum_mps"] == pytest.approx(5.5)
+    assert row["speed_error_std_mps"] == pytest.approx(errors.std(ddof=0))
+    assert row["reward"] == pytest.approx(-5.5)
+    assert (row["collisions"], row["switches"]) == (1, 1)
+    assert (row["max_gap_error_m"], row["string_ratio"]) == (pytest.approx(5.1), pytest.approx(2.0))
+    assert row["learned_share"] == pytest.approx(5 / 6)
+    with pytest.raises(ConfigError, match="case 9"):
+        case_table(rows, "case 9")
+
+
+def rewards(strategy: str, seed: int | None, *values: float) -> pd.DataFrame:
+    table = {"strategy": strategy, "training_seed": pd.Series([seed] * len(values), dtype="Int64")}
+    table |= {"case": "windows", "profile": [f"w{i}" for i in range(len(values))], "reward": values}
+    return pd.DataFrame(table)
+
+
+def test_win_rates_by_hand() -> None:
+    found = [
+        rewards("cacc", None, -2.0, -2.0, -2.0, -2.0),
+        rewards("ddpg", 0, -1.0, -3.0, -1.0, -1.0),
+        rewards("ddpg", 1, -4.0, -4.0, -4.0, -4.0),
+        rewards("hcfs", 0, -1.0, -1.0, -3.0, -2.0),
+        rewards("hcfs", 1, -1.0, -1.0, -1.0, -1.0),
+    ]
+    table = win_rates(pd.concat(found, ignore_index=True)).set_index("against")
+    # Against cacc: seed 0 wins 2, loses 1, ties 1 → 62.5 %; seed 1 wins all.
+    assert table.loc["cacc", "wins_pct"] == pytest.approx((62.5 + 100.0) / 2)
+    assert table.loc["cacc", "reward_gain"] == pytest.approx((0.25 + 1.0) / 2)
+    # Against its own parent, seed by seed: 1 win, 2 losses, 1 tie; then 4 wins.
+    assert table.loc["ddpg", "wins_pct"] == pytest.approx((37.5 + 100.0) / 2)
+    assert table.loc["ddpg", "windows"] == 4
+
+
+CAR, MOTOR = as_fleet(CirclesFuel()), as_fleet(None)
+TASK = Task("mine", "net_energy", "kJ/km", "human", {"max_gap_m": 120.0, "min_time_gap_s": 1.0})
+
+
+def driven(strategy: str, *energy: float, metres: float = 1000.0, **more: float) -> pd.DataFrame:
+    """Rows of as many windows as there are energies [kJ]."""
+    table = {"strategy": strategy, "profile_id": range(len(energy)), "driver_id": 0}
+    table |= {"training_seed": pd.array([pd.NA] * len(energy), dtype="Int64")}
+    table |= {"cav_distance_m": metres / 2, "hdv_distance_m": metres / 2, "collided": False}
+    table |= {"max_gap_m": 50.0, "min_time_gap_s": 1.2, "final_speed_spread_mps": 0.5}
+    return pd.DataFrame(table | {"total_net_energy_kj": energy} | more)
+
+
+def test_a_score_is_energy_over_distance_and_falling_behind_gains_nothing() -> None:
+    rows = [driven("human", 100.0, 300.0), driven("good", 90.0, 270.0)]
+    rows.append(driven("behind", 90.0, 270.0, metres=900.0))  # a tenth less energy, and road
+    found = scores(pd.concat(rows), TASK, MOTOR).set_index("strategy")
+    assert found["score"].tolist() == pytest.approx([200.0, 180.0, 200.0])
+    assert found.loc["good", "saving"] == pytest.approx(0.1)
+    assert found.loc["behind", "saving"] == pytest.approx(0.0, abs=1e-9)
+    assert found.loc["behind", "distance_lost"] == pytest.approx(0.1)
+    assert np.isnan(found.loc["human", "saving"])
+    assert TASK.among(["own"]).against == "own"
+
+
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        ({}, True),
+        ({"max_gap_m": 121.0}, False),
+        ({"min_time_gap_s": 0.9}, False),
+        ({"collided": True}, False),
+    ],
+)
+def test_limits_are_kept_by_the_worst_episode(change, kept) -> None:
+    own = driven("own", 1.0, 1.0)
+    for column, value in change.items():
+        own.loc[1, column] = value
+    found = scores(pd.concat([driven("human", 1.0, 1.0), own]), TASK, MOTOR)
+    assert found["kept"].tolist() == [True, kept]
+
+
+def test_a_share_is_limited_in_the_mean_and_a_column_may_be_the_score() -> None:
+    own = driven("own", 1.0, 1.0, final_speed_spread_mps=0.1)
+    rows = pd.concat([driven("human", 1.0, 1.0), own]).assign(share_ttc_unsafe=[0, 0, 0, 0.03])
+    for bound, kept in ((0.02, True), (0.01, False)):
+        task = Task("mine", "final_speed_spread_mps", limits={"share_ttc_unsafe": bound})
+        found = scores(rows, task, MOTOR)
+        assert found["kept"].tolist() == [True, kept]
+        assert found["score"].tolist() == pytest.approx([0.5, 0.1])
+
+
+def test_units() -> None:
+    fuel = CirclesFuel()
+    kj = 45.0 * fuel.heating_value / 1e3  # 45 g/km
+    assert per_distance(kj, "g/km", CAR) == pytest.approx(45.0)
+    assert per_distance(kj, "L/100km", CAR) == pytest.approx(4.5 / 0.745)
+    assert per_distance(kj, "mpg", CAR) == pytest.approx(235.215 * 0.745 / 4.5)
+    assert per_distance(360.0, "Wh/km", as_fleet(ElectricCar())) == pytest.approx(100.0)
+
+
+MIXED = Fleet({"a": CirclesFuel(), "b": CirclesFuel("Class8Tractor")})
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: per_distance(1.0, "mpg", MIXED), "one fuel"),
+        (lambda: Task("x", "fuel"), "'fuel'.*net_energy"),
+        (lambda: Task("x", limits={"max_gap": 1.0}), "'max_gap'.*max_gap_m"),
+        (lambda: scores(driven("own", 1.0), TASK, MOTOR), "task.against=human"),
+        (
+            lambda: scores(driven("human", 1.0), Task("x", limits={"min_ttc_s": 1.0}), MOTOR),
+            "task.limits.min_ttc_s",
+        ),
+    ],
+)
+def test_wrong_tasks_are_named(make, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make()
