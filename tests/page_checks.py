@@ -18,7 +18,7 @@ from commands import process_state
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from pages import ROOT, Block, name_of
 
-from lcc_rl import console
+from lcc_rl.cli import console
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 

@@ -15,7 +15,7 @@ from lcc_rl.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "settings.md"
-ROOMS = ("schemas", "agents", "pieces", "energy", "drivers", "data", "synthetic", "runs.loggers")
+ROOMS = ("config.schemas", "agents", "pieces", "energy", "drivers", "data", "synthetic", "runs.loggers")
 HEAD = """# Settings
 
 <!-- Written by `python tools/settings.py`; do not edit. -->

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lcc_rl.config.nodes import build
 from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.motor import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.nodes import build
 
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]

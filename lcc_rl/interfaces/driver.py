@@ -14,13 +14,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.strategies import DIRECT, FILTERED, baseline_controller, rules
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
-from lcc_rl.nodes import build
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World

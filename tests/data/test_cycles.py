@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
 from lcc_rl.data.leaders import RecordLeaders, stretch, varying
 from lcc_rl.data.profiles import from_records, resample
 from lcc_rl.data.speed_records import read_speed_record, shipped_cycles
 from lcc_rl.envs.factory import load_inputs
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.nodes import build
 
 
 def test_shipped_cycles_are_the_published_ones() -> None:

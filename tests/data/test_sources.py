@@ -10,10 +10,10 @@ from ngsim_text import START_MS, cells, csv_text, pair
 
 import lcc_rl.conf
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource, NgsimSource, find_files
 from lcc_rl.errors import DataError
-from lcc_rl.nodes import build
 
 
 def configured(name: str, *overrides: str) -> NgsimSource | EpisodesSource:

@@ -11,6 +11,7 @@ import pytest
 from table_text import GAP, LENGTH, long_table, openacc_text, speed
 
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
 from lcc_rl.data.episodes import read_episodes, validate_episodes
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
@@ -18,7 +19,6 @@ from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.nodes import build
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
 BY_GAP = {**BASE, "leader": "ahead", "gap": "gap"}

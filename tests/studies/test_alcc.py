@@ -8,10 +8,10 @@ import pytest
 from helpers import POPULATION, wavy_profiles
 
 from lcc_rl.agents.factory import build_agent
+from lcc_rl.config.schemas import as_plain, as_text
 from lcc_rl.data.profiles import SingleProfile, Split
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.schemas import as_plain, as_text
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.alcc.settings import PRECISE, followers_change, followers_study

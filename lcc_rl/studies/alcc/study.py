@@ -12,10 +12,10 @@ import numpy as np
 from lcc_rl.commands import evaluation
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, root_key
 from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.profiles import leader_profiles
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.schemas import StudyConfig
 from lcc_rl.studies.alcc.settings import (
     ABLATIONS,
     CONTROL,
