@@ -52,7 +52,7 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
         assert set(re.findall(r"\w+", rest[-1].strip("'\""))) <= set(EXTRAS), rest
     elif program.endswith("python"):
         assert (ROOT / rest[0]).exists(), rest[0]
-        settings = parsed(rest[0], rest[1:])
+        settings = parsed(rest[0], rest[1:]) if rest[1:] else []
         typed = (word for word in settings if "=" in word)
         once("train", (*ALWAYS.get(rest[0], ()), *typed))
     elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:
