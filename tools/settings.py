@@ -15,7 +15,10 @@ from lcc_rl.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "settings.md"
-ROOMS = ("config.schemas", "agents", "pieces", "energy", "drivers", "data", "synthetic", "runs.loggers")
+ROOMS = (
+    *("config.schemas", "agents", "pieces", "energy", "drivers", "data", "synthetic"),
+    "runs.loggers",
+)
 HEAD = """# Settings
 
 <!-- Written by `python tools/settings.py`; do not edit. -->
