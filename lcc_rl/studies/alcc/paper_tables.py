@@ -162,8 +162,8 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
                     "drivers_better_off": f"{int((saved > 0).sum())} of {len(saved)}",
                 }
             )
-    paper = {"behind": f"alcc ({PAPER})", "energy": NAMES[""]}
-    return _with_its_decimals([*rows, paper | PAPER_HUMAN])
+    rows.append({"behind": f"alcc ({PAPER})", "energy": NAMES[""], **PAPER_HUMAN})
+    return _with_its_decimals(rows)
 
 
 def _with_its_decimals(rows: Sequence[dict[str, object]]) -> pd.DataFrame:

@@ -47,7 +47,8 @@ def energies(episodes: pd.DataFrame) -> pd.DataFrame:
         row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
         for column in (f"total_{name}" for name in KINDS.values()):
             row |= mean(part.groupby("training_seed", dropna=False)[column].mean()).columns(column)
-        row |= part[[*PARTS, "cav_energy_kj", "hdv_energy_kj"]].mean().to_dict()
+        for column in (*PARTS, "cav_energy_kj", "hdv_energy_kj"):
+            row[column] = part[column].mean()
         rows.append(row)
     return pd.DataFrame(rows)
 
