@@ -1,7 +1,7 @@
-"""Controllers compared at the same share of the time beyond a limit, not at points that differ.
+"""Controllers compared at the same share of the time beyond a limit.
 
-A controller that drives nearer saves less energy and misses the limit of the time gap less. Two of
-them are compared as curves: trained for several limits each, and read where both miss as much.
+A controller that drives nearer saves less energy and misses the limit of the time gap less. Two
+controllers are compared as curves over several limits, read where both miss as much.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ def front(windows: pd.DataFrame, kind: Sequence[str]) -> Front:
 
 
 def energy_at(energy: NDArray[np.float64], share: NDArray[np.float64], at: float) -> float:
-    """Return the energy of a front, ``[limits]`` each, where the share is at most ``at``.
+    """Return the energy of a front, ``[limits]`` each, at a share of ``at``.
 
-    Linear between the limits; where the share stays below, that of the largest share; NaN where it
-    is never as small.
+    It is linear between the limits, that of the largest share if all are smaller, and NaN if none
+    is as small.
     """
     order = np.argsort(share)
     return float(np.interp(at, share[order], energy[order], left=np.nan))
@@ -63,15 +63,14 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both at the same share of the time beyond the limit, or below it. The interval is a clustered
-    bootstrap over windows, which both meet, and training seeds, as of
-    :func:`lcc_rl.results.intervals.saving`; resamples in which a front does not reach the share
-    are left out.
+    Both spend at most the same share of the time beyond the limit. The interval is that of
+    :func:`lcc_rl.results.intervals.saving`, without resamples in which a front does not reach the
+    share.
 
     Args:
         windows: see :func:`front`.
-        one: variant and policy of who saves.
-        other: ... and of whom it is compared with.
+        one: variant and policy of the controller that saves.
+        other: variant and policy of the controller that it is compared with.
         at: the largest share of the time.
     """
     fronts = [front(windows, kind) for kind in (one, other)]
@@ -86,7 +85,7 @@ def saving_at(
     saved = share_saved(*np.array(found))
     saved = saved[np.isfinite(saved)]
     if not len(saved):
-        return Estimate(value, float("nan"), float("nan"))
+        return Estimate(value)
     return Estimate(value, *bounds(saved))
 
 

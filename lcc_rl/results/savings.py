@@ -10,22 +10,22 @@ import pandas as pd
 from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
-REPEAT = "repeat"  # of a row: which draw of the noise of its profile and driver, where several
+REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
 BASELINES = ("idm", "human", "idm tuned", "reference")
 UNTRAINED = ("direct", "idm", "human", "idm tuned", "acc tuned")
-NOTHING = Estimate(np.nan, np.nan, np.nan)
+NOTHING = Estimate(np.nan)
 # Prefix of a saving, and of which energy: the path's, which leaves out what the motion stores
 # and with it what ending slower saves; and as drawn (A2).
 KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
 LEADER = ("leader_path_energy_kj", "leader_speed_mps")
-SOURCE = "source"  # of a row's leader, where a mixture has several
+SOURCE = "source"  # of a row's leader, if a mixture has several
 TERCILES = ("lower", "middle", "upper")
 
 
 def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
     """Return a column per strategy and a row per pair, the mean over seeds.
 
-    A pair is a profile and a driver, and where there are several draws of its noise, the draw.
+    A pair is a profile and a driver and, if there are several draws of its noise, the draw.
     """
     keys = [*KEYS, REPEAT] if REPEAT in episodes else KEYS
     return episodes.pivot_table(index=keys, columns="strategy", values=column, aggfunc="mean")
@@ -44,18 +44,17 @@ def driver_savings(episodes: pd.DataFrame, column: str, strategy: str, baseline:
 
 def per_seed(episodes: pd.DataFrame, column: str) -> dict[str, pd.Series]:
     """Return, for each strategy, the mean of a column over the episodes of each training seed."""
-    found = {}
-    for strategy, rows in episodes.groupby("strategy", sort=False):
-        values = rows.groupby("training_seed", dropna=False)[column].mean()
-        if values.notna().any():
-            found[str(strategy)] = values
-    return found
+    found = {
+        str(strategy): rows.groupby("training_seed", dropna=False)[column].mean()
+        for strategy, rows in episodes.groupby("strategy", sort=False)
+    }
+    return {strategy: values for strategy, values in found.items() if values.notna().any()}
 
 
 def per_window(episodes: pd.DataFrame, columns: str | Sequence[str]) -> pd.DataFrame:
     """Return the means over drivers: a row per strategy, training seed and window.
 
-    Of the same drivers in every window these rows give the same :func:`savings`, faster.
+    If every window has the same drivers, these rows give the same :func:`savings`, faster.
     """
     keys = ["strategy", "training_seed", "profile_id"]
     names = [columns] if isinstance(columns, str) else list(columns)
@@ -65,17 +64,17 @@ def per_window(episodes: pd.DataFrame, columns: str | Sequence[str]) -> pd.DataF
 
 
 def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> Estimate:
-    """Return the share of a strategy's mean energy saved against a baseline.
+    """Return the share of the baseline's mean energy that a strategy saves.
 
     Args:
         episodes: rows of an evaluation, or of :func:`per_window`.
         column: the energy.
-        strategy: who saves.
-        baseline: against whom.
+        strategy: the strategy that saves.
+        baseline: the strategy that it is compared with.
 
     Returns:
-        The share with its interval over windows and seeds (:func:`intervals.saving`), of the
-        windows that both were evaluated on; NaN where one of them is missing.
+        The share with its interval over windows and seeds (:func:`intervals.saving`), on the
+        windows that both were evaluated on; NaN if one of them is missing.
     """
     energy = per_window(episodes[episodes["strategy"].isin([strategy, baseline])], column)
     energy["training_seed"] = energy["training_seed"].astype(object).fillna(-1)
@@ -91,14 +90,12 @@ def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, f
 
     Args:
         energy: a table of :func:`paired`; the mean over seeds counts.
-        strategy: with whom.
-        baseline: compared with whom.
+        strategy: the strategy that may draw more.
+        baseline: the strategy that it is compared with.
 
     Returns:
-        ``pairs`` and ``drivers``, the latter by their mean over windows; NaN where one is missing.
+        ``pairs`` and ``drivers``, the latter by their mean over windows.
     """
-    if strategy == baseline or not {strategy, baseline} <= set(energy):
-        return {"pairs": float("nan"), "drivers": float("nan")}
     pairs = energy[[strategy, baseline]].dropna()
     levels = {"pairs": pairs, "drivers": pairs.groupby("driver_id").mean()}
     return {name: float((x[strategy] > x[baseline]).mean()) for name, x in levels.items()}
@@ -116,37 +113,35 @@ def by_source(episodes: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 def stratified(
     episodes: pd.DataFrame, column: str, strategy: str, baseline: str, by: Sequence[str] = LEADER
 ) -> pd.DataFrame:
-    """Savings in the terciles of windows by what their leader does, and in each source of leaders.
+    """Return savings in the terciles of windows by their leader, and in each source of leaders.
 
     Args:
         episodes: rows of an evaluation.
         column: the energy.
-        strategy: who saves.
-        baseline: against whom.
+        strategy: the strategy that saves.
+        baseline: the strategy that it is compared with.
         by: columns that are the same in every row of a window.
 
     Returns:
         One row per measure and tercile, the lowest first: its windows, the range of the measure
-        and the share saved [%] with its interval; and one per source, where there are several, by
+        and the share saved [%] with its interval; and one per source, if there are several, by
         its name in the column ``tercile``, without a range.
     """
-    rows: list[dict[str, object]] = []
-    row: dict[str, object]
-    for source, inside in by_source(episodes) if SOURCE in episodes else ():
-        row = {"by": SOURCE, "tercile": source, "windows": inside["profile_id"].nunique()}
-        row |= {"least": np.nan, "most": np.nan}
-        found = savings(inside, column, strategy, baseline)
-        rows.append(row | found.columns("saving_pct", 100.0))
+    strata: list[tuple[str, str, object, object, pd.DataFrame]] = []
+    if SOURCE in episodes:
+        strata += [(SOURCE, name, np.nan, np.nan, rows) for name, rows in by_source(episodes)]
     for measure in by:
         windows = episodes.groupby("profile_id")[measure].first().sort_values()
         parts = np.array_split(np.arange(len(windows)), len(TERCILES))
-        for name, chosen in zip(TERCILES, parts, strict=True):
-            part = windows.iloc[chosen]
-            if part.empty:
-                continue
-            inside = episodes[episodes["profile_id"].isin(part.index)]
-            row = {"by": measure, "tercile": name, "windows": len(part)}
-            row |= {"least": part.iloc[0], "most": part.iloc[-1]}
-            found = savings(inside, column, strategy, baseline)
-            rows.append(row | found.columns("saving_pct", 100.0))
-    return pd.DataFrame(rows)
+        for name, part in zip(TERCILES, (windows.iloc[chosen] for chosen in parts), strict=True):
+            if len(part):
+                inside = episodes[episodes["profile_id"].isin(part.index)]
+                strata.append((measure, name, part.iloc[0], part.iloc[-1], inside))
+    return pd.DataFrame(
+        [
+            {"by": measure, "tercile": name, "windows": inside["profile_id"].nunique()}
+            | {"least": least, "most": most}
+            | savings(inside, column, strategy, baseline).columns("saving_pct", 100.0)
+            for measure, name, least, most, inside in strata
+        ]
+    )

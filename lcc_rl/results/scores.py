@@ -1,4 +1,4 @@
-"""The table of a task: who keeps its limits, and what that saves against whom it names."""
+"""The table of a task: which strategies keep its limits, and what they save."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lcc_rl.results.savings import NOTHING, savings
 from lcc_rl.results.tables import strategies_side_by_side
 from lcc_rl.results.units import check_unit, per_distance
 
-# Scores by name: the column that is divided by the distance of all vehicles; None: as it is.
+# Scores by name: the column that is divided by the distance of all vehicles.
 PER_DISTANCE = {
     "energy": "total_energy_kj",
     "net_energy": "total_net_energy_kj",
@@ -24,7 +24,7 @@ PLAIN = ("final_speed_spread_mps", "speed_std_mps", "string_ratio")
 SCORE, DISTANCE = "score", "distance_m"
 MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", "flow_vph", "string_ratio")
 LARGEST, LEAST, SHARE = "max_", "min_", "share_"
-# Columns that a limit may be of, named before anything is played.
+# Columns that may have a limit.
 LIMITED = (
     *("max_gap_m", "max_time_gap_s", "min_gap_m", "min_time_gap_s", "min_ttc_s"),
     *("share_leader_faster", "share_time_gap_long", "share_time_gap_long_moving"),
@@ -34,19 +34,19 @@ LIMITED = (
 
 @dataclass(frozen=True)
 class Task:
-    """What a task asks for, so that two groups mean the same.
+    """What a task asks for.
 
     Args:
         name: of the task.
-        score: what counts, the less the better: ``energy``, ``net_energy`` or ``path_energy`` of
-            all vehicles over their distance, or a column of episodes.parquet.
+        score: the quantity to minimise: ``energy``, ``net_energy`` or ``path_energy`` of all
+            vehicles over their distance, or a column of episodes.parquet.
         unit: of an energy over a distance, see :mod:`lcc_rl.results.units`.
         against: the strategy that the others are compared with.
-        limits: bounds of columns by name: at most for ``max_…`` in every episode, at least for
-            ``min_…``, and for ``share_…`` at most so much of the time of all episodes.
+        limits: bounds by column: the largest value of ``max_…`` and the smallest of ``min_…`` in
+            any episode, and the largest mean of ``share_…`` over all episodes.
 
     Raises:
-        ConfigError: if the score is unknown, or a limit is of another column or no number.
+        ConfigError: if the score or the column of a limit is unknown, or a bound is no number.
     """
 
     name: str
@@ -83,17 +83,17 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
 
     Args:
         episodes: rows of an evaluation, every strategy on the same windows and drivers.
-        task: what counts.
+        task: the score and the limits.
         energy: the energy models, for units.
 
     Returns:
         One row per strategy: seeds, score, the share saved against ``task.against`` with its
         interval over windows and seeds, the share of the distance that is lost against it, means
-        of gap, speed and traffic, the value of every limit, collisions, and whether all limits
-        are kept without one.
+        of gap, speed and traffic, the value of every limit, collisions, and whether the strategy
+        keeps all limits and never collides.
 
     Raises:
-        ConfigError: if a column of a limit is missing, or whom to compare with.
+        ConfigError: if the column of a limit, or the strategy ``task.against``, is missing.
     """
     check_unit(task.unit, energy)
     missing = [column for column in task.limits if column not in episodes]
@@ -120,10 +120,10 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
 
 
 def _scored(episodes: pd.DataFrame, task: Task) -> tuple[pd.DataFrame, float]:
-    """Return the rows with score and distance of all vehicles, and whom they are compared with's.
+    """Return the rows with score and distance of all vehicles, and the baseline's distance [m].
 
-    An energy is brought to that mean distance [m] by the strategy's own: what is saved is then a
-    ratio of totals, in which short episodes count little.
+    An energy is scaled to that mean distance by the strategy's own: a saving is then a ratio of
+    totals, in which short episodes count little.
     """
     parts = [name for name in ("cav_distance_m", "hdv_distance_m") if name in episodes]
     rows = episodes.assign(**{DISTANCE: episodes[parts].sum(axis=1)})
@@ -140,21 +140,20 @@ def _scored(episodes: pd.DataFrame, task: Task) -> tuple[pd.DataFrame, float]:
 
 
 def _worst(part: pd.DataFrame, column: str) -> float:
-    """Return the value of a column that its limit is about."""
+    """Return the value that the limit of a column bounds."""
     if column.startswith(SHARE):
         return float(part[column].mean())
     return float(part[column].max() if column.startswith(LARGEST) else part[column].min())
 
 
 def _keeps(column: str, value: float, bound: float) -> bool:
-    """Whether a limit is kept; one of somebody who is not there is."""
+    """Whether a limit is kept; NaN, the value of a vehicle that does not exist, keeps it."""
     return not (value < bound if column.startswith(LEAST) else value > bound)
 
 
 def as_rich(table: pd.DataFrame, task: Task, title: str) -> Table:
     """Return scores as a table for the terminal, a column per strategy."""
-    shares = [column for column in task.limits if column.startswith(SHARE)]
-    others = [column for column in task.limits if column not in shares]
+    limits = sorted(task.limits, key=lambda column: column.startswith(SHARE))
     rows = (
         (task.label, "score", "{:.2f}"),
         (f"saved against {task.against}", "saving", "{:+.2%}"),
@@ -166,8 +165,14 @@ def as_rich(table: pd.DataFrame, task: Task, title: str) -> Table:
         ("spread of speeds at the end [m/s]", "final_speed_spread_mps", "{:.2f}"),
         ("flow [vehicles/h]", "flow_vph", "{:.0f}"),
         ("string ratio", "string_ratio", "{:.2f}"),
-        *((f"{column} (limit {task.limits[column]:g})", column, "{:.2f}") for column in others),
-        *((f"{column} (limit {task.limits[column]:g})", column, "{:.4f}") for column in shares),
+        *(
+            (
+                f"{column} (limit {task.limits[column]:g})",
+                column,
+                "{:.4f}" if column.startswith(SHARE) else "{:.2f}",
+            )
+            for column in limits
+        ),
         ("collisions", "collisions", "{:d}"),
         ("keeps the limits (1: yes)", "kept", "{:d}"),
         ("training seeds", "seeds", "{:d}"),

@@ -40,15 +40,15 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     """Summarise every strategy.
 
     Args:
-        episodes: rows of one or more evaluations on the same profiles and drivers; of a dataset
-            one block is in memory at a time, and strategies are paired within blocks.
+        episodes: rows of one or more evaluations on the same profiles and drivers; one block of a
+            dataset is in memory at a time, and strategies are paired within blocks.
         source: of the leaders whose rows count; empty for all.
 
     Returns:
         One row per strategy: mean energies [kJ] and energy per kilometre, savings against each of
-        :data:`BASELINES` as shares, positive where energy is saved, that of the path energy with
-        its interval; shares of (window, driver) pairs and of drivers whose path takes more; and
-        the safety measures; missing where a strategy has none.
+        :data:`BASELINES` as shares, positive if energy is saved, with their intervals; shares of
+        (window, driver) pairs and of drivers whose path takes more; and the safety measures.
+        Values that a strategy does not have are NaN.
     """
     # A string without automated vehicles, or without others, has no energies of them.
     columns = [*CAR_COLUMNS, *HUMAN_COLUMNS, "collided"]
@@ -67,25 +67,17 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         whose = "hdv" if np.isnan(mean["total_energy_kj"]) else "total"
         row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
         for baseline in BASELINES:
-            row |= _against(windows, found, strategy, baseline)
+            for kind, column in KINDS.items():
+                names = (f"total_{column}", strategy, baseline)
+                share = savings(windows, *names) if strategy != baseline else NOTHING
+                row |= share.columns(f"{kind}saving_vs_{baseline}")
+            worse = found.worse_off(strategy, baseline)
+            row |= {f"{name}_worse_than_{baseline}": share for name, share in worse.items()}
         row["collisions"] = int(total["collided"])
         row["min_ttc_s"] = found.low("min_ttc_s", strategy)
         row |= {column: mean[column] for column in SHOWN}
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _against(
-    windows: pd.DataFrame, found: Totals, strategy: str, baseline: str
-) -> dict[str, float]:
-    """Savings of a strategy over a baseline, paired by window and driver."""
-    row: dict[str, float] = {}
-    for kind, column in KINDS.items():
-        known = strategy != baseline
-        share = savings(windows, f"total_{column}", strategy, baseline) if known else NOTHING
-        row |= share.columns(f"{kind}saving_vs_{baseline}")
-    worse = found.worse_off(strategy, baseline)
-    return row | {f"{name}_worse_than_{baseline}": share for name, share in worse.items()}
 
 
 def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
@@ -123,12 +115,12 @@ ROWS = (
 def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
     """Return a warning for every human baseline whose desired speed the leaders mostly exceed.
 
-    A driver who would not keep up with the leader by choice drops back, whoever drives ahead:
-    energies then compare distances, not ways of driving.
+    Such a driver drops back, whoever drives ahead: energies then compare distances, not ways of
+    driving.
 
     Args:
         episodes: rows of an evaluation.
-        of_task: whether a task is evaluated, which chooses whom it compares.
+        of_task: whether a task is evaluated, which chooses the strategies to compare.
     """
     remedies = {
         "direct": "drivers=highway, or drivers calibrated on such traffic",
@@ -170,8 +162,8 @@ def strategies_side_by_side(
 
     Args:
         table: one row per strategy, named in the column ``strategy``.
-        rows: label, column of ``table`` and number format of what is shown, in order; columns
-            without any value are left out.
+        rows: label, column of ``table`` and number format, in order; columns without any value
+            are left out.
         title: above the table.
         caption: below it.
     """

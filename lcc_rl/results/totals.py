@@ -1,4 +1,4 @@
-"""What a summary needs of the rows of an evaluation, added up block by block."""
+"""Sums over the rows of an evaluation, added up block by block."""
 
 from __future__ import annotations
 
@@ -18,10 +18,7 @@ FOLDED = 100_000  # rows of partial sums that are kept before they are added up
 def frames(rows: Rows, columns: Sequence[str], source: str = "") -> Iterator[pd.DataFrame]:
     """Yield rows block by block; a data frame is one block.
 
-    Args:
-        rows: of one or more evaluations.
-        columns: the columns that are wanted; those that do not exist are left out.
-        source: of the leaders; empty for all.
+    Columns that do not exist are left out; ``source`` is that of the leaders, empty for all.
     """
     wanted = [*dict.fromkeys([*columns, SOURCE])] if source else list(columns)
     for frame in [rows] if isinstance(rows, pd.DataFrame) else _row_groups(rows, wanted):
@@ -49,10 +46,10 @@ class Totals:
 
     Args:
         rows: the rows.
-        means: columns whose means are asked for.
-        lows: columns whose minima are asked for.
-        paired_by: the energy by which pairs are compared.
-        baselines: with whom.
+        means: columns whose means are needed.
+        lows: columns whose minima are needed.
+        paired_by: the energy by which strategies are compared in pairs of window and driver.
+        baselines: the strategies that the others are compared with.
         source: of the leaders; empty for all.
     """
 
@@ -67,7 +64,7 @@ class Totals:
     ) -> None:
         self.means, self.lows, self.paired_by = list(means), list(lows), paired_by
         self.baselines, self.minima = baselines, pd.DataFrame()
-        # Of a strategy and a baseline: pairs, those worse off, and by driver the sums of both.
+        # By strategy and baseline: pairs, those worse off, and the sums of both by driver.
         self.pairs: dict[tuple[str, str], tuple[int, int]] = {}
         self.drivers: dict[tuple[str, str], pd.DataFrame] = {}
         parts: list[pd.DataFrame] = []
@@ -76,14 +73,12 @@ class Totals:
             parts.append(self._window_sums(frame))
             if sum(map(len, parts)) > FOLDED + 2 * len(parts[0]):
                 parts = [_folded(parts)]
-            lows_here = frame.groupby("strategy", sort=False)[self._known(frame, self.lows)].min()
+            known = [name for name in self.lows if name in frame]
+            lows_here = frame.groupby("strategy", sort=False)[known].min()
             self.minima = pd.concat([self.minima, lows_here]).groupby(level=0, sort=False).min()
             self._compare(frame)
         self.windows = _folded(parts)
         self.strategies = [str(name) for name in self.windows.index.unique(0)]
-
-    def _known(self, frame: pd.DataFrame, columns: Sequence[str]) -> list[str]:
-        return [name for name in columns if name in frame]
 
     def _window_sums(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Return sums and counts by window."""
@@ -111,19 +106,16 @@ class Totals:
 
     def sums(self) -> pd.DataFrame:
         """Return the sum of each column of means by strategy, and the number of ``rows``."""
-        return pd.DataFrame(self._by_strategy()["sum"])
+        return pd.DataFrame(self.windows["sum"].groupby(level=0, sort=False).sum())
 
     def mean(self) -> pd.DataFrame:
         """Return the mean of each column of means by strategy."""
-        found = self._by_strategy()
+        found = self.windows.groupby(level=0, sort=False).sum()
         return pd.DataFrame(found["sum"] / found["count"].replace(0, np.nan))
 
     def low(self, column: str, strategy: str) -> float:
-        """Return the minimum of a column of lows; NaN where the strategy has none."""
+        """Return the minimum of a column of lows; NaN if the strategy has none."""
         return float(self.minima[column][strategy]) if column in self.minima else np.nan
-
-    def _by_strategy(self) -> pd.DataFrame:
-        return self.windows.groupby(level=0, sort=False).sum()
 
     def per_window(self) -> pd.DataFrame:
         """Return the means by strategy, training seed and window, as rows."""
@@ -131,18 +123,12 @@ class Totals:
         return means.reset_index()
 
     def worse_off(self, strategy: str, baseline: str) -> dict[str, float]:
-        """Return the shares of pairs and of drivers who draw more than with a baseline.
-
-        See :func:`lcc_rl.results.savings.worse_off`; NaN where one of them is missing.
-        """
+        """Return :func:`lcc_rl.results.savings.worse_off`; NaN if a strategy is missing."""
         count, worse = self.pairs.get((strategy, baseline), (0, 0))
         if not count:
-            return {"pairs": float("nan"), "drivers": float("nan")}
-        drivers = self.drivers[strategy, baseline]
-        return {
-            "pairs": worse / count,
-            "drivers": float((drivers[strategy] > drivers[baseline]).mean()),
-        }
+            return {"pairs": np.nan, "drivers": np.nan}
+        sums = self.drivers[strategy, baseline]
+        return {"pairs": worse / count, "drivers": (sums[strategy] > sums[baseline]).mean()}
 
 
 def _folded(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:

@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from lcc_rl.energy import EnergyModel, Fleet
+from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
 
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
 ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH}
-FUEL = ("g/km", "L/100km", "mpg")
-UNITS = (*ELECTRIC, *FUEL)
+UNITS = (*ELECTRIC, "g/km", "L/100km", "mpg")
 
 
 def per_distance(kj_per_km: float, unit: str, energy: Fleet) -> float:
-    """Convert energy per distance.
+    """Convert energy per distance [kJ/km] to one of :data:`UNITS`.
 
     Args:
-        kj_per_km: what is converted [kJ/km].
+        kj_per_km: the energy per distance [kJ/km].
         unit: one of :data:`UNITS`.
         energy: the energy models, which know their fuel.
 
-    Returns:
-        The value in that unit.
-
     Raises:
-        ConfigError: if the unit is unknown, or of fuel where vehicles use none or different ones.
+        ConfigError: if the unit is unknown, or one of fuel and the vehicles do not all burn one.
     """
     check_unit(unit, energy)
     if unit in ELECTRIC:
@@ -40,21 +34,12 @@ def per_distance(kj_per_km: float, unit: str, energy: Fleet) -> float:
 
 
 def check_unit(unit: str, energy: Fleet) -> None:
-    """Check that a unit is known and means something for all vehicles.
-
-    Raises:
-        ConfigError: see :func:`per_distance`.
-    """
+    """Check that a unit is known and means something for all vehicles, see :func:`per_distance`."""
     if unit not in UNITS:
         raise unknown_name("unit (task.unit)", unit, UNITS)
-    if unit in FUEL and len(_fuels(energy.models)) != 1:
+    fuels = {(round(m.heating_value or 0.0, 3), m.density) for m in energy.models}
+    if unit not in ELECTRIC and (len(fuels) > 1 or not next(iter(fuels))[0]):
         raise ConfigError(
             f"task.unit={unit} needs vehicles that all burn one fuel; these burn several, or some "
-            "none (energy=…): say kJ/km or Wh/km"
+            "none (energy=…): choose kJ/km or Wh/km"
         )
-
-
-def _fuels(models: Sequence[EnergyModel]) -> set[tuple[float, float]]:
-    """Return heating value and density of every fuel; of none where a vehicle has no fuel."""
-    found = {(round(m.heating_value, 3), m.density) for m in models}
-    return set() if any(not value for value, _ in found) else found

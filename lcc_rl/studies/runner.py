@@ -20,6 +20,7 @@ from lcc_rl.config import NOT_IDENTITY, identity, load
 from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
@@ -35,7 +36,7 @@ GIVEN = ("seed", "variant")  # set by the study for each of its runs
 
 @dataclass(frozen=True)
 class Run:
-    """A training: its folder and the overrides of ``lcc-rl train``."""
+    """A training: its folder, and its overrides of ``lcc-rl train``."""
 
     folder: Path
     overrides: tuple[str, ...]
@@ -70,11 +71,11 @@ class Outcome:
 class BaseStudy:
     """The settings that every study has.
 
-    Args:
+    Attributes:
         folder: the study's folder.
         recipe: ``experiment`` of every training; None for the defaults of the agent.
         seeds: number of trainings of every learned variant, numbered from 0.
-        overrides: further settings of every run.
+        overrides: further settings of every run, data and calibration included.
         jobs: number of trainings at a time.
         accept: settings in which a run found in the folder may differ.
     """
@@ -97,31 +98,21 @@ def quoted(path: str | Path) -> str:
 
 
 def check_overrides(words: Sequence[str]) -> None:
-    """Check that the remaining words of a command line are overrides.
-
-    Raises:
-        ConfigError: if a word is no override, or sets what the study sets for every run.
-    """
+    """Check that the remaining words of a command line are overrides, and not of each run's own."""
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
     for word in words:
         if key_of(word) in GIVEN:
             raise ConfigError(
-                f"{word}: every run has its own; say --seeds, how many, counted from 0, "
-                "and which variants by the options of this command"
+                f"{word}: every run has its own; --seeds is their number, counted from 0, and "
+                "options of this command choose the variants"
             )
 
 
 def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> list[str]:
-    """List the settings in which the stored configuration of a run differs from the wanted one.
+    """List the settings of a stored run that differ from the wanted ones, ``key: found → wanted``.
 
-    Args:
-        run: the run; its folder holds a configuration.
-        wanted: the configuration it should have.
-        accept: dotted keys, or their beginnings, that may differ (``data``, ``drivers.path``).
-
-    Returns:
-        ``key: found → wanted`` for each.
+    ``accept`` names dotted keys, or their beginnings, that may differ (``data``, ``drivers.path``).
     """
     found, asked = (dict(flatten(as_plain(cfg))) for cfg in (load_config(run.folder), wanted))
     ignored = (*NOT_IDENTITY, *accept)
@@ -133,13 +124,7 @@ def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> li
 
 
 def up_to_date(cfg: StudyConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:
-    """Whether a folder holds the evaluation of a configuration, not older than its policies.
-
-    Args:
-        cfg: configuration of the evaluation.
-        folder: folder of the evaluation.
-        policies: folders of the trainings that it evaluates.
-    """
+    """Whether a folder holds the evaluation of a configuration, not older than its policies."""
     table = folder / EPISODES
     if not table.exists():
         return False
@@ -149,14 +134,10 @@ def up_to_date(cfg: StudyConfig, folder: Path, policies: Sequence[Path] = ()) ->
 
 
 def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:
-    """Run all unfinished trainings in parallel; a failure does not stop the others.
+    """Run all unfinished trainings in parallel, ``jobs`` at a time.
 
-    A run whose folder was made with other settings is left as it is and reported.
-
-    Args:
-        runs: the trainings of a study.
-        jobs: number of trainings at a time.
-        accept: settings in which a run found in its folder may differ.
+    A failure does not stop the others. A run whose folder was made with other settings, except
+    those in ``accept``, is left as it is and reported.
 
     Returns:
         The outcome of every run: those left out, those finished before, then those run now.
@@ -228,34 +209,29 @@ def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Eve
 
 def note(folder: Path, study: str, command: str) -> None:
     """Append a command and its time to the notes in the study's folder."""
-    notes = read_notes(folder)
-    notes["study"] = study
     when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    notes["commands"] = [*notes.get("commands", []), f"{when}  {command}"]
-    _write(folder, notes)
+    commands = [*read_notes(folder).get("commands", []), f"{when}  {command}"]
+    _write_notes(folder, study=study, commands=commands)
 
 
 def note_problems(folder: Path, outcomes: Sequence[Outcome]) -> None:
     """Store which runs failed or differ; earlier notes on the same runs are replaced."""
-    notes = read_notes(folder)
-    problems = dict(notes.get("problems", {}))
+    problems = dict(read_notes(folder).get("problems", {}))
     for outcome in outcomes:
         name = str(outcome.run.folder.relative_to(folder))
         problems.pop(name, None)
         if outcome.status != FINISHED:
             problems[name] = f"{outcome.status}: {outcome.note}"
-    notes["problems"] = problems
-    _write(folder, notes)
+    _write_notes(folder, problems=problems)
 
 
 def read_notes(folder: Path) -> dict[str, Any]:
-    """Return the notes in a study's folder; empty where there are none."""
-    try:
-        return dict(json.loads((folder / NOTES).read_text()))
-    except (OSError, ValueError):
-        return {}
+    """Return the notes in a study's folder, of which there may be none."""
+    path = folder / NOTES
+    return dict(read_json(path)) if path.is_file() else {}
 
 
-def _write(folder: Path, notes: dict[str, Any]) -> None:
+def _write_notes(folder: Path, **changed: object) -> None:
     with atomic_path(folder / NOTES) as temporary:
+        notes = read_notes(folder) | changed
         temporary.write_text(json.dumps(notes, indent=1, ensure_ascii=False))

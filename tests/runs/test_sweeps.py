@@ -17,12 +17,12 @@ from omegaconf import OmegaConf
 
 from lcc_rl import results
 from lcc_rl.agents.replay import Trainer
+from lcc_rl.cli import entry
 from lcc_rl.commands import training
 from lcc_rl.config import identity, load
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.runs import cli
 from lcc_rl.runs.states import ERROR, Busy, claim
 from lcc_rl.runs.sweeps import (
     Plan,
@@ -133,7 +133,7 @@ def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) ->
         raise ValueError("No trials are completed yet.")
 
     with pytest.raises(LccError, match="1 of 1 runs failed"):
-        cli.sweep(command)
+        entry.sweep(command)
     assert SweepCallback.folder is None
 
 

@@ -26,8 +26,13 @@ PAPER_TABLE_IV = {
 PAPER_IMPROVEMENT = {"mean": 4.38, "best": 14.43, "worst": -4.92}
 PAPER_WORSE = (138, 923)
 PAPER_GENERALIZATION = (7.00, 8.04, 9.35, 4.62)
-PAPER_HUMAN = {"A": 165.38, "B": 212.39}
-PAPER_HUMAN_SAVING = {"mean": 22.1, "least": 16.7, "most": 34.7}
+PAPER_HUMAN = {
+    "scenario_A_kj": 165.38,
+    "scenario_B_kj": 212.39,
+    "saving_pct": 22.1,
+    "least_driver_pct": 16.7,
+    "most_driver_pct": 34.7,
+}
 
 
 def table_iv(
@@ -56,20 +61,14 @@ def table_iv(
                 energy = own[f"total_{column}"]
                 share = 100.0 * share_saved(energy[strategy], energy[baseline])
                 row[f"{kind}saving_pct"] = share if name == strategy else np.nan
-            rows += [row, *_paper_row(label, name, strategy)]
+            rows.append(row)
+            if (label, name) in PAPER_TABLE_IV:
+                row = {"driver": label, "strategy": name, "from": PAPER}
+                keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
+                row |= dict(zip(keys, PAPER_TABLE_IV[label, name], strict=True))
+                row["saving_pct"] = PAPER_IMPROVEMENT[label] if name == strategy else np.nan
+                rows.append(row)
     return _with_its_decimals(rows)
-
-
-def _paper_row(driver: str, name: str, strategy: str) -> list[dict[str, object]]:
-    """Return the paper's row, where it prints one."""
-    if (driver, name) not in PAPER_TABLE_IV:
-        return []
-    row: dict[str, object] = {"driver": driver, "strategy": name, "from": PAPER}
-    keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
-    row |= dict(zip(keys, PAPER_TABLE_IV[driver, name], strict=True))
-    if name == strategy:
-        row["saving_pct"] = PAPER_IMPROVEMENT[driver]
-    return [row]
 
 
 def holistic(
@@ -80,15 +79,10 @@ def holistic(
     for kind, column in KINDS.items():
         found = savings(episodes, f"total_{column}", strategy, baseline)
         saved = 100.0 * driver_savings(episodes, f"total_{column}", strategy, baseline)
-        rows.append(
-            {
-                "from": f"{OURS}, {NAMES[kind]}",
-                **found.columns("mean_saving_pct", 100.0),
-                "best_driver_pct": saved.max(),
-                "worst_driver_pct": saved.min(),
-                "drivers_worse_off": f"{int((saved < 0).sum())} of {len(saved)}",
-            }
-        )
+        row = {"from": f"{OURS}, {NAMES[kind]}", **found.columns("mean_saving_pct", 100.0)}
+        row |= {"best_driver_pct": saved.max(), "worst_driver_pct": saved.min()}
+        row |= {"drivers_worse_off": f"{int((saved < 0).sum())} of {len(saved)}"}
+        rows.append(row)
     columns = ("mean_saving_pct", "best_driver_pct", "worst_driver_pct")
     paper = dict(zip(columns, PAPER_IMPROVEMENT.values(), strict=True))
     rows.append({"from": PAPER, **paper, "drivers_worse_off": "{} of {}".format(*PAPER_WORSE)})
@@ -98,7 +92,7 @@ def holistic(
 def generalization(
     episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
-    """Energies and savings on every held-out profile, with intervals over seeds (Fig. 12).
+    """Energies and savings on every held-out profile (Fig. 12).
 
     Returns:
         One row per profile: path energy of both vehicles under the baseline and the strategy
@@ -133,21 +127,14 @@ def generalization_row(
     rows = []
     for kind, column in KINDS.items():
         together = savings(episodes, f"total_{column}", strategy, baseline)
-        spread = _spread(table[f"{kind}saving_pct"].tolist())
         row = {"from": f"{OURS}, {NAMES[kind]}", **together.columns("together_pct", 100.0)}
-        rows.append(row | spread)
-    return pd.DataFrame([*rows, {"from": PAPER, **_spread(PAPER_GENERALIZATION)}])
+        rows.append(row | _spread(table[f"{kind}saving_pct"]))
+    return pd.DataFrame([*rows, {"from": PAPER, **_spread(pd.Series(PAPER_GENERALIZATION))}])
 
 
-def _spread(values: Sequence[float]) -> dict[str, float | int]:
-    numbers = np.asarray(values, float)
-    return {
-        "profiles": len(numbers),
-        "least_pct": float(numbers.min()),
-        "median_pct": float(np.median(numbers)),
-        "most_pct": float(numbers.max()),
-        "profiles_with_saving": int((numbers > 0).sum()),
-    }
+def _spread(values: pd.Series) -> dict[str, float]:
+    ends = {"least_pct": values.min(), "median_pct": values.median(), "most_pct": values.max()}
+    return {"profiles": len(values), **ends, "profiles_with_saving": int((values > 0).sum())}
 
 
 def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -175,17 +162,7 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
                     "drivers_better_off": f"{int((saved > 0).sum())} of {len(saved)}",
                 }
             )
-    rows.append(
-        {
-            "behind": f"alcc ({PAPER})",
-            "energy": NAMES[""],
-            "scenario_A_kj": PAPER_HUMAN["A"],
-            "scenario_B_kj": PAPER_HUMAN["B"],
-            "saving_pct": PAPER_HUMAN_SAVING["mean"],
-            "least_driver_pct": PAPER_HUMAN_SAVING["least"],
-            "most_driver_pct": PAPER_HUMAN_SAVING["most"],
-        }
-    )
+    rows.append({"behind": f"alcc ({PAPER})", "energy": NAMES[""], **PAPER_HUMAN})
     return _with_its_decimals(rows)
 
 

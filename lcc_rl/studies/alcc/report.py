@@ -130,7 +130,7 @@ def _awareness(page: Page, episodes: pd.DataFrame) -> None:
     text = f"""The paper's main claim: regard for the driver behind saves energy in total, alcc
         against reference. The paper shows one profile and 923 drivers, energy as drawn. Its
         reference is weak: the car draws {PAPER_TABLE_IV["mean", "reference"][0]} kJ, where a human
-        driver behind the same leader draws {PAPER_HUMAN["B"]} kJ (Fig. 9)."""
+        driver behind the same leader draws {PAPER_HUMAN["scenario_B_kj"]} kJ (Fig. 9)."""
     beside = f"Table IV beside this study ({size(episodes)})"
     shown = [
         ("table_iv", beside, paper_tables.table_iv(episodes)),

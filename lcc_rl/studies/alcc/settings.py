@@ -24,9 +24,7 @@ ROWS = f"*/seed_*/{EPISODES}"
 SMOKE = "smoke"
 OF_CALIBRATION = ("data", "calibration")  # overrides that only the calibration takes
 VARIANTS = ("alcc", "reference")
-CONTROL = (
-    "own_energy"  # weighs its own energy as much as alcc weighs all, without regard for others
-)
+CONTROL = "own_energy"  # weighs its own energy as much as alcc weighs that of all
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
 RECIPES = ("quickstart", "paper_alcc")  # length and batches of DDPG's training
 OF_DDPG = ("short_training", *(f"recipe_{name}" for name in RECIPES))
@@ -71,11 +69,7 @@ ABLATIONS = {
 
 
 def chosen_ablation(item: str) -> tuple[str, Change]:
-    """Return the name and the change of an item of ``--ablations``: a name or ``name:override``.
-
-    Raises:
-        ConfigError: if the name is unknown and has no override.
-    """
+    """Return the name and the change of an item of ``--ablations``: a name or ``name:override``."""
     name, _, override = item.partition(":")
     if override:
         return name, Change((override,))
@@ -90,11 +84,9 @@ def chooses_agent(overrides: Iterable[str]) -> bool:
 
 
 def followers_change(overrides: Iterable[str], number: int) -> Change:
-    """Return the change of the part ``followers``; settings that the user gives are kept.
+    """Return the change of the part ``followers``, with ``number`` human drivers behind the car.
 
-    Args:
-        overrides: the study's.
-        number: human drivers behind the controlled car.
+    Settings among the study's overrides are kept.
     """
     given = {key_of(item) for item in overrides}
     learner, windows = (
@@ -110,13 +102,7 @@ def followers_change(overrides: Iterable[str], number: int) -> Change:
 class Study(BaseStudy):
     """The settings of the ALCC study.
 
-    Args:
-        folder: the study's folder.
-        recipe: ``experiment`` of every training; None for the defaults of the agent.
-        seeds: number of trainings of every variant, numbered from 0.
-        overrides: further settings of every run, data and calibration included.
-        jobs: number of trainings at a time.
-        accept: settings in which a run found in the folder may differ.
+    Attributes:
         ablations: names of :data:`ABLATIONS` or further ones as ``name:override``, e.g.
             ``early:reward.terms.safety.threshold=6``; None for all.
         profiles: number of profiles of the part ``single``.
@@ -186,7 +172,7 @@ class Study(BaseStudy):
 def followers_study(study: Study) -> Study:
     """Return the study of the part ``followers``, which has an agent of its own.
 
-    Recipes (but smoke) and overrides of agent and training are DDPG's and are dropped, unless
+    Recipes (except smoke) and overrides of agent and training are DDPG's and are dropped, unless
     the user chooses the agent.
     """
     if chooses_agent(study.overrides):

@@ -12,7 +12,7 @@ import numpy as np
 from lcc_rl.commands import evaluation
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, root_key
 from lcc_rl.config import load
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.schemas import PipelineConfig, StudyConfig
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.profiles import leader_profiles
 from lcc_rl.errors import ConfigError, unknown_name
@@ -63,14 +63,11 @@ def run(study: Study, parts: Sequence[str] | None = None, command: str = "") -> 
 
 
 def check(study: Study, parts: Sequence[str]) -> StudyConfig:
-    """Check settings before any work, and return the configuration of a main training.
-
-    Raises:
-        ConfigError: if a part or a setting is unknown or wrong.
-    """
+    """Check settings before any work, and return the configuration of a main training."""
     for part in parts:
         if part not in PARTS:
             raise unknown_name("part", part, PARTS)
+    _calibration(study)
     wanted = study.runs(study.folder / "train")[0].compose()
     if "filter" in parts and any(root_key(item) == "filter" for item in study.overrides):
         raise ConfigError(
@@ -90,9 +87,14 @@ def calibrate(study: Study) -> None:
     """Read the trajectories and calibrate drivers in both modes, unless that is done."""
     if (study.folder / DRIVERS).exists() and (study.folder / TRAJECTORIES).exists():
         return
+    calibrate_once(_calibration(study), study.folder)
+
+
+def _calibration(study: Study) -> PipelineConfig:
     skipped = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
     own = [item for item in study.overrides if root_key(item) not in skipped]
-    calibrate_once(load("pipeline", ["calibration=both", *own]), study.folder)
+    cfg: PipelineConfig = load("pipeline", ["calibration=both", *own])
+    return cfg
 
 
 def _main(study: Study, wanted: StudyConfig) -> list[Outcome]:
@@ -157,13 +159,7 @@ def _each(
 ) -> list[Outcome]:
     """Train and evaluate every change in its folder.
 
-    Args:
-        study: the settings.
-        changes: by folder.
-        shared: folder of a variant that every evaluation includes.
-
-    Returns:
-        The outcome of every training.
+    Every evaluation includes the variant in the folder ``shared``.
     """
     runs = [run for folder, change in changes.items() for run in study.runs(folder, change)]
     outcomes = run_all(runs, study.jobs, study.accept)

@@ -1,11 +1,15 @@
-"""Tables of energy, safety and learning in the ALCC study, with 95 % intervals."""
+"""Tables of energy, safety and learning in the ALCC study, with 95 % intervals.
+
+Their arguments are rows of evaluations, every strategy on the same profiles and drivers. Intervals
+of savings are over windows and seeds, all others over seeds only.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.cells import heading
+from lcc_rl.results.cells import MISSING, heading
 from lcc_rl.results.intervals import mean, share_saved
 from lcc_rl.results.savings import (
     BASELINES,
@@ -20,6 +24,7 @@ from lcc_rl.results.savings import (
     worse_off,
 )
 
+PATH = "total_path_energy_kj"
 PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
 COMPARED = (*BASELINES, "own_energy")
 LONG, MOVING = "long_time_gap_pct", "long_time_gap_above_1_mps_pct"
@@ -32,54 +37,40 @@ LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # share of time [%], for every seed
 
 
 def energies(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Mean energies of every strategy.
+    """Mean energies of every strategy [kJ].
 
-    Args:
-        episodes: rows of an evaluation: every strategy on the same profiles and drivers.
-
-    Returns:
-        One row per strategy: seeds, path energy of both vehicles and energy as drawn, the path's
-        parts at constant speed and lost by accelerating, and what CAV and HDV draw [kJ].
-        Intervals are over seeds only: they say how much trainings differ on these windows.
+    Path energy of both vehicles and energy as drawn, the path's parts at constant speed and lost
+    by accelerating, and what CAV and HDV draw.
     """
     rows = []
-    for strategy in dict.fromkeys(episodes["strategy"]):
-        part = episodes[episodes["strategy"] == strategy]
-        row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(episodes, strategy)}
+    for strategy, part in episodes.groupby("strategy", sort=False):
+        row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
         for column in (f"total_{name}" for name in KINDS.values()):
-            energy = part.groupby("training_seed", dropna=False)[column].mean()
-            row |= mean(energy).columns(column)
-        row |= part[list(PARTS)].mean().to_dict()
-        row |= {f"{v}_energy_kj": part[f"{v}_energy_kj"].mean() for v in ("cav", "hdv")}
+            row |= mean(part.groupby("training_seed", dropna=False)[column].mean()).columns(column)
+        for column in (*PARTS, "cav_energy_kj", "hdv_energy_kj"):
+            row[column] = part[column].mean()
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def headline(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Savings of the total energy: of its path, and as drawn.
+    """Savings of the total energy, of its path and as drawn, by trained strategy and baseline.
 
-    Args:
-        episodes: rows of an evaluation: every strategy on the same profiles and drivers.
-
-    Returns:
-        One row per trained strategy and baseline: the share saved [%] with its interval over
-        windows and seeds, that of the worst seed, and the (window, driver) pairs whose path takes
-        more [%].
+    The share saved [%], that of the worst seed, and the (window, driver) pairs whose path takes
+    more [%].
     """
     columns = [f"total_{column}" for column in KINDS.values()]
     windows, path = per_window(episodes, columns), paired(episodes, columns[0])
-    found = per_seed(episodes, columns[0])
-    learned = [name for name in found if name not in UNTRAINED]
+    seeds = {column: per_seed(windows, column) for column in columns}
     rows = []
-    for strategy in learned:
-        for baseline in (name for name in COMPARED if name in found and name != strategy):
+    for strategy in (name for name in seeds[columns[0]] if name not in UNTRAINED):
+        for baseline in (x for x in COMPARED if x in seeds[columns[0]] and x != strategy):
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
-            row["seeds"] = _seeds(episodes, strategy)
-            for kind, column in KINDS.items():
-                share = savings(windows, f"total_{column}", strategy, baseline)
+            row["seeds"] = _seeds(episodes[episodes["strategy"] == strategy])
+            for kind, column in zip(KINDS, columns, strict=True):
+                share = savings(windows, column, strategy, baseline)
                 row |= share.columns(f"{kind}saving_pct", 100.0)
-                values = per_seed(windows, f"total_{column}")
-                worst = share_saved(values[strategy].max(), values[baseline].mean())
+                worst = share_saved(seeds[column][strategy].max(), seeds[column][baseline].mean())
                 row[f"worst_seed_{kind}saving_pct"] = 100.0 * worst
             row["pairs_worse_off_pct"] = 100.0 * worse_off(path, strategy, baseline)["pairs"]
             rows.append(row)
@@ -89,17 +80,13 @@ def headline(episodes: pd.DataFrame) -> pd.DataFrame:
 def strata(episodes: pd.DataFrame) -> pd.DataFrame:
     """Savings of path energy in the terciles of windows by what their leader does.
 
-    Returns:
-        The rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained
-        strategy without it, against each baseline.
+    Rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained strategy
+    without it, against each baseline.
     """
-    names = [name for name in per_seed(episodes, "total_path_energy_kj") if name not in UNTRAINED]
-    kept = ["alcc"] if "alcc" in names else names
+    names = [name for name in per_seed(episodes, PATH) if name not in UNTRAINED]
     parts = [
-        stratified(episodes, "total_path_energy_kj", name, baseline).assign(
-            strategy=name, against=baseline
-        )
-        for name in kept
+        stratified(episodes, PATH, name, baseline).assign(strategy=name, against=baseline)
+        for name in (["alcc"] if "alcc" in names else names)
         for baseline in COMPARED
         if baseline != name and (episodes["strategy"] == baseline).any()
     ]
@@ -108,65 +95,51 @@ def strata(episodes: pd.DataFrame) -> pd.DataFrame:
     return table[["strategy", "against", *table.columns.drop(["strategy", "against"])]]
 
 
-def _seeds(episodes: pd.DataFrame, strategy: str) -> str:
+def _seeds(rows: pd.DataFrame) -> str:
     """Return the number of training seeds; a dash for a strategy without training."""
-    count = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
-    return str(count) if count else "–"
+    return str(rows["training_seed"].nunique() or MISSING)
 
 
 def constraints(episodes: pd.DataFrame) -> pd.DataFrame:
     """Safety and efficiency of every strategy with a controlled car.
 
-    Returns:
-        One row per strategy: collisions in all episodes; shares of time with TTC < 4 s and time
-        gap > 2.5 s [%] in the mean over seeds, of the worst seed and of the worst episode; the
-        least TTC [s] and gap [m]; and whether every seed is within :data:`LIMITS`.
+    Collisions in all episodes; shares of time with TTC < 4 s and time gap > 2.5 s [%] in the mean
+    over seeds, of the worst seed and of the worst episode; the least TTC [s] and gap [m]; and
+    whether every seed is within :data:`LIMITS`.
     """
     rows = []
     for strategy in per_seed(episodes, "total_energy_kj"):
         part = episodes[episodes["strategy"] == strategy]
-        row: dict[str, object] = {
-            "strategy": strategy,
-            "seeds": _seeds(episodes, strategy),
-            "episodes": len(part),
-            "collisions": int(part["collided"].sum()),
-        }
+        row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
+        row |= {"episodes": len(part), "collisions": int(part["collided"].sum())}
+        kept = not row["collisions"]
         for name, column in SHARES.items():
             values = 100.0 * part.groupby("training_seed", dropna=False)[column].mean()
             row[f"mean_{name}"], row[f"worst_seed_{name}"] = values.mean(), values.max()
             row[f"worst_episode_{name}"] = 100.0 * part[column].max()
+            kept = kept and values.max() <= LIMITS.get(name, np.inf)
         row["least_ttc_s"], row["least_gap_m"] = part["min_ttc_s"].min(), part["min_gap_m"].min()
-        within = [float(str(row[f"worst_seed_{x}"])) <= limit for x, limit in LIMITS.items()]
-        row["within_limits"] = row["collisions"] == 0 and all(within)
-        rows.append(row)
+        rows.append(row | {"within_limits": bool(kept)})
     return pd.DataFrame(rows)
 
 
 def constraints_by_seed(episodes: pd.DataFrame) -> pd.DataFrame:
     """The shares of :func:`constraints` for every trained seed, one row each."""
-    learned = episodes[episodes["training_seed"].notna()]
-    rows = []
-    for (strategy, seed), part in learned.groupby(["strategy", "training_seed"], sort=True):
-        rows.append(
-            {
-                "strategy": strategy,
-                "seed": str(seed),
-                "total_energy_kj": part["total_energy_kj"].mean(),
-                "collisions": int(part["collided"].sum()),
-                **{name: 100.0 * part[column].mean() for name, column in SHARES.items()},
-                "least_ttc_s": part["min_ttc_s"].min(),
-            }
-        )
-    return pd.DataFrame(rows)
+    groups = episodes.groupby(["strategy", "training_seed"], sort=True)
+    table = groups[["total_energy_kj"]].mean().assign(collisions=groups["collided"].sum())
+    for name, column in SHARES.items():
+        table[name] = 100.0 * groups[column].mean()
+    table["least_ttc_s"] = groups["min_ttc_s"].min()
+    table = table.reset_index().rename(columns={"training_seed": "seed"})
+    return table.astype({"seed": str})
 
 
 def learning(training: pd.DataFrame) -> pd.DataFrame:
     """Statistics of the learning curves, one row per variant and seed.
 
-    Returns:
-        Mean reward per episode in the first, middle and last tenth of the training, its standard
-        deviation over the batches of the last tenth, and ``drop``: the largest fall of the mean
-        of a tenth below that of an earlier one.
+    Mean reward per episode in the first, middle and last tenth of the training, its standard
+    deviation over the batches of the last tenth, and ``drop``: the largest fall of the mean of a
+    tenth below that of an earlier one.
     """
     rows = []
     for (variant, seed), part in training.groupby(["variant", "seed"], sort=True):
@@ -199,29 +172,25 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
 
     Returns:
         One row per change and trained strategy: path energy [kJ], its savings against each of
-        :data:`COMPARED` [%] with intervals over windows and seeds, energy as drawn [kJ],
-        collisions, shares of time [%], and RMS jerk [m/s³]; path energy and jerk also of the
-        worst seed. Intervals of other than savings are over seeds only.
+        :data:`COMPARED` [%], energy as drawn [kJ], collisions, shares of time [%], and RMS jerk
+        [m/s³]; path energy and jerk also of the worst seed.
     """
     baselines = [name for name in COMPARED if (episodes["strategy"] == name).any()]
-    path = "total_path_energy_kj"
     rows = []
     for change, part in episodes.groupby(by, sort=False):
-        windows = per_window(part, [path, "total_energy_kj", *SHARES.values(), "rms_jerk_mps3"])
-        for strategy, energy in per_seed(windows, path).items():
-            if strategy in UNTRAINED:
-                continue
-            own = windows[windows["strategy"] == strategy]
-            row: dict[str, object] = {by: change, "strategy": strategy}
-            row["seeds"] = _seeds(part, strategy)
+        windows = per_window(part, [PATH, "total_energy_kj", *SHARES.values(), "rms_jerk_mps3"])
+        learned = {x: y for x, y in per_seed(windows, PATH).items() if x not in UNTRAINED}
+        for strategy, energy in learned.items():
+            own, inside = (x[x["strategy"] == strategy] for x in (windows, part))
+            row: dict[str, object] = {by: change, "strategy": strategy, "seeds": _seeds(inside)}
             row |= mean(energy).columns("path_energy_kj")
             row["worst_seed_path_energy_kj"] = energy.max()
             for baseline in baselines:
                 known = baseline != strategy
-                found = savings(windows, path, strategy, baseline) if known else NOTHING
+                found = savings(windows, PATH, strategy, baseline) if known else NOTHING
                 row |= found.columns(f"path_saving_against_{baseline}_pct", 100.0)
             row["total_energy_kj"] = own["total_energy_kj"].mean()
-            row["collisions"] = int(part.loc[part["strategy"] == strategy, "collided"].sum())
+            row["collisions"] = int(inside["collided"].sum())
             for name, column in SHARES.items():
                 row |= mean(per_seed(own, column)[strategy]).columns(name, 100.0)
             jerk = per_seed(own, "rms_jerk_mps3")[strategy]
@@ -231,26 +200,19 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
 
 
 def single_profile(episodes: pd.DataFrame) -> pd.DataFrame:
-    """One profile for both training and evaluation, one row per profile.
+    """One profile for both training and evaluation, one row per ``study_profile``.
 
-    Args:
-        episodes: rows of the evaluations, with the column ``study_profile``.
-
-    Returns:
-        Total energy as drawn [kJ], the paper's measure, of ``idm``, ``reference`` and ``alcc``
-        with intervals over seeds, the saving of ``alcc`` against both, also of path energy [%],
-        and how many seeds of either beat the human.
+    Total energy as drawn [kJ], the paper's measure, of ``idm``, ``reference`` and ``alcc``, the
+    saving of ``alcc`` against both, also of path energy [%], and how many seeds beat the human.
     """
     rows = []
     for profile, part in episodes.groupby("study_profile", sort=True):
         energy = per_seed(part, "total_energy_kj")
-        row: dict[str, object] = {"profile": str(profile), "seeds": _seeds(part, "alcc")}
-        row["idm_energy_kj"] = energy["idm"].mean()
-        for strategy in ("reference", "alcc"):
-            if strategy not in energy:
-                continue
+        human, seeds = energy["idm"].mean(), _seeds(part[part["strategy"] == "alcc"])
+        row: dict[str, object] = {"profile": str(profile), "seeds": seeds, "idm_energy_kj": human}
+        for strategy in (name for name in ("reference", "alcc") if name in energy):
             row |= mean(energy[strategy]).columns(f"{strategy}_energy_kj")
-            better = int((energy[strategy] < energy["idm"].mean()).sum())
+            better = int((energy[strategy] < human).sum())
             row[f"{strategy}_seeds_below_idm"] = f"{better} of {len(energy[strategy])}"
         for baseline in ("reference", "idm"):
             for kind, column in KINDS.items():
