@@ -47,7 +47,7 @@ def test_flags_may_stand_anywhere(typed, sorted_words) -> None:
 def test_an_unknown_flag_is_one_line(tmp_path, entry) -> None:
     # argparse would take --experiment for an abbreviation of a flag of Hydra's own
     flag = "--experiment" if entry == "train" else "--seed"
-    done = run_command(f"lcc_rl.{entry}", "variant=idm", flag, "3", cwd=tmp_path)
+    done = run_command(f"lcc_rl.cli.{entry}", "variant=idm", flag, "3", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith(f"lcc_rl: error: unknown flag {flag}: settings are written key=")
     assert done.stderr.count("\n") == 1

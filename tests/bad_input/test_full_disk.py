@@ -182,7 +182,7 @@ def test_a_command_on_a_disk_without_space_ends_in_one_line(tmp_path, size) -> N
 )
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, entry, place, words) -> None:
     (tmp_path / "file").write_text("kept")
-    module, target = f"lcc_rl.{entry}", f"hydra.run.dir={place}"
+    module, target = f"lcc_rl.cli.{entry}", f"hydra.run.dir={place}"
     done = run_command(module, *COMMANDS[entry], target, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
@@ -224,7 +224,7 @@ def test_the_second_process_in_a_folder_says_so_and_touches_nothing(
     with claim(folder):
         before = sorted(folder.rglob("*"))
         target = f"hydra.run.dir={folder}"
-        done = run_command(f"lcc_rl.{entry}", *COMMANDS[entry], target, cwd=tmp_path)
+        done = run_command(f"lcc_rl.cli.{entry}", *COMMANDS[entry], target, cwd=tmp_path)
         assert sorted(folder.rglob("*")) == before
     assert done.returncode == 2
     assert done.stderr == f"lcc_rl: error: {folder}: another process is working on this run\n"
@@ -245,7 +245,7 @@ def test_a_folder_is_held_while_a_command_works_and_free_afterwards(
 
     monkeypatch.setattr(module, "save_config", observed)
     target = f"hydra.run.dir={tmp_path / 'run'}"
-    run_command(f"lcc_rl.{entry}", *COMMANDS[entry], target, cwd=tmp_path, check=True)
+    run_command(f"lcc_rl.cli.{entry}", *COMMANDS[entry], target, cwd=tmp_path, check=True)
     assert held == [True]
     assert not is_claimed(tmp_path / "run")
 
