@@ -116,7 +116,7 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Settings):
-        return values(value)
+        return {name: _plain(held) for name, held in values(value).items()}
     return list(value) if isinstance(value, tuple) else value
 
 

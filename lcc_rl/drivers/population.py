@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,17 +20,12 @@ from lcc_rl.drivers.parameters import (
     PLAUSIBLE,
     Bounds,
     at_bound,
-    checked_bounds,
     users,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of
 from lcc_rl.errors import (
-    LAST_SEED,
     ConfigError,
     DataError,
-    require_in,
-    require_positive,
-    require_whole,
 )
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
@@ -149,8 +145,6 @@ def bootstrap(
     found = from_table(load_drivers(path, mode))
     if least_speed is None:
         return found
-    low, high = PLAUSIBLE["desired_speed"]
-    require_in("drivers", f"[{low:g}, {high:g}]", least_speed=least_speed)
     raised = found.desired_speed < least_speed
     speed = found.desired_speed.clamp(min=least_speed)
     return replace(found, desired_speed=speed, at_bound=found.at_bound & ~raised)
@@ -212,7 +206,7 @@ def kde(
     drivers: int = 1000,
     seed: int = 0,
     bandwidth: float | None = None,
-    bounds: Bounds | None = None,
+    bounds: Mapping[str, Any] | None = None,
     mode: str | None = None,
 ) -> DriverPopulation:
     """Population drawn from a Gaussian kernel density estimate of the joint distribution.
@@ -229,12 +223,8 @@ def kde(
         ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
-    require_whole("drivers", 1, drivers=drivers)
-    require_whole("drivers", 0, LAST_SEED, seed=seed)
-    if bandwidth is not None:
-        require_positive("drivers", bandwidth=bandwidth)
     require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
-    limits = checked_bounds(bounds)
+    limits = Bounds(**(bounds or {}))
     table = load_drivers(path, mode)
     models = sorted(set(models_of(table, "driver table")))
     if len(models) > 1:
@@ -251,7 +241,7 @@ def kde(
     draws = density.resample(drivers, seed=np.random.default_rng(seed))
     drawn = {column: np.full(drivers, table[column].iloc[0]) for column in columns.values()}
     for name, row in zip(names, draws, strict=True):
-        drawn[COLUMNS[name]] = row.clip(*limits[name])
+        drawn[COLUMNS[name]] = row.clip(*getattr(limits, name))
     return from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
 
 
@@ -274,7 +264,6 @@ def fixed(
     Raises:
         ConfigError: if a parameter is not one that a driver can have.
     """
-    require_positive("drivers", desired_speed=desired_speed, time_gap=time_gap)
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
         time_gap=torch.tensor([float(time_gap)]),

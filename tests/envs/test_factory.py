@@ -279,7 +279,7 @@ def test_the_runs_of_a_sweep_share_the_data_while_its_files_stay_the_same(
     tmp_path, monkeypatch
 ) -> None:
     path = tmp_path / "pairs.parquet"
-    stream = StreamSource(2, 3, 3, (35.0, 45.0))
+    stream = StreamSource(recordings=2, platoons=3, vehicles=3, duration_s=(35.0, 45.0))
     write_episodes(stream.load().episodes, path)
     cfg = compose("alcc", "data=episodes", f"data.path={path}", "evaluation.profiles=2")
     read: list[str] = []
