@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from matplotlib.figure import Figure
 from PIL import Image  # comes with matplotlib
 
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.figures.drawing import INK, new_figure, unbox
+from lcc_rl.figures.drawing import INK, new_figure, style
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.motion import Motion, Series
 
+FORMS = (".html", ".gif", ".mp4")
 COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}
 NAMES = ("human driver", "controlled car")  # a human may drive it, too, as a baseline
 LARGEST = 50_000  # moments of vehicles in a page, each a speed and a gap
@@ -32,8 +33,8 @@ DPI = 80
 def animate(motion: Motion, title: str, path: str | Path) -> Path:
     """Write an animation; the ending, ``.html``, ``.gif`` or ``.mp4``, chooses the form.
 
-    A page plays in any browser, with a slider. A longer episode plays faster in a GIF or MP4,
-    which says how much.
+    A page plays in any browser, with a slider. A long episode plays faster in a GIF or MP4, whose
+    title says how much.
 
     Args:
         motion: of one episode, at two moments or more.
@@ -50,16 +51,17 @@ def animate(motion: Motion, title: str, path: str | Path) -> Path:
     path = Path(path)
     check_ending(path)
     with atomic_path(path) as temporary:
-        FORMS[path.suffix](motion, title, temporary)
+        if path.suffix == ".html":
+            temporary.write_text(page(motion, title), encoding="utf-8")
+        elif path.suffix == ".gif":
+            _write_gif(motion, title, temporary)
+        else:
+            _write_mp4(motion, title, temporary)
     return path
 
 
 def check_ending(path: Path) -> None:
-    """Check that an animation can be written in the form that its file's ending means.
-
-    Raises:
-        ConfigError: if there is no such form, or ffmpeg is needed and missing.
-    """
+    """Check that an animation can be written in the form that its file's ending means."""
     if path.suffix not in FORMS:
         raise unknown_name("ending of an animation", path.suffix, FORMS)
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
@@ -139,9 +141,7 @@ def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Serie
         axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
         axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
     axis.set_ylim(0.0, 1.05 * max(float(values.max()), 1.0))
-    axis.set_xlabel("time [s]")
-    axis.set_ylabel(label)
-    unbox(axis)
+    style(axis, "time [s]", label)
 
 
 def _along(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:
@@ -167,37 +167,22 @@ def _around(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> No
     axis.axis("off")
 
 
-def _write_page(motion: Motion, title: str, path: Path) -> None:
-    path.write_text(page(motion, title), encoding="utf-8")
-
-
 def _write_gif(motion: Motion, title: str, path: Path) -> None:
     images = []
     for figure in frames(motion, title):
         figure.set_dpi(DPI)
-        canvas = figure.canvas
-        canvas.draw()
-        pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]
-        images.append(
-            Image.fromarray(pixels).convert("RGB").quantize(64, Image.Quantize.FASTOCTREE)
-        )
+        figure.canvas.draw()
+        pixels = np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
+        image = Image.fromarray(pixels).convert("RGB")
+        images.append(image.quantize(64, Image.Quantize.FASTOCTREE))
     settings = {"duration": 1000 // RATE, "loop": 0, "optimize": True}
     images[0].save(path, "GIF", save_all=True, append_images=images[1:], **settings)
 
 
 def _write_mp4(motion: Motion, title: str, path: Path) -> None:
     writer = FFMpegWriter(fps=RATE, extra_args=["-f", "mp4", "-pix_fmt", "yuv420p"])
-    begun = False
-    for figure in frames(motion, title):
-        if not begun:
+    for number, figure in enumerate(frames(motion, title)):
+        if number == 0:
             writer.setup(figure, str(path), dpi=DPI)
-            begun = True
         writer.grab_frame()
     writer.finish()
-
-
-FORMS: dict[str, Callable[[Motion, str, Path], None]] = {
-    ".html": _write_page,
-    ".gif": _write_gif,
-    ".mp4": _write_mp4,
-}

@@ -72,7 +72,7 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
     """Return the sample episodes of a strategy by a name for readers.
 
     Args:
-        steps: rows of steps.parquet; of several training seeds the first is taken.
+        steps: rows of steps.parquet; those of the first training seed are taken.
         strategy: its name.
 
     Raises:
@@ -87,10 +87,8 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
         if rows["training_seed"].notna().any():
             rows = rows[rows["training_seed"] == rows["training_seed"].min()]
         keys = [name for name in EPISODE if name in rows]
-        found = {
-            f"{keys[0]} {key[0]}, driver {key[1]}": part
-            for key, part in rows.groupby(keys, sort=False)
-        }
+        groups = rows.groupby(keys, sort=False)
+        found = {f"profile {key[0]}, driver {key[1]}": part for key, part in groups}
     if not found:
         raise ResultsError(f"no sample episode of {strategy} is stored")
     return found
@@ -109,8 +107,8 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Motion:
     Raises:
         ResultsError: if the rows lack the place of a vehicle.
     """
-    long = "follower" in rows
-    time, leader, speed, gap, roles = (_of_platoon if long else _of_string)(rows, scenario)
+    read = _of_platoon if "follower" in rows else _of_string
+    time, leader, speed, gap, roles = read(rows, scenario)
     length = float(scenario["vehicle_length"])
     step = np.diff(time, prepend=time[0])
     if scenario["road"] == RING:
@@ -135,10 +133,8 @@ Found = tuple[Series, Series | None, Series, Series, tuple[str, ...]]
 
 def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     """Read rows with one vehicle each; the leader is follower 0."""
-    speed, gap = (
-        rows.pivot_table(index="time_s", columns="follower", values=name)
-        for name in ("speed_mps", "gap_m")
-    )
+    table = rows.pivot_table(index="time_s", columns="follower", values=["speed_mps", "gap_m"])
+    speed, gap = table["speed_mps"], table["gap_m"]
     roles = parse_string(scenario["string"], scenario["road"]).roles
     count = speed.shape[1] - 1
     # A case of a platoon has its own number of vehicles, all automated.
