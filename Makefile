@@ -11,7 +11,7 @@ ARGS ?=
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test test-all extras coverage lint docs clean
+.PHONY: run test test-all extras coverage lint size docs clean
 
 run: $(STAMP)
 	$(BIN)/python -m lcc_rl.pipeline experiment=main $(ARGS)
@@ -24,7 +24,7 @@ test-all: lint
 
 # Without them, test-all skips their tests: interfaces, the site, SUMO …
 extras: $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[test,interfaces,docs,bench,sumo,sweeps]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[test,interfaces,docs,bench,sumo,sweeps,fetch]"
 
 coverage: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --cov $(ARGS)
@@ -34,13 +34,17 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# Lines, code, guards, tests and cases, beside their targets.
+size: $(STAMP)
+	$(BIN)/python tools/size.py
+
 # Strict: a broken link or name is an error. Needs no network once the extra is installed.
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "lcc_rl needs Python 3.11 or newer, %s is %d.%d; say make PYTHON=python3.12" % (sys.executable, v[0], v[1]))'
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "lcc_rl needs Python 3.11 or newer, %s is %d.%d; use make PYTHON=python3.12" % (sys.executable, v[0], v[1]))'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"

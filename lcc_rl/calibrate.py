@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 from lcc_rl.runs.cli import entry_point, run_folder
+from lcc_rl.schemas import CalibrateConfig
 
 
 @entry_point("calibrate", "lcc_rl.commands.calibration")
-def main(cfg: DictConfig) -> None:
+def main(cfg: CalibrateConfig) -> None:
     """Calibrate and write into the run's folder."""
     from lcc_rl.commands.calibration import run  # loads torch
 

@@ -24,8 +24,6 @@ TOOLS = {
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
     "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX or PyTorch program"),
-    "sumo": ("lcc_rl.interfaces.sumo_ring", "a policy on a ring road in SUMO"),
-    "drivers": ("lcc_rl.commands.export_drivers", "calibrated drivers as SUMO vehicle types"),
 }
 COMMANDS = {**HYDRA, **TOOLS}
 

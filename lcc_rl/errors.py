@@ -52,6 +52,12 @@ WORDS = {
 }
 
 
+def require(condition: bool, message: str) -> None:
+    """Raise a ConfigError with the message unless the condition holds."""
+    if not condition:
+        raise ConfigError(message)
+
+
 def require_in(where: str, interval: str, **settings: Any) -> None:
     """Check that settings of one piece or agent are numbers in an interval.
 

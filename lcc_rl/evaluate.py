@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 
-from omegaconf import DictConfig
-
 from lcc_rl.config import is_sweep
 from lcc_rl.runs.cli import entry_point, resumed_folder
+from lcc_rl.schemas import EvaluateConfig
 
 log = logging.getLogger("lcc_rl")
 
 
 @entry_point("evaluate", "lcc_rl.commands.evaluation")
-def main(cfg: DictConfig) -> None:
+def main(cfg: EvaluateConfig) -> None:
     """Evaluate into the run's folder."""
     from lcc_rl.commands.evaluation import complete, run  # loads torch
 

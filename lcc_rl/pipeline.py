@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.cli import entry_point, root_key, run_folder
 from lcc_rl.runs.console import headlines, tell
+from lcc_rl.schemas import PipelineConfig
 from lcc_rl.version import __version__
 
 
 @entry_point("pipeline", "lcc_rl.commands.pipeline")
-def main(cfg: DictConfig) -> None:
+def main(cfg: PipelineConfig) -> None:
     """Run everything into the run's folder, or complete the one given by ``resume``."""
     from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides  # loads torch
     from lcc_rl.results.runs import check_folder, check_links, save_config

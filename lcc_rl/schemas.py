@@ -1,218 +1,223 @@
-"""Schemas of the configurations: which keys exist and of which type; values stand in conf/."""
+"""The typed tree of a configuration: its sections, with the types and ranges of their settings.
+
+Values stand in conf/. Nodes with a ``_target_`` (pieces, agents, data …) stay mappings until they
+are built; :mod:`lcc_rl.nodes` checks them and completes their defaults.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+import yaml
+from pydantic import AfterValidator, Field
 
-from lcc_rl.config_types import check_numbers
-from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole, unknown_name
-from lcc_rl.targets import TARGET, settings_at
+from lcc_rl.errors import LAST_SEED, ConfigError
+from lcc_rl.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
+from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
+
+MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
+Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
+Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
+Million = Annotated[int, Field(ge=1, le=1_000_000)]
+FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
+Format = Literal["png", "pdf", "svg"]
 
 
-@dataclass
-class ScenarioConfig:
+def _described(node: Any) -> Any:
+    if node is not None and not is_node(node):
+        raise ValueError(f"expected a node with {TARGET} or null, got {node!r}")
+    return node
+
+
+def _all_described(nodes: dict[str, Any]) -> dict[str, Any]:
+    for name, node in nodes.items():
+        if isinstance(node, Mapping) and not is_node(node):
+            known = ", ".join(key for key in nodes if key != name)
+            raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
+        if node is not None and not is_node(node):
+            raise ValueError(f"{name}: expected a node with {TARGET} or null, got {node!r}")
+    return nodes
+
+
+Node = Annotated[Any, AfterValidator(_described)]
+Nodes = Annotated[dict[str, Any], AfterValidator(_all_described)]
+AUTO = "scenario.controllers.automated"
+
+
+class ScenarioConfig(Settings):
     """A scenario: its clock, its string of vehicles and its pieces."""
 
-    name: str = MISSING
-    horizon: int = MISSING
-    time_step: float = MISSING
-    string: Any = MISSING
-    road: str = MISSING
-    circumference: float | None = None
-    vehicle_length: float = MISSING
-    initial_speed: float = MISSING
-    controllers: dict[str, Any] = field(default_factory=dict)
-    start: dict[str, Any] = field(default_factory=dict)
-    filters: dict[str, Any] = field(default_factory=dict)
-    pieces: dict[str, Any] = field(default_factory=dict)
+    name: str
+    horizon: Million  # steps of an episode
+    time_step: Annotated[float, Field(ge=0.001, le=10.0)]  # [s]
+    string: str | dict[str, Any]  # roles from front to back, see docs/strings.md
+    road: Literal["open", "ring"]
+    circumference: Positive | None = None  # of a ring [m]
+    vehicle_length: Positive  # [m]
+    initial_speed: NonNegative  # on a ring [m/s]
+    controllers: Nodes
+    start: Nodes
+    filters: Nodes
+    pieces: Nodes
 
 
-@dataclass
-class RewardConfig:
+class RewardConfig(Settings):
     """The reward: named terms."""
 
-    terms: dict[str, Any] = field(default_factory=dict)
+    terms: Nodes
 
 
-@dataclass
-class TrainingConfig:
+class TrainingConfig(Settings):
     """Length and bookkeeping of a training; the algorithm's own settings are the agent's."""
 
-    episodes: int = MISSING
-    environments: int = MISSING
-    segment: int = MISSING
-    checkpoint_every: int = MISSING
-    keep_every: int | None = None
+    episodes: Count
+    environments: Count
+    segment: Count
+    checkpoint_every: Count
+    keep_every: Count | None = None
     compiled: bool | None = None
-    collector: str = "string"
-    gap_range: list[float] = MISSING
+    collector: Literal["string", "torchrl"] = "string"
+    gap_range: list[float]
 
 
-@dataclass
-class EvaluationConfig:
+class EvaluationConfig(Settings):
     """Size of an evaluation, and what a row of its table is: an episode or a vehicle."""
 
-    rows: str = MISSING
-    baselines: list[str] = MISSING
-    profiles: int | None = MISSING
-    drivers: int | None = MISSING
-    batch_size: int = MISSING
-    seed: int = MISSING
-    sample_episodes: int = MISSING
-    repeats: int = MISSING
-    shards: int = MISSING
-    shard: int = MISSING
+    rows: Literal["episodes", "vehicles"]
+    baselines: list[str]
+    profiles: Count | None
+    drivers: Count | None
+    batch_size: Count
+    seed: Seed
+    sample_episodes: Annotated[int, Field(ge=0)]
+    repeats: Million
+    shards: Million
+    shard: Annotated[int, Field(ge=0)]
     compiled: bool | None = None
     full_length: bool = False
 
 
-@dataclass
-class StudyConfig:
-    """What every entry point that drives vehicles shares."""
+class BaseConfig(Settings):
+    """What every command shares."""
 
-    variant: str = MISSING
-    seed: int = MISSING
-    device: str = MISSING
-    threads: int = MISSING
-    matmul_precision: str = "highest"
-    data: Any = MISSING
-    drivers: Any = MISSING
-    split: Any = MISSING
-    leader: Any = None
-    energy: Any = None
-    task: Any = None
-    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
-    observation: Any = MISSING
-    reward: RewardConfig = field(default_factory=RewardConfig)
-    agent: Any = MISSING
+    seed: Seed
+    device: str
+    threads: Parallel
+    matmul_precision: Literal["highest", "high", "medium"] = "highest"
+    data: Node
+    figure_formats: list[Format]
+    trust: list[str] = dataclasses.field(default_factory=list)
+
+    def settled(self) -> None:
+        if "png" not in self.figure_formats:
+            raise ConfigError(
+                f"figure_formats must name png, which pages show, got {self.figure_formats}"
+            )
+
+
+class CalibrateConfig(BaseConfig):
+    """``lcc-rl calibrate``."""
+
+    calibration: Node
+
+
+class StudyConfig(BaseConfig):
+    """What every command that drives vehicles shares."""
+
+    variant: str
+    drivers: Node
+    split: Node
+    leader: Node = None
+    energy: Node = None
+    task: dict[str, Any] | None = None
+    scenario: ScenarioConfig
+    observation: Node
+    reward: RewardConfig
+    agent: Node
     gains: Any = None
     # Drives the automated vehicles once the policy is trained; None: the policy itself.
-    deployed: Any = None
+    deployed: Node = None
     # Here, not in TrainConfig, so that one recipe serves every entry point.
-    training: TrainingConfig = field(default_factory=TrainingConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    figure_formats: list[str] = MISSING
-    trust: list[str] = field(default_factory=list)
+    training: TrainingConfig
+    evaluation: EvaluationConfig
+    resume: str | None = None
+    sweep: str | None = None
+    policy: str | None = None
 
 
-@dataclass
 class TrainConfig(StudyConfig):
     """``lcc-rl train``."""
 
-    resume: str | None = None
-    sweep: str | None = None
-    objective: Any = "total_path_energy_kj"
-    policy: str | None = None
-    logger: Any = MISSING
+    objective: str | list[str] = "total_path_energy_kj"
+    logger: Node = None
 
 
-@dataclass
 class EvaluateConfig(StudyConfig):
     """``lcc-rl evaluate``."""
 
-    resume: str | None = None
-    sweep: str | None = None
-    policy: str | None = None
-    compare: list[str] = field(default_factory=list)
+    compare: list[str] = dataclasses.field(default_factory=list)
 
 
-@dataclass
 class PipelineConfig(TrainConfig):
     """``lcc-rl run``."""
 
-    calibration: Any = MISSING
-    variants: list[str] = MISSING
-    jobs: int = MISSING
+    calibration: Node
+    variants: list[str]
+    jobs: Parallel
 
 
-# Ranges of the numbers above; other numbers are checked by the classes that take them.
-RANGES = {
-    "scenario.time_step": "[0.001, 10]",
-    "scenario.circumference": "(0, inf)",
-    "scenario.vehicle_length": "(0, inf)",
-    "scenario.initial_speed": "[0, inf)",
+KINDS: dict[str, type[BaseConfig]] = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "pipeline": PipelineConfig,
+    "calibrate": CalibrateConfig,
 }
-MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
-WHOLE: dict[str, tuple[int, ...]] = {
-    **dict.fromkeys(("seed", "evaluation.seed"), (0, LAST_SEED)),
-    **dict.fromkeys(("threads", "jobs"), (1, MOST_PARALLEL)),
-    "scenario.horizon": (1, 1_000_000),
-    **{
-        f"training.{name}": (1,)
-        for name in ("episodes", "environments", "segment", "checkpoint_every", "keep_every")
-    },
-    **{f"evaluation.{name}": (1,) for name in ("profiles", "drivers", "batch_size")},
-    **{f"evaluation.{name}": (1, 1_000_000) for name in ("repeats", "shards")},
-    **dict.fromkeys(("evaluation.sample_episodes", "evaluation.shard"), (0,)),
+SECTIONS: dict[str, type[Settings]] = {
+    "scenario": ScenarioConfig,
+    "reward": RewardConfig,
+    "training": TrainingConfig,
+    "evaluation": EvaluationConfig,
 }
 
 
-FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
-
-
-def check_formats(formats: Sequence[str]) -> None:
-    """Check the formats in which figures are written.
-
-    Raises:
-        ConfigError: if one is unknown, or the one that pages show is missing.
-    """
-    for name in formats:
-        if name not in FORMATS:
-            raise unknown_name("format (figure_formats)", str(name), FORMATS)
-    if FORMATS[0] not in formats:
-        raise ConfigError(
-            f"figure_formats must name {FORMATS[0]}, which pages show, got {list(formats)}"
-        )
-
-
-def check_ranges(cfg: Any) -> None:
-    """Check that a configuration is whole, its numbers finite, and the schema's in their range.
+def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = None) -> Any:
+    """Return the typed tree of a configuration: the door through which settings come in.
 
     Args:
-        cfg: configuration of an entry point, or a part such as ``{"scenario": …}``.
+        content: a configuration as plain containers.
+        kind: class of the tree; by default the command's that has these settings.
 
     Raises:
-        ConfigError: naming the first key at fault.
+        ConfigError: naming the first setting that is unknown, missing or wrong.
     """
-    try:
-        everything = OmegaConf.to_container(cfg, resolve=True)
-    except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
-        raise ConfigError(" ".join(str(error).split())) from error
-    schema = OmegaConf.get_type(cfg)
-    lacking = [x.name for x in fields(schema) if x.name not in cfg] if is_dataclass(schema) else []
-    # Of an object, who builds it says what it lacks.
-    lacking += [
-        key for key, node, value in settings_at(everything) if value == "???" and TARGET not in node
-    ]
-    if lacking:
-        raise ConfigError(f"{lacking[0]} is required: say {lacking[0]}=…")
-    for key in (*RANGES, *WHOLE):
-        value = OmegaConf.select(cfg, key)
-        if value is None:
-            continue
-        where, _, name = key.rpartition(".")
-        if key in RANGES:
-            require_in(where, RANGES[key], **{name: value})
-        else:
-            require_whole(where, *WHOLE[key], **{name: value})
-    if "figure_formats" in cfg:
-        check_formats(cfg.figure_formats)
-    check_numbers(everything, "")
+    kind = kind or _kind_of(content)
+    check_numbers(content, "")
+    found = with_defaults(content)
+    for key, value in found.items():
+        check_nodes(value, key)
+    for name, section in SECTIONS.items():
+        if name in found:
+            if not isinstance(found[name], Mapping):
+                raise ConfigError(f"{name} must be a mapping of settings, got {found[name]!r}")
+            found[name] = parse(section, found[name], name)
+    return parse(kind, found, "")
 
 
-def register_schemas() -> None:
-    """Make the schemas known to Hydra; each yaml names its own first in its defaults."""
-    store = ConfigStore.instance()
-    for name, schema in (
-        ("train_schema", TrainConfig),
-        ("evaluate_schema", EvaluateConfig),
-        ("pipeline_schema", PipelineConfig),
-    ):
-        store.store(name=name, node=schema)
+def _kind_of(content: Mapping[str, Any]) -> type[BaseConfig]:
+    def misses(kind: type[BaseConfig]) -> int:
+        return len({item.name for item in dataclasses.fields(kind)} ^ set(content))
+
+    return min(KINDS.values(), key=misses)
+
+
+def as_text(cfg: Settings) -> str:
+    """Return a typed tree as the text of a file, see :func:`parse_config`."""
+    return str(yaml.safe_dump(as_plain(cfg), sort_keys=False, allow_unicode=True))
+
+
+def as_plain(cfg: Settings) -> dict[str, Any]:
+    """Return a typed tree as plain containers, as files store it."""
+    return dataclasses.asdict(cfg)  # type: ignore[call-overload]

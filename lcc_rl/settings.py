@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from functools import wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
@@ -84,10 +84,12 @@ def refused(error: ValidationError, kind: type[Settings], where: str) -> ConfigE
     first = error.errors()[0]
     if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
         known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-        return unknown_name(f"setting of {where} ({kind.__name__})", str(first["loc"][-1]), known)
-    key = where + "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
+        what = f"setting of {where} ({kind.__name__})" if where else "option"
+        return unknown_name(what, str(first["loc"][-1]), known)
+    parts = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
+    key = (where + parts).removeprefix(".")
     if first["type"] == "missing" and len(first["loc"]) == 1:
-        return ConfigError(f"{key} is required: say {key}=…")
+        return ConfigError(f"{key} is required: use {key}=…")
     if first["type"] == "value_error":
         return ConfigError(f"{key}: {first['ctx']['error']}")
     return ConfigError(
@@ -99,3 +101,34 @@ def values(settings: Settings) -> dict[str, Any]:
     """Return the settings of an object by name."""
     names = (field.name for field in dataclasses.fields(settings))  # type: ignore[arg-type]
     return {name: getattr(settings, name) for name in names}
+
+
+def defaults(kind: type[Settings]) -> dict[str, Any]:
+    """Return the defaults of a class's settings by name, as plain containers."""
+    found = {}
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        if field.default is not dataclasses.MISSING:
+            found[field.name] = _plain(field.default)
+        elif field.default_factory is not dataclasses.MISSING:
+            found[field.name] = _plain(field.default_factory())
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Settings):
+        return values(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def given_as(kind: type[Settings]) -> Any:
+    """Return the annotation of a setting that has settings itself, given as a mapping."""
+
+    def made(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        try:
+            return kind(**value)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+
+    return Annotated[kind, BeforeValidator(made)]

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 
-from omegaconf import DictConfig
-
 from lcc_rl.config import is_sweep
 from lcc_rl.runs.cli import entry_point, resumed_folder
+from lcc_rl.schemas import TrainConfig
 
 log = logging.getLogger("lcc_rl")
 
 
 @entry_point("train", "lcc_rl.commands.training")
-def main(cfg: DictConfig) -> float | list[float]:
+def main(cfg: TrainConfig) -> float | list[float]:
     """Train into the run's folder; return the objective to a sweeper that optimises."""
     from lcc_rl.commands.training import complete, objective, run  # loads torch
 

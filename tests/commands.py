@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pandas as pd
@@ -23,7 +24,6 @@ import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
@@ -39,7 +39,7 @@ NO_AGENT = ("experiment=smoke", *DATA, HORIZON)
 TINY = (*NO_AGENT, *AGENT)
 
 
-def tiny(entry: str, *overrides: str, agent: bool = True) -> DictConfig:
+def tiny(entry: str, *overrides: str, agent: bool = True) -> Any:
     """Compose an entry point's configuration, shrunk; without the settings of a learning agent."""
     return load(entry, [*(TINY if agent else NO_AGENT), *overrides])
 

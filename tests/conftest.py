@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from composing import composed_once
 from matplotlib.figure import Figure
 from PIL import Image
 from streams import driven_once
@@ -22,8 +21,8 @@ DEFAULT_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 @pytest.fixture(scope="session", autouse=True)
 def work_that_all_tests_share() -> Iterator[None]:
-    """Compose the package's files once for each choice of them, and drive each stream once."""
-    with composed_once(), driven_once():
+    """Drive each synthetic stream once."""
+    with driven_once():
         yield
 
 

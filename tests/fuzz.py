@@ -24,20 +24,20 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from omegaconf import OmegaConf
 
 import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.checks import check_settings
-from lcc_rl.config import build, load
-from lcc_rl.config_checks import string_of_scenario
+from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import constant_profiles
+from lcc_rl.envs.inputs import constant_profiles, string_of
 from lcc_rl.errors import LccError
 from lcc_rl.io import memory
+from lcc_rl.nodes import build
 from lcc_rl.runs.interrupts import SIGNALS
+from lcc_rl.schemas import as_plain
 
 CONF = Path(lcc_rl.conf.__path__[0])
 # Limits of a case; a training or an evaluation may rightly take longer, and is ended sooner.
@@ -48,7 +48,7 @@ DATA = ("data.platoons=2", "data.recordings=2")
 RECIPES = (
     *("+filter=cbf", "+knowledge=memory", "+knowledge=preview", "scenario=ring agent=none"),
     *("agent=td3", "agent=sac", "agent=analytic", "agent=none", "drivers=fixed", "drivers=kde"),
-    *("split=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
+    *("split.by=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
     *("scenario.string=automated*2", "scenario.string={size:6,penetration:0.3}"),
     "controller@scenario.controllers.automated=handover",
 )
@@ -86,7 +86,7 @@ class TooLong(BaseException):
 @cache
 def keys_of(variant: str) -> dict[str, Any]:
     """Return the values of a variant's configuration by dotted keys, those of nodes, too."""
-    cfg = OmegaConf.to_container(load("train", [f"variant={variant}"]), resolve=False)
+    cfg = as_plain(load("train", [f"variant={variant}"]))
     unused = ("data", "split") if "leader" in cfg and cfg["leader"] is not None else ()
     return {
         key: value
@@ -184,10 +184,10 @@ def build_study(overrides: Sequence[str]) -> None:
         build_agent(cfg, bootstrap())
     env.rollout(3)
     for key in ("data", "split", "leader"):
-        if cfg.get(key) is not None:
-            build(cfg[key], key)
-    if cfg.get("leader") is not None:
-        followers = len(string_of_scenario(scenario))
+        if getattr(cfg, key) is not None:
+            build(getattr(cfg, key), key)
+    if cfg.leader is not None:
+        followers = len(string_of(cfg))
         build(cfg.leader, "leader").load(scenario.time_step, scenario.horizon, followers)
 
 

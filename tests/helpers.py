@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from functools import cache
 from typing import Any
 
 import pandas as pd
 import pytest
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
-from lcc_rl.policies import shared_policy
+from lcc_rl.schemas import TrainConfig
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
 VARIANTS = ("alcc", "reference", "own_energy", "cbf", "idm", "direct", *PLATOON)
@@ -66,16 +67,16 @@ def followers(count: int) -> str:
 
 
 @cache
-def _loaded(overrides: tuple[str, ...]) -> DictConfig:
+def _loaded(overrides: tuple[str, ...]) -> TrainConfig:
     return load("train", overrides)
 
 
-def composed(*overrides: str) -> DictConfig:
+def composed(*overrides: str) -> TrainConfig:
     """Compose the configuration of a training; the same one is composed only once."""
-    return _loaded(overrides).copy()
+    return deepcopy(_loaded(overrides))
 
 
-def compose(variant: str = "alcc", *overrides: str) -> DictConfig:
+def compose(variant: str = "alcc", *overrides: str) -> TrainConfig:
     """Compose the configuration of a training with short episodes."""
     return composed(f"variant={variant}", "scenario.horizon=20", *overrides)
 
@@ -102,12 +103,12 @@ def single_env(
     return small_env(variant, batch_size, overrides, seed).append_transform(SingleAgent())
 
 
-def make_agent(cfg: DictConfig) -> Agent:
+def make_agent(cfg: TrainConfig) -> Agent:
     """Build the agent of a configuration for the shipped drivers."""
     return build_agent(cfg, POPULATION)
 
 
-def network(cfg: DictConfig) -> TensorDictBase:
+def network(cfg: TrainConfig) -> TensorDictBase:
     """Return the untrained policy of a configuration, for the group of automated vehicles."""
     return shared_policy(make_agent(cfg).policy)
 

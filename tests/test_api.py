@@ -7,7 +7,6 @@ import pytest
 from commands import TINY
 
 import lcc_rl
-from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
 
 
@@ -30,9 +29,3 @@ def test_runs_controllers_and_baselines_are_compared(run, tmp_path) -> None:
     own = found.rows[found.rows["strategy"] == "alcc"].reset_index(drop=True)
     columns = ["profile_id", "driver_id", "total_energy_kj"]
     pd.testing.assert_frame_equal(own[columns], run.rows[columns])
-
-
-def test_an_unknown_option_is_an_error_before_anything_is_written(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="sede"):
-        lcc_rl.learn("alcc", ["sede=3"], tmp_path / "never")
-    assert not (tmp_path / "never").exists()

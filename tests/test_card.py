@@ -10,10 +10,10 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.envs import Clock
 from lcc_rl.pieces import CACC, NGSIMLeader
 from lcc_rl.pieces.world import World
-from lcc_rl.policies import ControllerPolicy
 from lcc_rl.synthetic.stream import StreamSource
 
 

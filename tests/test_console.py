@@ -44,7 +44,7 @@ def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys) -> None:
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["status", "reproduce", "fetch", "drivers"])
+@pytest.mark.parametrize("name", ["status", "reproduce", "fetch"])
 def test_help_of_a_command_bears_its_name(name, capsys, monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["lcc-rl"])
     monkeypatch.setattr("lcc_rl.runs.interrupts.end_quietly", lambda: None)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import pytest
-from commands import UNTRAINED, run_process, tiny
+from commands import UNTRAINED, tiny
 from helpers import POPULATION, compose, wavy_profiles
 
 from lcc_rl.commands import evaluation
 from lcc_rl.envs import build_env
-from lcc_rl.io.files import read_parquet
 
 MODULE = '''
 import torch
-from lcc_rl.pieces import IDM, Controller, Feature, MotorPower, RewardTerm
+from lcc_rl.pieces import Controller, Feature, MotorPower, RewardTerm
 
 
 class DoublePower(MotorPower):
@@ -20,13 +19,6 @@ class DoublePower(MotorPower):
 
     def compute(self, *entries):
         return 2.0 * super().compute(*entries)
-
-
-class Slow(IDM):
-    """Human drivers at half of what the IDM would do."""
-
-    def command(self, speed, *more):
-        return super().command(0.5 + speed, *more)
 
 
 class KeepDistance(Controller):
@@ -53,7 +45,6 @@ class Kinetic(Feature):
     def compute(self, speed):
         return 0.5 * speed.square()
 '''
-HUMAN = "scenario.controllers.human._target_=own_pieces.Slow"
 POWER = "scenario.pieces.power._target_=own_pieces.DoublePower"
 OWN = "scenario.controllers.automated._target_=own_pieces.KeepDistance"
 
@@ -79,18 +70,6 @@ def test_a_power_model_measures_every_strategy(tmp_path) -> None:
         assert own[name][known].to_numpy() == pytest.approx(2.0 * plain[name][known].to_numpy())
     assert plain.loc[plain["strategy"] == "idm", "cav_energy_kj"].notna().all()
     assert own["min_ttc_s"].equals(plain["min_ttc_s"])
-
-
-@pytest.mark.slow
-def test_a_driver_model_drives_behind_every_strategy(tmp_path) -> None:
-    words = ("variant=alcc", "policy=pretrained")
-    plain, own = rows(tmp_path / "a", *words), rows(tmp_path / "b", *words, HUMAN)
-    for name in (*UNTRAINED, "alcc"):
-        one, two = (x.loc[x["strategy"] == name, "hdv_energy_kj"].mean() for x in (plain, own))
-        assert one != two, name
-    # The automated vehicle of the human baseline is the IDM still.
-    one, two = (x.loc[x["strategy"] == "idm", "cav_energy_kj"].mean() for x in (plain, own))
-    assert one == two
 
 
 def test_a_controller_is_evaluated_beside_the_baselines(tmp_path) -> None:
@@ -120,13 +99,3 @@ def test_a_reward_term_and_an_entry_of_the_observation() -> None:
     )
     kinetic = 0.005 * data["vehicles", "speed"][..., :1, :].square()
     assert ((seen - kinetic).abs() < 1e-6).any(-1).all()
-
-
-@pytest.mark.slow
-def test_the_command_finds_a_module_on_the_path(tmp_path) -> None:
-    words = ["experiment=smoke", "data.platoons=2", "data.recordings=2", "scenario.horizon=40"]
-    words += ["variant=idm", OWN, POWER, HUMAN, "hydra.run.dir=run"]
-    done = run_process("lcc_rl.evaluate", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    found = read_parquet(tmp_path / "run" / "episodes.parquet")
-    assert "keepdistance" in set(found["strategy"])

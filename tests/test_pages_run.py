@@ -29,13 +29,9 @@ NOT_RUN = {
     "export": "of the shell",
     "ls": "of the shell",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
-    "lcc-rl sumo": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
+    "python tools/sumo_ring.py": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
     "lcc-rl animate": "tests/results/test_animation.py runs it",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
-    "python tools/compare_agents.py": "tests/tools/test_compare_agents.py runs it",
-    "python tools/compare_lengths.py": "tests/tools/test_compare_lengths.py runs it",
-    "python tools/compare_launchers.py": "runs of every launcher, of extras",
-    "ray-environment/bin/python": "needs the extra ray",
     "python tools/kill_test.py": "takes an hour",
 }
 # Settings that shrink a command, where they are settings of it.

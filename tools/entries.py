@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 from equations import EQUATIONS, PAPERS
-from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
@@ -24,6 +23,7 @@ from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces import Handover
 from lcc_rl.pieces.base import Key, as_key
 from lcc_rl.pieces.entries import ENTRIES, NAME, ROLE, entry_key
+from lcc_rl.schemas import StudyConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "entries.md"
@@ -45,14 +45,14 @@ refused, unless a whole moment of an episode is given, of which the reset option
 """
 
 
-def configurations() -> Iterator[DictConfig]:
+def configurations() -> Iterator[StudyConfig]:
     """Yield configurations that together write every entry, with sizes that differ."""
     for path in sorted((ROOT / "conf" / "variant").glob("*.yaml")):
         string = "scenario.string=human*5" if path.stem == "direct" else SIZES
         cfg = load("train", [f"variant={path.stem}", string])
         yield cfg
         if cfg.deployed is not None:
-            cfg.scenario.controllers.automated = cfg.deployed
+            cfg.scenario.controllers["automated"] = cfg.deployed
             yield cfg
     knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", *knowledge])

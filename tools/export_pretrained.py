@@ -13,56 +13,44 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from omegaconf import OmegaConf
-
-from lcc_rl.errors import LccError
 from lcc_rl.io.tensors import write_torch
 from lcc_rl.results.policies import load_policy
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.schemas import as_text
 
 LOCAL = ("data", "drivers", "leader", "split", "resume", "policy", "compare")
 FOLDER = Path(__file__).parents[1] / "lcc_rl" / "assets" / "pretrained"
 
 
 def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None = None) -> Path:
-    """Write the policy of a run into the package.
+    """Write the policy of a run into the package; return the file's path.
 
     Args:
         run: a run folder or policy file.
         origin: data, recipe and seed, in a sentence.
         folder: folder of the file.
-        name: of the file, without suffix; None: the variant's.
-
-    Returns:
-        The file's path.
-
-    Raises:
-        ResultsError: if the run holds no policy.
+        name: name of the file, without suffix; None: the variant's.
     """
     weights, cfg = load_policy(run)
-    OmegaConf.set_struct(cfg, False)
     for key in LOCAL:
-        cfg.pop(key, None)
+        setattr(cfg, key, None)
     path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
-    content = {"weights": weights, "config": OmegaConf.to_yaml(cfg), "provenance": provenance}
+    content = {"weights": weights, "config": as_text(cfg), "provenance": provenance}
     write_torch(content, path)
     return path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Export a policy; 1 if the run holds none."""
+    """Export a policy."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", help="run folder or policy.pt")
     parser.add_argument("origin", help="data, recipe and seed, in a sentence")
-    parser.add_argument("--name", help="of the file; by default the variant's")
+    parser.add_argument("--name", help="name of the file; by default the variant's")
     options = parser.parse_args(arguments)
-    try:
-        print(export(options.run, options.origin, name=options.name))
-    except LccError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    print(export(options.run, options.origin, name=options.name))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main_guard(main)())

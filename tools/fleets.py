@@ -13,17 +13,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from leaderboard import task_scores
 from matplotlib.figure import Figure
 
-from lcc_rl.commands.tasks import task_of
-from lcc_rl.config import require
-from lcc_rl.energy import build_energy
 from lcc_rl.envs.inputs import string_of
+from lcc_rl.errors import require
 from lcc_rl.figures.drawing import legend_above, new_figure, save, style
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.runs import load_config
-from lcc_rl.results.scores import scores
 from lcc_rl.runs.cli import main_guard
 
 SHARE, LEARNED = "penetration", "learned"
@@ -49,12 +46,8 @@ SHOWN_AS = {
 
 def scored(run: Path) -> pd.DataFrame:
     """Return the scores of one evaluation, with its share of automated vehicles."""
-    cfg = load_config(run)
-    task = task_of(cfg)
-    require(task is not None and task.name in SHOWN, f"{run}: not of a task {', '.join(SHOWN)}")
-    assert task is not None
-    rows = read_parquet(run / "episodes.parquet")
-    found = scores(rows, task.among(rows["strategy"]), build_energy(cfg))
+    cfg, task, _, found = task_scores(run)
+    require(task.name in SHOWN, f"{run}: an evaluation of {task.name}, not of {', '.join(SHOWN)}")
     found["strategy"] = found["strategy"].astype(str).replace(cfg.variant, LEARNED)
     string = string_of(cfg)
     found.insert(0, SHARE, string.count(AUTOMATED) / len(string))

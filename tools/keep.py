@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.config import require
+from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.runs.cli import main_guard

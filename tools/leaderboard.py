@@ -1,17 +1,18 @@
 """Write the tables of tasks: python tools/leaderboard.py outputs/evaluate/<run>… (docs/tasks.md).
 
-Each run is an evaluation with task=…; its scores, and the time that each strategy takes for a
+Each run is an evaluation with task=…. Its scores, and the time that each strategy takes for a
 decision, measured here for one vehicle, are kept below --reference. Without runs the tables are
-written again from what is kept there.
+written again from the kept scores.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from timeit import repeat
 
 import numpy as np
 import pandas as pd
@@ -20,12 +21,11 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.commands.tasks import task_of
-from lcc_rl.config import require
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.envs.step import entries, pieces_of
-from lcc_rl.errors import LccError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
@@ -33,55 +33,50 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces import Controller
 from lcc_rl.results.runs import load_config
 from lcc_rl.results.scores import LEAST, SHARE, Task, scores
+from lcc_rl.runs.cli import main_guard
+from lcc_rl.schemas import EvaluateConfig
 
 BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
 DECISIONS, WARM_UP = 200, 20
-REFERENCE = "outputs/reference/tasks"
+LIMIT = "limit_"
+REFERENCE, PAGE = Path("outputs/reference/tasks"), Path("docs/tasks.md")
 
 
 def decision_ms(strategy: Strategy, env: TransformedEnv) -> float:
     """Return the median time [ms] that a strategy takes to decide for the vehicles of one string.
 
-    Of a learned policy the network with its TensorDict, of a rule the controller.
+    The time is that of the network with its TensorDict, or of a rule's controller.
     """
     td, policy = env.reset(), strategy.policy
     if policy is not None:
         seen = td.select(*getattr(policy, "in_keys", ()), strict=False)
-
-        def decide() -> object:
-            return policy(seen)
+        decide = partial(policy, seen)
     else:
-        (controller,) = (
-            piece
-            for piece in pieces_of(env)
-            if isinstance(piece, Controller) and piece.role == AUTOMATED
-        )
+        pieces = [x for x in pieces_of(env) if isinstance(x, Controller) and x.role == AUTOMATED]
         moment = entries(td)
-        values = [moment[key] for _, key in controller.needs]
-
-        def decide() -> object:
-            return controller.compute(*values)
-
-    spent = []
+        decide = partial(pieces[0].compute, *(moment[key] for _, key in pieces[0].needs))
     with torch.no_grad():
-        for _ in range(WARM_UP + DECISIONS):
-            begun = time.perf_counter()
-            decide()
-            spent.append(time.perf_counter() - begun)
+        spent = repeat(decide, repeat=WARM_UP + DECISIONS, number=1)
     return float(np.median(spent[WARM_UP:])) * 1e3
 
 
-def scored(folder: Path) -> tuple[Task, pd.DataFrame]:
-    """Return the task of an evaluation and the scores of its strategies.
+def task_scores(folder: Path) -> tuple[EvaluateConfig, Task, pd.DataFrame, pd.DataFrame]:
+    """Return the configuration of an evaluation, its task, its episodes and their scores.
 
     Raises:
-        ConfigError: if it is of no task.
+        ConfigError: if it has no task.
     """
     cfg = load_config(folder)
     task = task_of(cfg)
-    require(task is not None, f"{folder}: an evaluation without task=…")
-    assert task is not None
-    table = scores(read_parquet(folder / "episodes.parquet"), task, build_energy(cfg))
+    if task is None:
+        raise ConfigError(f"{folder}: an evaluation without task=…")
+    rows = read_parquet(folder / "episodes.parquet")
+    return cfg, task, rows, scores(rows, task.among(rows["strategy"]), build_energy(cfg))
+
+
+def scored(folder: Path) -> tuple[str, pd.DataFrame]:
+    """Return the name of an evaluation's task and the scores of its strategies, to be kept."""
+    cfg, task, rows, table = task_scores(folder)
     strategies, inputs = strategies_of(cfg)
     spent = {}
     for strategy in strategies:
@@ -89,87 +84,82 @@ def scored(folder: Path) -> tuple[Task, pd.DataFrame]:
             env = build_env(strategy.cfg, inputs.evaluation, inputs.population, 1, nominal=True)
             spent[strategy.name] = decision_ms(strategy, env)
     table["decision_ms"] = table["strategy"].map(spent)
-    episodes = read_parquet(folder / "episodes.parquet")
-    table["windows"] = episodes["profile_id"].nunique()
-    return task, table
+    table["windows"] = rows["profile_id"].nunique()
+    table = table.assign(**{f"{LIMIT}{key}": value for key, value in task.limits.items()})
+    return task.name, table.assign(score_name=task.score, unit=task.unit, against=task.against)
 
 
 def drawn(task: Task, table: pd.DataFrame) -> str:
     """Return the Markdown table of a task."""
-    head = [
-        "strategy",
-        task.label,
-        f"saved against {task.against}",
-        "distance lost",
-        *(_bound(column, bound) for column, bound in task.limits.items()),
-        "spread at the end",
-        "per decision",
-    ]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    bounds = (bounded(column, bound) for column, bound in task.limits.items())
+    head = ["strategy", task.label, f"saved against {task.against}", "distance lost", *bounds]
+    head += ["spread at the end", "per decision"]
+    lines = [head]
     for row in table.to_dict("records"):
+        name, decision = str(row["strategy"]), row["decision_ms"]
         interval = f"{row['saving']:+.1%} ({row['saving_low']:+.1%} … {row['saving_high']:+.1%})"
         cells = [
-            f"**{row['strategy']}**" if row["kept"] else str(row["strategy"]),
+            f"**{name}**" if row["kept"] else name,
             f"{row['score']:.2f}",
             interval if np.isfinite(row["saving"]) else "",
             f"{row['distance_lost']:+.1%}",
-            *(_value(column, row[column]) for column in task.limits),
+            *(measured(column, row[column]) for column in task.limits),
             f"{row['final_speed_spread_mps']:.2f} m/s",
-            f"{row['decision_ms']:.2f} ms" if np.isfinite(row["decision_ms"]) else "",
+            f"{decision:.2f} ms" if np.isfinite(decision) else "",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    first, *others = ("| " + " | ".join(cells) + " |" for cells in lines)
+    return "\n".join([first, "|" + "---|" * len(head), *others])
 
 
-def _bound(column: str, bound: float) -> str:
+def bounded(column: str, bound: float) -> str:
+    """Return a column and its limit in words."""
     sign = "≥" if column.startswith(LEAST) else "≤"
-    number = f"{bound:.2%}" if column.startswith(SHARE) else f"{bound:g}"
-    return f"{column} {sign} {number}"
+    return f"{column} {sign} " + (f"{bound:.2%}" if column.startswith(SHARE) else f"{bound:g}")
 
 
-def _value(column: str, value: float) -> str:
+def measured(column: str, value: float) -> str:
+    """Return a value of a limited column."""
     if not np.isfinite(value):
         return ""
     return f"{value:.2%}" if column.startswith(SHARE) else f"{value:.2f}"
 
 
+def write_tables(reference: Path, page: Path) -> None:
+    """Write the tables of all kept scores into the page.
+
+    Raises:
+        ConfigError: if the page lacks the marks.
+    """
+    parts = []
+    for path in sorted(reference.glob("*.parquet")):
+        table = read_parquet(path)
+        if "score_name" not in table:  # of fleets
+            continue
+        first = {str(key): value for key, value in table.iloc[0].items()}
+        limits = {x.removeprefix(LIMIT): first[x] for x in first if x.startswith(LIMIT)}
+        task = Task(path.stem, first["score_name"], first["unit"], first["against"], limits)
+        parts.append(f"### {path.stem}\n\n{first['windows']} windows.\n\n{drawn(task, table)}\n")
+    text = page.read_text()
+    require(BEGIN in text and END in text, f"{page}: it lacks the lines {BEGIN} and {END}")
+    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    with atomic_path(page) as part:
+        part.write_text("\n".join([f"{before}{BEGIN}\n", *parts, f"{END}{after}"]))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the tables; 1 where the input is at fault."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
+    """Keep the scores of the runs given and write the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path, help="folders of evaluations with task=…")
     parser.add_argument("--reference", type=Path, default=REFERENCE, help="where scores are kept")
-    parser.add_argument("--page", type=Path, default="docs/tasks.md", help="the page to write into")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the page to write into")
     options = parser.parse_args(arguments)
-    reference, page = Path(options.reference), Path(options.page)
-    try:
-        for folder in options.runs:
-            task, table = scored(folder)
-            kept = table.assign(**{f"limit_{key}": value for key, value in task.limits.items()})
-            kept = kept.assign(score_name=task.score, unit=task.unit, against=task.against)
-            write_parquet(kept, reference / f"{task.name}.parquet")
-        parts = []
-        for path in sorted(reference.glob("*.parquet")):
-            table = read_parquet(path)
-            if "score_name" not in table:  # of fleets, of damping
-                continue
-            found = [name for name in map(str, table.columns) if name.startswith("limit_")]
-            first = table.iloc[0]
-            limits = {name.removeprefix("limit_"): float(first[name]) for name in found}
-            how = (first["score_name"], first["unit"], first["against"], limits)
-            task = Task(path.stem, *how)
-            parts += [f"### {path.stem}\n\n{int(first['windows'])} windows.\n", drawn(task, table)]
-            parts.append("")
-        text = page.read_text()
-        require(BEGIN in text and END in text, f"{page}: it lacks the lines {BEGIN} and {END}")
-        before, _, rest = text.partition(BEGIN)
-        tables = "\n".join(parts)
-        with atomic_path(page) as part:
-            part.write_text(f"{before}{BEGIN}\n\n{tables}\n{END}{rest.partition(END)[2]}")
-    except (LccError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    for folder in options.runs:
+        name, table = scored(folder)
+        write_parquet(table, options.reference / f"{name}.parquet")
+    write_tables(options.reference, options.page)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main_guard(main)())

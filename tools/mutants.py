@@ -21,8 +21,9 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -39,7 +40,7 @@ class Mutant:
 
     Args:
         name: as on the command line.
-        file: where it is made, a module of ``lcc_rl/``; the copy shares ``conf/`` with the tree.
+        file: a module of ``lcc_rl/``; the copy shares ``conf/`` with the tree.
         text: what is replaced; occurs exactly once in the file.
         fault: what replaces it.
         breaks: what is wrong then.
@@ -51,14 +52,10 @@ class Mutant:
     text: str
     fault: str
     breaks: str
-    tests: tuple[str, ...]
+    tests: list[str]
 
     def applied(self, source: str) -> str:
-        """Return the file's content with the fault.
-
-        Raises:
-            ValueError: if the text does not occur exactly once, or the fault changes nothing.
-        """
+        """Return the file's content with the fault."""
         count = source.count(self.text)
         if count != 1 or self.fault == self.text:
             raise ValueError(f"{self.name}: {self.text!r} occurs {count} times in {self.file}")
@@ -67,34 +64,7 @@ class Mutant:
 
 def mutants() -> dict[str, Mutant]:
     """Return the listed faults by name."""
-    listed = tomllib.loads(LIST.read_text())
-    return {
-        name: Mutant(name, **{**entry, "tests": tuple(entry["tests"])})
-        for name, entry in listed.items()
-    }
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What the tests said of a fault.
-
-    Args:
-        name, file, breaks: of the fault.
-        test: the first test that failed; empty if the fault survived.
-        nearest: whether the tests nearest to the fault found it.
-        seconds: time that the tests took [s].
-    """
-
-    name: str
-    file: str
-    breaks: str
-    test: str
-    nearest: bool
-    seconds: float
-
-    def __str__(self) -> str:
-        said = f"caught by {self.test}" if self.test else f"SURVIVED: {self.breaks}"
-        return f"{self.name:<18} {self.seconds:4.0f} s  {said}"
+    return {name: Mutant(name, **entry) for name, entry in tomllib.loads(LIST.read_text()).items()}
 
 
 class Copy:
@@ -118,11 +88,7 @@ class Copy:
         self.environment = {**os.environ, **own}
 
     def first_failure(self, tests: Sequence[str]) -> str:
-        """Run tests until one fails; return its id, or nothing if all pass.
-
-        Raises:
-            RuntimeError: if pytest could not run them, with its last lines.
-        """
+        """Run tests until one fails; return its id, or nothing if all pass."""
         done = subprocess.run(
             [sys.executable, "-m", "pytest", *PYTEST, *tests],
             cwd=self.tree,
@@ -137,42 +103,47 @@ class Copy:
             raise RuntimeError(f"pytest {shlex.join(tests)}: {done.stdout[-2000:]}{done.stderr}")
         return ""
 
-    def judge(self, mutant: Mutant, stages: Sequence[Sequence[str]]) -> Verdict:
-        """Apply a fault, run the tests of each stage until one fails, and take the fault out."""
+    def judge(self, mutant: Mutant, stages: Sequence[Sequence[str]]) -> dict[str, Any]:
+        """Apply a fault, run the tests of each stage until one fails, and take the fault out.
+
+        Returns:
+            The row of the fault: its name, file and effect, the first test that failed (empty if
+            the fault survived), whether a test nearest to it found it, and the seconds.
+        """
         path, begun, test = self.tree / mutant.file, time.monotonic(), ""
         plain = path.read_text()
         path.write_text(mutant.applied(plain))
         try:
             for tests in stages:
-                test = self.first_failure(tests)
-                if test:
-                    break
+                test = test or self.first_failure(tests)
         finally:
             path.write_text(plain)
-        nearest = bool(test) and tests == mutant.tests
-        seconds = time.monotonic() - begun
-        return Verdict(mutant.name, mutant.file, mutant.breaks, test, nearest, seconds)
+        row = {"name": mutant.name, "file": mutant.file, "breaks": mutant.breaks, "test": test}
+        nearest = bool(test) and any(test.startswith(name) for name in mutant.tests)
+        return {**row, "nearest": nearest, "seconds": time.monotonic() - begun}
 
 
 def run(chosen: Sequence[Mutant], tests: Sequence[str] | None, out: Path | None) -> bool:
-    """Judge faults and print the verdicts; return whether all are caught."""
-    verdicts = []
+    """Judge faults and print what caught them; return whether all are caught."""
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
         for mutant in chosen:
-            stages = [mutant.tests, ()] if tests is None else [tests]
-            verdicts.append(copy.judge(mutant, stages))
-            print(verdicts[-1], flush=True)
-        failing = list(dict.fromkeys(verdict.test for verdict in verdicts if verdict.test))
+            row = copy.judge(mutant, [mutant.tests, ()] if tests is None else [tests])
+            result = f"caught by {row['test']}" if row["test"] else f"SURVIVED: {mutant.breaks}"
+            print(f"{mutant.name:<18} {row['seconds']:4.0f} s  {result}", flush=True)
+            rows.append(row)
+        failing = list(dict.fromkeys(row["test"] for row in rows if row["test"]))
         while failing and (test := copy.first_failure(failing)):
             print(f"{test} fails without a fault, too", flush=True)
             failing.remove(test)
-    verdicts = [x if x.test in failing else replace(x, test="") for x in verdicts]
+    table = pd.DataFrame(rows)
+    table["test"] = table["test"].where(table["test"].isin(failing), "")
     if out is not None:
-        pd.DataFrame(map(asdict, verdicts)).to_csv(out, index=False)
-    survivors = [verdict.name for verdict in verdicts if not verdict.test]
-    caught = len(verdicts) - len(survivors)
-    print(f"{caught} of {len(verdicts)} caught", *survivors, sep="; not " if survivors else "")
+        table.to_csv(out, index=False)
+    survivors = table.loc[table["test"] == "", "name"].tolist()
+    caught = f"{len(table) - len(survivors)} of {len(table)} caught"
+    print(caught, *survivors, sep="; not " if survivors else "")
     return not survivors
 
 

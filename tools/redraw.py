@@ -1,8 +1,8 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
-The tables of docs/tasks.md and docs/hcfs.md, docs/reports, and of docs/figures: calibration.png,
-fleets.png, fleets_ring.png, limits.png, record.png and ring.png. The other figures are drawn from
-runs that were not kept, or from recorded data.
+The tables of docs/tasks.md and docs/hcfs.md, docs/reports, and of docs/figures: fleets.png,
+fleets_ring.png, limits.png, record.png and ring.png. The other figures need runs that were not
+kept, recorded data, or tools of earlier commits.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from pathlib import Path
 
 import fleets
 import leaderboard
-from compare_lengths import figure_of_lengths
-from limit_results import figure_of_limits
+import pandas as pd
 from matplotlib.figure import Figure
 
-from lcc_rl.config import build, load, require
+from lcc_rl.config import load
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.figures.drawing import save
+from lcc_rl.figures.drawing import in_words, legend_above, new_figure, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.nodes import build
+from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
 from lcc_rl.runs.cli import main_guard
 from lcc_rl.studies.hcfs import report as hcfs_report
 
@@ -34,6 +35,14 @@ RING = "tasks/ring_steps.parquet"
 SHOWN = ("human", "pi_saturation", "alcc")
 EVERY = 10  # steps between the rows kept
 COLUMNS = ("strategy", "training_seed", "profile", "driver_id", "time_s")
+POLICIES = {
+    "network": ("network", "#0072b2"),
+    "memory": ("network with memory", "#56b4e9"),
+    "preview": ("network with preview", "#009e73"),
+    "idm": ("IDM, by search", "#d55e00"),
+    "idm_gradient": ("IDM, by gradient", "#cc79a7"),
+}
+LINES = {"alcc": "-", "own_energy": "--", "reference": ":"}
 
 
 def keep_ring(run: Path, path: Path) -> None:
@@ -55,10 +64,30 @@ def figure_of_record() -> Figure:
     return record_figure(stretch(used.path, step, used.scale), used.from_s, leaders.cases)
 
 
+def figure_of_limits(windows: pd.DataFrame) -> Figure:
+    """Draw path energy over the share of long time gaps: a dot per training, a line per kind.
+
+    Args:
+        windows: one row per training and held-out window.
+    """
+    figure = new_figure(6.4, 4.2)
+    axes = figure.subplots()
+    for kind, rows in windows.groupby(KINDS, sort=False):
+        variant, policy = map(str, kind)
+        name, hue = POLICIES[policy]
+        line = points(rows).sort_values(SHARE)
+        label = f"{in_words(variant)}, {name}"
+        axes.plot(100.0 * line[SHARE], line[ENERGY], ls=LINES[variant], color=hue, label=label)
+        each = rows.groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
+        axes.plot(100.0 * each[SHARE], each[ENERGY], ".", color=hue, alpha=0.6)
+    legend_above(axes, 2)
+    style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy\n[kJ per episode]")
+    return figure
+
+
 def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     """Write the tables into the page and the figures; return the files written."""
-    code = leaderboard.main(["--reference", str(reference / "tasks"), "--page", str(page)])
-    require(code == 0, "the tables of the tasks could not be written")
+    leaderboard.write_tables(reference / "tasks", page)
     for task in fleets.SHOWN:
         where = ["--reference", str(reference / "tasks"), "--figures", str(figures)]
         fleets.main([task, *where])
@@ -67,9 +96,8 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     assert ring is not None
     save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
     drawn = {
-        "limits.png": figure_of_limits(reference / "limits"),
+        "limits.png": figure_of_limits(read_parquet(reference / "limits" / "windows.parquet")),
         "record.png": figure_of_record(),
-        "calibration.png": figure_of_lengths(read_parquet(reference / "calibration.parquet")),
     }
     for name, figure in drawn.items():
         save(figure, figures / name)

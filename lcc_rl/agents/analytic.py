@@ -9,90 +9,58 @@ et al., "Accelerated policy learning with parallel differentiable simulation", I
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
-from lcc_rl.agents.loop import anneal, check_fraction
-from lcc_rl.agents.simulated import SimulatedAgent, SimulatedSettings
-from lcc_rl.config import require
-from lcc_rl.errors import require_in, require_positive, require_whole
-from lcc_rl.policies.actor import seeded_mlp
-
-
-@dataclass(frozen=True)
-class AnalyticSettings(SimulatedSettings):
-    """Settings of the analytic agent; the layers are those of policy and value network.
-
-    Args:
-        learning_rate: of the policy at the start; it falls along half a cosine.
-        final_lr_fraction: of it that is left at the end.
-        clip_norm: gradients longer than this are shortened to it; through 300 steps of traffic
-            they can become arbitrarily long.
-        gamma: discount.
-        bootstrap: learn a value and add it at the end of every segment; without it the segment is
-            all that counts, and should be the whole episode.
-        value_lr: learning rate of the value network.
-        td_lambda: weight of longer returns in the value's targets, per step.
-        value_every: steps from one moment at which the value is learned to the next; moments a
-            tenth of a second apart tell hardly more than one of them. 1 takes all.
-        tau: share by which the value's target network follows at every update.
-        compiled: compile the step of the simulator; None: where the training is long enough to
-            pay for it. Without a compiler the plain step is used.
-
-    Raises:
-        ConfigError: if a setting is out of range or contradicts another.
-    """
-
-    learning_rate: float = 3e-3
-    final_lr_fraction: float = 0.05
-    clip_norm: float = 1.0
-    gamma: float = 0.998
-    bootstrap: bool = True
-    value_lr: float = 1e-3
-    td_lambda: float = 0.95
-    value_every: int = 5
-    tau: float = 0.05
-    compiled: bool | None = None
-
-    def __post_init__(self) -> None:
-        require_in("agent", "(0, 1]", gamma=self.gamma, tau=self.tau)
-        require_in("agent", "[0, 1]", td_lambda=self.td_lambda)
-        require_whole("agent", 1, value_every=self.value_every)
-        require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
-        require_positive(
-            "agent",
-            learning_rate=self.learning_rate,
-            clip_norm=self.clip_norm,
-            value_lr=self.value_lr,
-        )
-        check_fraction(self.final_lr_fraction)
+from lcc_rl.agents.actor import seeded_mlp
+from lcc_rl.agents.agent import Fraction, Scene, anneal
+from lcc_rl.agents.simulated import SimulatedAgent
+from lcc_rl.errors import require
+from lcc_rl.settings import Count, Positive
 
 
 class Analytic(SimulatedAgent):
-    """A policy, its optimizer, the objective's stand-ins and, where asked for, a value.
+    """A policy, its optimizer, the objective's smooth terms and, if asked for, a value."""
 
-    Arguments as of :class:`lcc_rl.agents.simulated.SimulatedAgent`.
-    """
+    learning_rate: Positive = 3e-3  # of the policy at the start; it falls along half a cosine
+    final_lr_fraction: Fraction = 0.05  # of it that is left at the end
+    # Gradients longer than this are shortened to it; through 300 steps of traffic they can become
+    # arbitrarily long.
+    clip_norm: Positive = 1.0
+    gamma: Fraction = 0.998  # discount
+    # Learn a value and add it at the end of every segment; without it the segment is all that
+    # counts, and should be the whole episode.
+    bootstrap: bool = True
+    value_lr: Positive = 1e-3  # learning rate of the value network
+    td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
+    # Steps between two states at which the value is learned: a tenth of a second apart they tell
+    # hardly more than one of them. 1 takes all.
+    value_every: Count = 5
+    tau: Fraction = 0.05  # share by which the value's target network follows at every update
+    # Compile the step of the simulator; None: if the training is long enough to pay for it.
+    compiled: bool | None = None
 
-    Settings: ClassVar[type[AnalyticSettings]] = AnalyticSettings
+    def settled(self) -> None:
+        require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
 
-    def _prepare(self, size: int) -> None:
-        own, seed = self.settings, self.seed + 1
-        self.value = seeded_mlp(size, 1, own.hidden, seed).to(self.device)
-        self.target = seeded_mlp(size, 1, own.hidden, seed).to(self.device)
+    def setup(self, scene: Scene) -> None:
+        super().setup(scene)
+        size, seed = scene.observation_size, scene.seed + 1
+        self.value = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
+        self.target = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
         self.optimizer = torch.optim.Adam(
             [entry for entry in self.policy.parameters() if entry.requires_grad],
-            lr=own.learning_rate,
+            lr=self.learning_rate,
             betas=(0.9, 0.99),
         )
-        self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=own.value_lr)
+        self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=self.value_lr)
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""
-        return anneal([self.optimizer], share, self.settings.final_lr_fraction)
+        return anneal([self.optimizer], share, self.final_lr_fraction)
 
     def update(self, rewards: Tensor, running: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Take one gradient step on the policy, and one on the value where it is learned.
@@ -107,29 +75,29 @@ class Analytic(SimulatedAgent):
             The loss and the length of its gradient before clipping, and the value's loss.
         """
         steps = rewards.shape[1]
-        discounts = self.settings.gamma ** torch.arange(steps, device=rewards.device)
+        discounts = self.gamma ** torch.arange(steps, device=rewards.device)
         returns = (rewards * discounts.unsqueeze(-1)).sum(1)
-        if self.settings.bootstrap:
+        if self.bootstrap:
             last = self.target(observation[:, -1]).squeeze(-1) * running[:, -1]
-            returns = returns + self.settings.gamma**steps * last
+            returns = returns + self.gamma**steps * last
         loss = -returns.mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.clip_norm)
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.clip_norm)
         # A step along a gradient that is not a number would destroy the weights for good.
         if bool(torch.isfinite(norm)):
             self.optimizer.step()
         result = {"loss_actor": loss.detach(), "gradient_norm": norm.detach()}
-        if self.settings.bootstrap:
+        if self.bootstrap:
             result["loss_value"] = self._fit(rewards.detach(), running, observation.detach())
         return result
 
     def _fit(self, rewards: Tensor, running: Tensor, observation: Tensor) -> Tensor:
         """Take one step of the value towards the λ-returns of a segment and move its target."""
-        own, steps = self.settings, rewards.shape[1]
-        begins = range(0, steps, own.value_every)
+        steps = rewards.shape[1]
+        begins = range(0, steps, self.value_every)
         ends = [*begins[1:], steps]
-        gamma = own.gamma ** torch.arange(own.value_every, device=rewards.device).unsqueeze(-1)
+        gamma = self.gamma ** torch.arange(self.value_every, device=rewards.device).unsqueeze(-1)
         with torch.no_grad():
             after = running[:, [end - 1 for end in ends]]
             ahead = self.target(observation[:, ends]).squeeze(-1) * after
@@ -137,13 +105,13 @@ class Analytic(SimulatedAgent):
             for place in range(len(ends) - 1, -1, -1):
                 begin, end = begins[place], ends[place]
                 length = end - begin
-                mixed = torch.lerp(ahead[:, place], future, own.td_lambda**length)
+                mixed = torch.lerp(ahead[:, place], future, self.td_lambda**length)
                 reward = (rewards[:, begin:end] * gamma[:length]).sum(1)
-                future = reward + own.gamma**length * mixed * after[:, place]
+                future = reward + self.gamma**length * mixed * after[:, place]
                 wanted[:, place] = future
         # What follows a collision is no state of any episode.
         begun = torch.cat([torch.ones_like(running[:, :1]), after[:, :-1]], 1)
-        seen = observation[:, : steps : own.value_every]
+        seen = observation[:, : steps : self.value_every]
         error = (self.value(seen).squeeze(-1) - wanted) * begun
         loss = error.square().mean()
         self.value_optimizer.zero_grad(set_to_none=True)
@@ -152,7 +120,7 @@ class Analytic(SimulatedAgent):
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.value.parameters(), strict=True)
             for target, online in pairs:
-                target.lerp_(online, self.settings.tau)
+                target.lerp_(online, self.tau)
         return loss.detach()
 
     def state_dict(self) -> dict[str, Any]:
@@ -166,7 +134,7 @@ class Analytic(SimulatedAgent):
 
     def _parts(self) -> dict[str, Any]:
         own = {"policy": self.policy, "optimizer": self.optimizer, "limits": self.objective.limits}
-        if self.settings.bootstrap:
+        if self.bootstrap:
             learned = (self.value, self.target, self.value_optimizer)
             own |= dict(zip(("value", "target", "value_optimizer"), learned, strict=True))
         return own

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from lcc_rl.envs.finite import ACTION, EPISODE, Written, check_moment
+from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.errors import Diverged
-from lcc_rl.functional.finite import any_lost, lost_weight
-from lcc_rl.pieces.base import STEP, Key, Piece, as_key, next_key
+from lcc_rl.functional.finite import lost_weight
+from lcc_rl.pieces.base import NEXT, as_key, root_key
 
 
 def check_learner(
@@ -37,34 +37,20 @@ def check_learner(
         raise Diverged(f"the policy's weight {found} became no number", advice)
 
 
-def check_batch(
-    batch: TensorDictBase, pieces: Sequence[Piece], begun: int = 0, who: str = ""
-) -> None:
+def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
     """Check that transitions are numbers, before anything is learned from them.
-
-    One sum per entry; only where that is lost, the first cause is looked for.
 
     Args:
         batch: ``[environments, steps]``.
-        pieces: the environment's.
-        begun: steps played before the batch, for batches that do not hold the steps themselves.
+        begun: steps played before the batch.
         who: who drives, for the message.
 
     Raises:
         Diverged: naming the first entry that is not a number, its step and its episode.
     """
-    if not any_lost(batch.values(True, True)):
-        return
-    writers = {key: piece for piece in pieces for key in piece.targets}
-    found = {as_key(name): entry.detach() for name, entry in batch.items(True, True)}
-    for step in range(batch.shape[1]):
-        now = {key: entry[:, step] for key, entry in found.items()}
-        count = torch.full((len(batch), 1), begun + step, device=batch.device)
-        moment: dict[Key, Tensor] = {STEP: count, **{k: now[k] for k in EPISODE if k in now}}
-        left = [Written(key, now[key], piece) for key, piece in writers.items() if key in now]
-        reached = [Written(ACTION, now[ACTION])] if ACTION in now else []
-        after = [(key, next_key(key)) for key in writers]
-        reached += [Written(key, now[late], writers[key]) for key, late in after if late in now]
-        running = torch.ones_like(count, dtype=torch.bool)
-        check_moment(left, moment, running, pieces, who)
-        check_moment(reached, {**moment, STEP: moment[STEP] + 1}, running, pieces, who)
+    known = {as_key(key): value.detach() for key, value in batch.items(True, True)}
+    # The moment left is the one that the step before reached.
+    keys = [ACTION, *(key for key in known if key[0] == NEXT and root_key(key) != ACTION)]
+    entries = {root_key(key): known[key].transpose(0, 1) for key in keys if key in known}
+    running = torch.ones((*batch.shape[1::-1], 1), dtype=torch.bool, device=batch.device)
+    check_numbers(entries, running, begun + 1, who)

@@ -2,94 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import field
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import DDPGLoss
 
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.fused import FusedUpdate
-from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings, leaves
-from lcc_rl.errors import ConfigError, require_whole
-
-
-@dataclass(frozen=True)
-class DDPGSettings(OffPolicySettings):
-    """Settings of DDPG.
-
-    Args:
-        fused: compute the update with its gradient written out, which gives the numbers of
-            TorchRL's ``DDPGLoss`` up to rounding at up to twice the speed; False uses the loss
-            itself.
-        target_every: updates between two steps of each target network towards its own; with
-            ``tau`` 1 a step is a copy.
-        mask_terminal: no value is expected after a collision; False expects one there, too.
-
-    Raises:
-        ConfigError: if a setting is out of range or contradicts another.
-    """
-
-    fused: bool = True
-    target_every: Mapping[str, int] = field(default_factory=lambda: {"actor": 1, "critic": 1})
-    mask_terminal: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if set(self.target_every) != {"actor", "critic"}:
-            raise ConfigError(
-                "agent.target_every must have the entries actor and critic, got "
-                f"{', '.join(self.target_every) or 'none'}"
-            )
-        require_whole("agent.target_every", 1, **self.target_every)
+from lcc_rl.agents.off_policy import OffPolicy, leaves
+from lcc_rl.settings import Count
 
 
 class DDPG(OffPolicy):
-    """Actor, critic, their target networks and one optimizer of both (A7–A9, HCFS H7–H10).
+    """Actor, critic, their target networks and one optimizer of both (A7–A9, HCFS H7–H10)."""
 
-    Args:
-        observation_size, action_size, seed, settings, device: see
-            :class:`lcc_rl.agents.off_policy.OffPolicy`.
-    """
+    # Compute the update with its gradient written out, which gives the numbers of TorchRL's
+    # DDPGLoss up to rounding at up to twice the speed; False uses the loss itself.
+    fused: bool = True
+    # Updates between two steps of each target network; with tau 1 a step is a copy.
+    target_every: dict[Literal["actor", "critic"], Count] = field(
+        default_factory=lambda: {"actor": 1, "critic": 1}
+    )
+    mask_terminal: bool = True  # no value is expected after a collision; False: one is
 
-    Settings: ClassVar[type[OffPolicySettings]] = DDPGSettings
-
-    def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        seed: int,
-        settings: DDPGSettings | None = None,
-        device: str = "cpu",
-    ) -> None:
-        super().__init__(observation_size, action_size, seed, settings, device)
+    def setup(self, scene: Scene) -> None:
+        super().setup(scene)
         loss = DDPGLoss(
             self.policy, self.values[0], loss_function="l2", delay_actor=True, delay_value=True
         )
         self._complete(loss, "value_network_params", ("actor", "value"))
-        self.fused: FusedUpdate | None = None
-        if self.settings.fused:
-            self.fused = FusedUpdate(
+        self.update_both: FusedUpdate | None = None
+        if self.fused:
+            self.update_both = FusedUpdate(
                 leaves(loss.actor_network_params),
                 leaves(loss.value_network_params),
                 leaves(loss.target_actor_network_params),
                 leaves(loss.target_value_network_params),
-                self.settings,
+                self,
             )
-            self.optimizers = {"both": self.fused.optimizer}
+            self.optimizers = {"both": self.update_both.optimizer}
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         self.count += 1
-        if not self.settings.mask_terminal:
+        if not self.mask_terminal:
             batch = batch.clone(False)
             ended = batch["next", "terminated"]
             batch["next", "terminated"] = torch.zeros_like(ended)
-        every = self.settings.target_every
+        every = self.target_every
         due = (self.count % every["actor"] == 0, self.count % every["critic"] == 0)
-        if self.fused is not None:
-            loss_actor, loss_value = self.fused(batch, due)
+        if self.update_both is not None:
+            loss_actor, loss_value = self.update_both(batch, due)
             return {"loss_actor": loss_actor, "loss_value": loss_value}
         losses = self.loss(batch)
         # Only these two: the other entries of TorchRL's result are not losses, and one of them

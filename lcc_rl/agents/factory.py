@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
+from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
-from lcc_rl.agents.loop import Agent, TrainingLoop
+from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.replay import Trainer
 from lcc_rl.agents.tuned import SearchLoop, Tuned
-from lcc_rl.config import build_as, identity, short_name
+from lcc_rl.config import identity
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
+from lcc_rl.envs.factory import world_of
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces import Piece
+from lcc_rl.nodes import TARGET, build, short_name
+from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.pieces.world import World
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import StudyConfig
 
 
-def learns(cfg: DictConfig) -> bool:
+def learns(cfg: StudyConfig) -> bool:
     """Whether anything is learned: the configuration has an agent."""
-    return isinstance(cfg.agent, Mapping | DictConfig) and TARGET in cfg.agent
+    return cfg.agent is not None
 
 
-def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") -> Agent:
+def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -> Agent:
     """Build the agent of a configuration.
 
     Raises:
@@ -43,33 +41,21 @@ def build_agent(cfg: DictConfig, population: Population, device: str = "cpu") ->
     if not string.count(AUTOMATED):
         raise ConfigError(
             f"scenario.string={cfg.scenario.string}: nobody is automated, so nothing can be "
-            "learned; say agent=none to evaluate it"
+            "learned; use agent=none to evaluate it"
         )
-    observation = build_as("a piece", Piece, cfg.observation, "observation", world=World(string))
+    world = world_of(cfg, population=population)
+    observation = build(cfg.observation, "observation", Observation, world=world)
     driver = cfg.scenario.controllers.get(AUTOMATED) or {}
-    # The acceleration of action 1, where the vehicles are driven by actions.
-    limits = {key: driver[key] for key in ("max_acceleration",) if key in driver}
-    agent: Agent = build_as(
-        "an agent",
-        ("policy", "anneal", "load_state_dict"),
-        cfg.agent,
-        "agent",
-        population=population,
-        observation=observation,
-        **limits,
-        observation_size=observation.event_shape[-1],
-        action_size=1,
-        seed=cfg.seed,
-        time_step=cfg.scenario.time_step,
-        string=string,
-        energy=build_energy(cfg),
-        device=device,
-    )
-    return agent
+    # The acceleration of action 1, if actions drive the vehicles.
+    limit = {key: driver[key] for key in ("max_acceleration",) if key in driver}
+    size = observation.event_shape[-1]
+    scene = Scene(size, cfg.seed, device, world, observation, **limit)
+    agent: Agent = build(cfg.agent, "agent", Agent)
+    return agent.start(scene)
 
 
 def make_trainer(
-    cfg: DictConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
+    cfg: StudyConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
 ) -> TrainingLoop:
     """Build the training loop of an agent with its environment.
 
@@ -78,7 +64,7 @@ def make_trainer(
     """
     env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
     if not list(env.full_action_spec.keys(True, True)):
-        kind = short_name(cfg.scenario.controllers.automated.get(TARGET))
+        kind = short_name(cfg.scenario.controllers[AUTOMATED].get(TARGET))
         raise ConfigError(
             f"scenario.controllers.automated ({kind}) takes no action of a policy, so nothing can "
             "be learned; say agent=none, or leave the controller out"
@@ -87,3 +73,27 @@ def make_trainer(
     loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
     return trained
+
+
+def check_lengths(cfg: StudyConfig) -> None:
+    """Check that the length of a training and those of its parts go together.
+
+    Raises:
+        ConfigError: naming the two that do not.
+    """
+    settings, horizon = cfg.training, cfg.scenario.horizon
+    require(
+        settings.episodes % settings.environments == 0,
+        f"training.episodes ({settings.episodes}) must be a multiple of training.environments "
+        f"({settings.environments})",
+    )
+    require(
+        horizon % settings.segment == 0,
+        f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})",
+    )
+    window, count = cfg.agent.get("best_window") or 0, settings.environments
+    require(
+        window % count == 0 and window <= settings.episodes,
+        f"agent.best_window ({window}) must be a multiple of training.environments ({count}) and "
+        f"at most training.episodes ({settings.episodes}), or null: the last policy is kept",
+    )

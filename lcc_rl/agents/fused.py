@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.agents.off_policy import OffPolicySettings
+from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.agents.vectors import join, take_step, vector_adam, views
 
 Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, the same transposed, biases
@@ -107,7 +107,7 @@ class FusedUpdate:
         critic: Sequence[Tensor],
         target_actor: Sequence[Tensor],
         target_critic: Sequence[Tensor],
-        settings: OffPolicySettings,
+        settings: OffPolicy,
     ) -> None:
         self.gamma, self.tau = settings.gamma, settings.tau
         self.saturation = settings.saturation

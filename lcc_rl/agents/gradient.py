@@ -10,12 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.agents.loop import REPORTED, derived_seed, episode_statistics
+from lcc_rl.agents.loop import REPORTED, episode_statistics
 from lcc_rl.agents.simulated import SimulatedLoop
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
-from lcc_rl.envs.step import pieces_of
 from lcc_rl.pieces.base import next_key
 
 log = logging.getLogger("lcc_rl")
@@ -36,16 +36,16 @@ class GradientTrainer(SimulatedLoop[Analytic]):
 
     def _prepare(self) -> None:
         super()._prepare()
-        if not self.agent.settings.bootstrap and self.settings.segment < self.horizon:
+        if not self.agent.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
-                "say training.segment=%d for the gradient of whole episodes",
+                "use training.segment=%d for the gradient of whole episodes",
                 self.settings.segment,
                 self.horizon,
             )
 
     def _source(self) -> DifferentiableRollout:
-        compiled = self.agent.settings.compiled
+        compiled = self.agent.compiled
         if compiled is None:
             compiled = self.settings.compiled
         if compiled is None:
@@ -64,7 +64,7 @@ class GradientTrainer(SimulatedLoop[Analytic]):
             begun = time.perf_counter()
             state, record = source.play(state, self.agent.policy.module, self.settings.segment)
             data = source.assemble(record)
-            check_batch(data, pieces_of(self.env))
+            check_batch(data)
             collected = time.perf_counter()
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)

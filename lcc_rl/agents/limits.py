@@ -1,4 +1,4 @@
-"""Limits of a training: their prices are learned until they are kept, no dearer than needed.
+"""Limits of a training: prices rise until the limits hold, and no further.
 
 A limit is a share of the time that must not be exceeded. Its smooth stand-in, which has a gradient,
 is priced by a multiplier; the multiplier follows the share that is really missed (a proxy
@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_in, require_positive
+from lcc_rl.errors import ConfigError
 
 LEAST = 1e-3  # a limit of zero is approached as if it were this share
 
@@ -29,27 +29,24 @@ class Limits:
         known: the names that there are.
 
     Raises:
-        ConfigError: if a name is unknown or of a term without weight, a share lies outside 0…1
-            or the rate is not positive.
+        ConfigError: if a name is unknown, or of a term without weight.
     """
 
     def __init__(
         self, largest: Mapping[str, float | None], rate: float, known: Mapping[str, object]
     ) -> None:
         self.largest = {name: share for name, share in largest.items() if share is not None}
-        for name, share in self.largest.items():
+        for name in self.largest:
             if name not in known:
                 raise ConfigError(f"agent.limits.{name}: there is no agent.surrogates.{name}")
             if not hasattr(known[name], "missed"):
                 kind = type(known[name]).__name__
                 raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")
-            require_in("agent.limits", "[0, 1)", **{name: share})
             if not known[name].weight:  # type: ignore[attr-defined]
                 raise ConfigError(
                     f"agent.limits.{name}: agent.surrogates.{name}.weight is 0, which no price "
-                    f"can change; raise it, or say agent.limits.{name}=null"
+                    f"can change; raise it, or use agent.limits.{name}=null"
                 )
-        require_positive("agent", limit_rate=rate)
         self.rate = rate
         self.logarithms = dict.fromkeys(self.largest, 0.0)
 

@@ -7,24 +7,21 @@ counter, and a resumed training equals one that never stopped, bit for bit.
 
 from __future__ import annotations
 
-import hashlib
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import pandas as pd
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.checks import check_learner
-from lcc_rl.agents.sizes import check_length
 from lcc_rl.agents.vectors import denormals_flushed
-from lcc_rl.errors import Diverged, Interrupted, ResultsError, require_in
+from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.pieces.rewards import REWARD, TERMS
@@ -34,59 +31,6 @@ from lcc_rl.schemas import TrainingConfig
 
 # What the record of an iteration is made from.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
-
-
-def derived_seed(*parts: object) -> int:
-    """Return a seed that depends on all parts; distinct purposes get independent streams."""
-    digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
-    return int.from_bytes(digest[:4], "big") >> 1
-
-
-def check_fraction(final_lr_fraction: float) -> None:
-    """Check the fraction of learning rates at the end, see :func:`anneal`.
-
-    Raises:
-        ConfigError: if it is out of range.
-    """
-    require_in("agent", "(0, 1]", final_lr_fraction=final_lr_fraction)
-
-
-def anneal(
-    optimizers: Iterable[torch.optim.Optimizer], share: float, final_lr_fraction: float
-) -> float:
-    """Let learning rates fall along half a cosine, from what they are made with to a share of it.
-
-    Args:
-        optimizers: whose rates to set.
-        share: how much of the training is over.
-        final_lr_fraction: of the rate at the start, at the end; 1 for a constant rate.
-
-    Returns:
-        The first rate.
-    """
-    factor = final_lr_fraction + (1.0 - final_lr_fraction) * 0.5 * (1.0 + math.cos(math.pi * share))
-    groups = [group for optimizer in optimizers for group in optimizer.param_groups]
-    for group in groups:
-        group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
-    return float(groups[0]["lr"])
-
-
-class Agent(Protocol):
-    """What learns: a policy and all that a training of it needs.
-
-    ``policy`` reads ``"observation"`` and writes ``"action"``.
-    """
-
-    policy: TensorDictModule
-
-    def anneal(self, share: float) -> float:
-        """Set the learning rates after this share of the training; return the policy's."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
 
 
 AgentT = TypeVar("AgentT", bound=Agent)
@@ -102,9 +46,6 @@ class TrainingLoop(ABC, Generic[AgentT]):
         seed: seed of everything random.
         folder: where training.parquet, timing.parquet, checkpoint.pt and progress.json go.
         identity: hash of the configuration; a checkpoint of another one is refused.
-
-    Raises:
-        ConfigError: if the settings contradict each other.
     """
 
     advice: ClassVar[str]  # what to do when the training diverges
@@ -120,7 +61,6 @@ class TrainingLoop(ABC, Generic[AgentT]):
         identity: str,
     ) -> None:
         self.horizon = env.base_env.horizon
-        check_length(settings, self.horizon)
         self.keep_every = settings.keep_every
         self.agent, self.env, self.settings = agent, env, settings
         self.seed, self.folder, self.identity = seed, folder, identity

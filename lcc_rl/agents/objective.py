@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.limits import Limits
-from lcc_rl.config import build
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_lost
+from lcc_rl.nodes import build
 from lcc_rl.pieces.base import Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
@@ -23,7 +23,7 @@ class Objective:
 
     Args:
         settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
-            :class:`lcc_rl.agents.simulated.SimulatedSettings`.
+            :class:`lcc_rl.agents.simulated.SimulatedAgent`.
         device: where the terms compute.
         world: what the terms share.
 
@@ -34,7 +34,7 @@ class Objective:
     def __init__(self, settings: Any, device: str, world: World) -> None:
         def made(where: str) -> dict[str, RewardTerm]:
             return {
-                name: build(node, f"agent.{where}.{name}", world, name).to(device)
+                name: build(node, f"agent.{where}.{name}", world=world, name=name).to(device)
                 for name, node in getattr(settings, where).items()
                 if node is not None
             }

@@ -2,57 +2,42 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from dataclasses import field
+from typing import Annotated, Any, ClassVar
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from lcc_rl.agents.loop import anneal, check_fraction, derived_seed
+from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
+from lcc_rl.agents.agent import Agent, Fraction, Scene, Whole, anneal, derived_seed
 from lcc_rl.agents.vectors import join, take_step, vector_adam, views
-from lcc_rl.errors import ConfigError, require_in, require_positive, require_whole, unknown_name
-from lcc_rl.policies import GaussianExploration
-from lcc_rl.policies.actor import make_actor, seeded_mlp
+from lcc_rl.errors import ConfigError
+from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, given_as
 
 
-@dataclass(frozen=True)
-class Exploration:
-    """Schedule of the exploration noise: falls linearly, or by a factor at every update.
+class Exploration(Settings):
+    """Schedule of the exploration noise: falls linearly, or by a factor at every update."""
 
-    Args:
-        initial: standard deviation at the first episode, where the action's range is [-1, 1].
-        final: after the decay.
-        decay_share: share of the training over which it falls linearly; None: see next.
-        decay_per_update: factor of every update, down to ``final``; None: falls linearly.
+    initial: NonNegative = 0.4  # standard deviation at the first episode; actions lie in [-1, 1]
+    final: NonNegative = 0.05  # after the decay
+    decay_share: Fraction | None = 0.5  # share of the training over which it falls linearly
+    decay_per_update: Fraction | None = None  # instead: factor of every update, down to final
 
-    Raises:
-        ConfigError: if a value is out of range, or both or neither decay is given.
-    """
-
-    initial: float = 0.4
-    final: float = 0.05
-    decay_share: float | None = 0.5
-    decay_per_update: float | None = None
-
-    def __post_init__(self) -> None:
-        where = "agent.exploration"
-        require_in(where, "[0, inf)", initial=self.initial, final=self.final)
+    def settled(self) -> None:
         if (self.decay_share is None) == (self.decay_per_update is None):
             raise ConfigError(
-                f"{where}: give either decay_share or decay_per_update, and null for the other"
+                "agent.exploration: give either decay_share or decay_per_update, and null for the "
+                "other"
             )
-        if self.decay_share is not None:
-            require_in(where, "(0, 1]", decay_share=self.decay_share)
-        if self.decay_per_update is not None:
-            require_in(where, "(0, 1]", decay_per_update=self.decay_per_update)
 
     def sigma(self, share: float, updates: int = 0) -> float:
         """Return the standard deviation after this share of the training and these updates."""
@@ -62,117 +47,49 @@ class Exploration:
         return self.initial + (self.final - self.initial) * min(share / self.decay_share, 1.0)
 
 
-@dataclass(frozen=True)
-class OffPolicySettings:
-    """Settings that all agents with a replay buffer share; conf/agent holds their values.
+class OffPolicy(Agent):
+    """A policy, its Q networks, their loss and optimizers; a subclass says what an update is."""
 
-    Args:
-        gamma: discount.
-        hidden: sizes of the ReLU layers of policy and Q networks.
-        actor_lr: learning rate of the policy.
-        critic_lr: learning rate of the Q networks.
-        batch_size: transitions per update.
-        buffer_size: transitions that the replay buffer holds.
-        tau: share by which the target networks follow at every update.
-        saturation: weight of a penalty on the square of the actor's output before its tanh; 0 is
-            the literal algorithm. Without it some seeds brake fully for ever: where every action
-            leads to the same end, nothing else draws the actor back from the tanh's flat part.
-        final_lr_fraction: of the learning rates at the end; they fall to it along half a cosine.
-            1 is the literal algorithm, whose policy keeps swinging until it stops.
-        updates_per_transition: updates per collected transition.
-        learning_starts: transitions in the buffer before the first update; at least one batch.
-        best_window: episodes whose mean reward rates the policy; the best one becomes the run's.
-            None: the last one does.
-        exploration: schedule of the exploration, see :class:`Exploration`.
+    gamma: Share = 0.9  # discount
+    hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of policy and Q networks
+    actor_lr: Positive = 1e-3  # learning rate of the policy
+    critic_lr: Positive = 1e-3  # learning rate of the Q networks
+    batch_size: Count = 1024  # transitions per update
+    buffer_size: Count = 20_000  # transitions that the replay buffer holds
+    tau: Fraction = 0.005  # share by which the targets follow at an update; the paper is silent
+    # Weight of a penalty on the square of the actor's output before its tanh; 0 is the literal
+    # algorithm. Without it some seeds brake fully for ever: where every action leads to the same
+    # end, nothing else draws the actor back from the tanh's flat part.
+    saturation: NonNegative = 0.001
+    # Of the learning rates at the end; they fall to it along half a cosine. 1 is the literal
+    # algorithm, whose policy keeps swinging until it stops.
+    final_lr_fraction: Fraction = 0.05
+    # Updates per collected transition; the paper is silent. Many more would never end.
+    updates_per_transition: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.125
+    learning_starts: Whole = 0  # transitions in the buffer before the first update
+    # Episodes whose mean reward rates the policy; the best one becomes the run's. None: the last.
+    best_window: Count | None = None
+    exploration: given_as(Exploration) = field(default_factory=Exploration)  # type: ignore[valid-type]
 
-    Raises:
-        ConfigError: if a setting is out of range or contradicts another.
-    """
-
-    gamma: float = 0.9
-    hidden: Sequence[int] = (200, 100, 50)
-    actor_lr: float = 1e-3
-    critic_lr: float = 1e-3
-    batch_size: int = 1024
-    buffer_size: int = 20000
-    tau: float = 0.005
-    saturation: float = 0.001
-    final_lr_fraction: float = 0.05
-    updates_per_transition: float = 0.125
-    learning_starts: int = 0
-    best_window: int | None = None
-    exploration: Mapping[str, float | None] = field(
-        default_factory=lambda: {
-            "initial": 0.4,
-            "final": 0.05,
-            "decay_share": 0.5,
-            "decay_per_update": None,
-        }
-    )
-
-    def __post_init__(self) -> None:
-        require_in("agent", "[0, 1)", gamma=self.gamma)
-        require_in("agent", "(0, 1]", tau=self.tau)
-        if not 0 < self.batch_size <= self.buffer_size:
-            raise ConfigError(
-                f"agent.batch_size ({self.batch_size}) must be positive and at most "
-                f"agent.buffer_size ({self.buffer_size})"
-            )
-        require_in("agent", "[0, inf)", saturation=self.saturation)
-        check_fraction(self.final_lr_fraction)
-        # Far more updates than that would be a training without end.
-        require_in("agent", "(0, 1000]", updates_per_transition=self.updates_per_transition)
-        if not 0 <= self.learning_starts <= self.buffer_size:
-            raise ConfigError(
-                f"agent.learning_starts ({self.learning_starts}) must be between 0 and "
-                f"agent.buffer_size ({self.buffer_size}), or nothing is ever learned"
-            )
-        if self.best_window is not None:
-            require_whole("agent", 1, best_window=self.best_window)
-        require_positive("agent", actor_lr=self.actor_lr, critic_lr=self.critic_lr)
-        known = [item.name for item in fields(Exploration)]
-        for key in self.exploration:
-            if key not in known:
-                raise unknown_name("setting of agent.exploration", key, known)
-
-
-class OffPolicy(ABC):
-    """A policy, its Q networks, their loss and optimizers; a subclass says what an update is.
-
-    Args:
-        observation_size: entries of the observation.
-        action_size: entries of the action.
-        seed: seed of the initial weights.
-        settings: see :class:`OffPolicySettings`; None for its defaults.
-        device: where the networks live.
-
-    Raises:
-        ConfigError: if a setting is out of range or contradicts another.
-    """
-
-    Settings: ClassVar[type[OffPolicySettings]] = OffPolicySettings
     critics: ClassVar[int] = 1
 
-    def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        seed: int,
-        settings: Any = None,
-        device: str = "cpu",
-    ) -> None:
-        self.settings: Any = self.Settings() if settings is None else settings
-        self.seed, self.device, self.count = seed, device, 0
-        self.exploration = Exploration(**self.settings.exploration)
-        hidden = self.settings.hidden
-        self.policy: TensorDictModule = make_actor(observation_size, action_size, hidden, seed).to(
-            device
-        )
+    def settled(self) -> None:
+        for name in ("batch_size", "learning_starts"):
+            if getattr(self, name) > self.buffer_size:
+                raise ConfigError(
+                    f"agent.{name} ({getattr(self, name)}) must be at most agent.buffer_size "
+                    f"({self.buffer_size}), or nothing is ever learned"
+                )
+
+    def setup(self, scene: Scene) -> None:
+        size, seed, hidden = scene.observation_size, scene.seed, self.hidden
+        self.count = 0
+        self.policy = make_actor(size, 1, hidden, seed).to(scene.device)
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)
-        inputs, keys = observation_size + action_size, ["observation", "action"]
+        keys = ["observation", "action"]
         self.values = [
-            ValueOperator(seeded_mlp(inputs, 1, hidden, seed + 1 + 2 * number), in_keys=keys).to(
-                device
+            ValueOperator(seeded_mlp(size + 1, 1, hidden, seed + 1 + 2 * number), in_keys=keys).to(
+                scene.device
             )
             for number in range(self.critics)
         ]
@@ -181,7 +98,7 @@ class OffPolicy(ABC):
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's."""
-        return anneal(self.optimizers.values(), share, self.settings.final_lr_fraction)
+        return anneal(self.optimizers.values(), share, self.final_lr_fraction)
 
     @abstractmethod
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -204,10 +121,10 @@ class OffPolicy(ABC):
             delayed: which of ``"actor"`` and ``"value"`` have a target network.
         """
         self.loss = loss
-        self.loss.make_value_estimator(gamma=self.settings.gamma)
+        self.loss.make_value_estimator(gamma=self.gamma)
         # TorchRL asks for an updater of the targets; _follow does its work.
         HardUpdate(loss)
-        rates = {"actor": self.settings.actor_lr, "value": self.settings.critic_lr}
+        rates = {"actor": self.actor_lr, "value": self.critic_lr}
         for name, key in (("actor", "actor_network_params"), ("value", critic)):
             network = leaves(getattr(loss, key))
             vector = join(network)
@@ -228,7 +145,7 @@ class OffPolicy(ABC):
     def _penalty(self, batch: TensorDictBase) -> Tensor:
         """Return the penalty on the actor's output before its tanh."""
         raw = self.policy.module[0](batch["observation"])
-        return self.settings.saturation * raw.square().mean()
+        return self.saturation * raw.square().mean()
 
     def _step(self, *names: str) -> None:
         """Take a step of the named optimizers along the gradients at hand; clear all gradients."""
@@ -242,7 +159,7 @@ class OffPolicy(ABC):
         """Move the named target networks towards their own, as TorchRL's ``SoftUpdate`` does."""
         for name in names:
             target, vector = self.targets[name]
-            target.lerp_(vector, self.settings.tau)
+            target.lerp_(vector, self.tau)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""

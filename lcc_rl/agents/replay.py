@@ -12,17 +12,13 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from lcc_rl.agents.actor import ACTION, OBSERVATION, shared_policy
+from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch, check_learner
-from lcc_rl.agents.loop import REPORTED, TrainingLoop, derived_seed, episode_statistics
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.agents.sizes import check_window
-from lcc_rl.config import require
 from lcc_rl.envs import StringCollector
-from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import Diverged
 from lcc_rl.pieces.rewards import REWARD
-from lcc_rl.policies import shared_policy
-from lcc_rl.policies.actor import ACTION, OBSERVATION
 
 # What is learned from, as the environment names it and as the losses do.
 LEARNED_FROM = {
@@ -36,7 +32,6 @@ LEARNED_FROM = {
 
 # Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
 WORTH_COMPILING = 40_000
-COLLECTORS = ("string", "torchrl")
 
 
 class Trainer(TrainingLoop[OffPolicy]):
@@ -45,22 +40,16 @@ class Trainer(TrainingLoop[OffPolicy]):
     advice = "Lower agent.critic_lr or agent.actor_lr"
 
     def _prepare(self) -> None:
-        settings, agent, env = self.settings, self.agent, self.env
-        require(
-            settings.collector in COLLECTORS,
-            f"training.collector must be one of {', '.join(COLLECTORS)}, got "
-            f"{settings.collector!r}",
-        )
+        agent, env = self.agent, self.env
         self.exploration = agent.noise.to(env.device or "cpu")
         self.sampler = torch.Generator()
         self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(agent.settings.buffer_size, device=env.device or "cpu"),
-            batch_size=agent.settings.batch_size,
+            storage=LazyTensorStorage(agent.buffer_size, device=env.device or "cpu"),
+            batch_size=agent.batch_size,
             generator=self.sampler,
         )
 
     def _source(self) -> BaseCollector:
-        check_window(self.agent.settings.best_window, self.settings)
         return self._collector(self.settings.segment, self._compiled())
 
     def _collector(self, steps: int, compiled: bool) -> BaseCollector:
@@ -95,7 +84,7 @@ class Trainer(TrainingLoop[OffPolicy]):
         for part in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             self.exploration.sigma.fill_(self.agent.exploration.sigma(share, self.updates))
-            batch = self._collect(collector, segments, part * self.settings.segment)
+            batch = self._collect(segments, part * self.settings.segment)
             new = transitions(batch)
             self.buffer.extend(new)
             played.append(batch.select(*REPORTED))
@@ -124,7 +113,7 @@ class Trainer(TrainingLoop[OffPolicy]):
 
     def _keep_best(self) -> None:
         """Keep the policy if no window of episodes since learning began had a higher reward."""
-        window = (self.agent.settings.best_window or 0) // self.settings.environments
+        window = (self.agent.best_window or 0) // self.settings.environments
         recent = self.rows[-window:]
         if not window or len(recent) < window or not recent[0]["updates"]:
             return
@@ -134,26 +123,19 @@ class Trainer(TrainingLoop[OffPolicy]):
             weights = {name: value.clone() for name, value in state.items()}
             self.best = {"score": score, "iteration": self.iteration, "weights": weights}
 
-    def _collect(
-        self, collector: BaseCollector, segments: Iterator[TensorDictBase], begun: int
-    ) -> TensorDictBase:
+    def _collect(self, segments: Iterator[TensorDictBase], begun: int) -> TensorDictBase:
         """Return the next segment, after so many steps, all of it numbers.
 
         Raises:
             Diverged: naming the first entry that is not a number, its step and its episode.
         """
-        try:
-            batch = next(segments)
-            check_batch(batch, pieces_of(self.env), begun)
-        except Diverged:
-            if isinstance(collector, StringCollector):
-                collector.replay()  # finds what the batch does not hold
-            raise
+        batch = next(segments)
+        check_batch(batch, begun)
         return batch
 
     def _learn(self, before: int, new: int) -> dict[str, float]:
         """Take the updates that are due after ``new`` transitions on top of those ``before``."""
-        settings = self.agent.settings
+        settings = self.agent
         ratio = settings.updates_per_transition
         ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
         count = int((before + new) * ratio) - int(before * ratio) if ready else 0

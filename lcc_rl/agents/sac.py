@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import field
 
 import torch
 from tensordict import TensorDictBase
@@ -13,11 +11,12 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
-from lcc_rl.agents.off_policy import OffPolicy, OffPolicySettings
-from lcc_rl.errors import require_in, require_positive
+from lcc_rl.agents.actor import ACTION, OBSERVATION, action_noise, seeded_mlp
+from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.off_policy import Exploration, OffPolicy
 from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import SEED, STEP
-from lcc_rl.policies.actor import ACTION, OBSERVATION, action_noise, seeded_mlp
+from lcc_rl.settings import Number, Positive, given_as
 
 ONE = 1.0 - 1e-6  # the largest action whose inverse tanh exists in single precision
 
@@ -65,60 +64,25 @@ class SampledAction(TensorDictModuleBase):
         return tensordict.set(ACTION, (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE))
 
 
-@dataclass(frozen=True)
-class SACSettings(OffPolicySettings):
-    """Settings of SAC; its exploration is a factor of the policy's own standard deviation.
-
-    Args:
-        alpha_init: temperature at the start.
-        alpha_lr: learning rate of the temperature.
-        target_entropy: entropy to keep per action; None: minus the number of actions.
-
-    Raises:
-        ConfigError: if a setting is out of range or contradicts another.
-    """
-
-    exploration: Mapping[str, float | None] = field(
-        default_factory=lambda: {
-            "initial": 1.0,
-            "final": 1.0,
-            "decay_share": 1.0,
-            "decay_per_update": None,
-        }
-    )
-    alpha_init: float = 0.1
-    alpha_lr: float = 1e-3
-    target_entropy: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive("agent", alpha_init=self.alpha_init, alpha_lr=self.alpha_lr)
-        if self.target_entropy is not None:
-            require_in("agent", "(-inf, inf)", target_entropy=self.target_entropy)
-
-
 class SAC(OffPolicy):
     """Learns a distribution of actions and its temperature; its mean is the policy that is kept.
 
-    Args:
-        observation_size, action_size, seed, settings, device: see
-            :class:`lcc_rl.agents.off_policy.OffPolicy`.
+    Its exploration is a factor of the policy's own standard deviation.
     """
 
-    Settings: ClassVar[type[OffPolicySettings]] = SACSettings
+    exploration: given_as(Exploration) = field(  # type: ignore[valid-type]
+        default_factory=lambda: Exploration(initial=1.0, final=1.0, decay_share=1.0)
+    )
+    alpha_init: Positive = 0.1  # temperature at the start
+    alpha_lr: Positive = 1e-3  # its learning rate
+    target_entropy: Number | None = None  # entropy to keep per action; None: -1, of one action
+
     critics = 2
 
-    def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        seed: int,
-        settings: SACSettings | None = None,
-        device: str = "cpu",
-    ) -> None:
-        super().__init__(observation_size, action_size, seed, settings, device)
-        own = self.settings
-        spread = seeded_mlp(observation_size, action_size, own.hidden[-1:], seed + 2).to(device)
+    def setup(self, scene: Scene) -> None:
+        super().setup(scene)
+        size, seed, device = scene.observation_size, scene.seed, scene.device
+        spread = seeded_mlp(size, 1, self.hidden[-1:], seed + 2).to(device)
         head = Head(self.policy.module[0], spread)
         self.noise = SampledAction(head)
         actor = ProbabilisticActor(
@@ -127,19 +91,18 @@ class SAC(OffPolicy):
             distribution_class=TanhNormal,
             return_log_prob=True,
         )
-        entropy = -float(action_size) if own.target_entropy is None else own.target_entropy
         loss = SACLoss(
             actor,
             self.values,
-            alpha_init=own.alpha_init,
-            target_entropy=entropy,
+            alpha_init=self.alpha_init,
+            target_entropy=-1.0 if self.target_entropy is None else self.target_entropy,
             loss_function="l2",
             delay_qvalue=True,
         ).to(device)
         self._complete(loss, "qvalue_network_params", ("value",))
         self.loss.log_alpha.grad = torch.zeros_like(self.loss.log_alpha)
         alpha = [self.loss.log_alpha]
-        self.optimizers["alpha"] = torch.optim.Adam(alpha, lr=own.alpha_lr, fused=True)
+        self.optimizers["alpha"] = torch.optim.Adam(alpha, lr=self.alpha_lr, fused=True)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         with self._own_randomness():

@@ -2,96 +2,50 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar
+from dataclasses import field
+from typing import Any, TypeVar
 
-from tensordict.nn import TensorDictModule
-
+from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.objective import Objective
-from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.agents.rules import make_policy
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.base import as_key
-from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.rewards import REWARD, RewardTerm
-from lcc_rl.pieces.world import World
-from lcc_rl.policies.rules import make_policy
+from lcc_rl.settings import Count, Positive, Share
 
 
-@dataclass(frozen=True)
-class SimulatedSettings:
-    """What learns, and what it maximises; conf/agent holds the values.
+class SimulatedAgent(Agent):
+    """A policy and the objective that it learns by; once started, ``policy`` is the module."""
 
-    Args:
-        policy: what learns: ``"network"``, a rule with learned constants (``"idm"``, ``"acc"``), or
-            a network on top of a rule (``"residual_idm"``, ``"residual_acc"``).
-        constants: constants of a rule at the start; those left out have its own values.
-        hidden: sizes of the ReLU layers of a network.
-        surrogates: nodes of reward terms that take the place of those of the same name in the
-            objective; their weights multiply the terms' own. Those of terms that the reward
-            lacks are ignored.
-        limits: largest share of the time in which a surrogate's limit may be missed, by its name;
-            its weight is then the price at the start, see :class:`lcc_rl.agents.limits.Limits`.
-        limit_rate: largest change of the logarithm of such a price at once.
-        regularizers: nodes of reward terms that belong to the objective only.
-    """
+    # A network; a rule with learned constants (idm, acc); or a network on top of a rule
+    # (residual_idm, residual_acc).
+    policy: Any = "network"
+    constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
+    hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of a network
+    # Nodes of reward terms that take the place of those of the same name in the objective; their
+    # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
+    surrogates: dict[str, Any] = field(default_factory=dict)
+    # Largest share of the time in which a surrogate's limit may be missed, by its name; its weight
+    # is then the price at the start, see lcc_rl.agents.limits.
+    limits: dict[str, Share | None] = field(default_factory=dict)
+    limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
+    regularizers: dict[str, Any] = field(default_factory=dict)  # terms of the objective only
 
-    policy: str = "network"
-    constants: Mapping[str, float] | None = None
-    hidden: Sequence[int] = (200, 100, 50)
-    surrogates: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float | None] = field(default_factory=dict)
-    limit_rate: float = 0.1
-    regularizers: Mapping[str, Any] = field(default_factory=dict)
-
-
-class SimulatedAgent(ABC):
-    """A policy and the objective that it learns by.
-
-    Args:
-        observation: what the policy sees.
-        seed: seed of the initial weights.
-        time_step: duration of a step [s], for terms of the objective that need it.
-        max_acceleration: acceleration of action 1 [m/s²], for rules.
-        string: the string of vehicles, for terms of the objective.
-        settings: see the class's ``Settings``; None for its defaults.
-        device: where the networks live.
-        energy: the energy models, for terms of the objective; None for the ALCC paper's.
-
-    Raises:
-        ConfigError: if a setting is out of range.
-    """
-
-    Settings: ClassVar[type[SimulatedSettings]] = SimulatedSettings
-
-    def __init__(
-        self,
-        observation: Observation,
-        seed: int,
-        time_step: float,
-        max_acceleration: float = 3.0,
-        string: VehicleString | None = None,
-        settings: Any = None,
-        device: str = "cpu",
-        energy: Fleet | None = None,
-    ) -> None:
-        self.settings: Any = self.Settings() if settings is None else settings
-        self.seed, self.device = seed, device
-        own = self.settings
-        world = World(string or VehicleString(), time_step, energy=as_fleet(energy))
-        self.objective = Objective(own, device, world)
-        self.policy: TensorDictModule = make_policy(
-            own.policy, observation, own.hidden, seed, own.constants, max_acceleration
-        ).to(device)
-        self._prepare(observation.event_shape[-1])
-
-    @abstractmethod
-    def _prepare(self, size: int) -> None:
-        """Make what learns besides the policy; observations have ``size`` entries."""
+    def setup(self, scene: Scene) -> None:
+        assert scene.observation is not None
+        self.objective = Objective(self, scene.device, scene.world)
+        module = make_policy(
+            self.policy,
+            scene.observation,
+            self.hidden,
+            scene.seed,
+            self.constants,
+            scene.max_acceleration,
+        )
+        self.policy = module.to(scene.device)
 
 
 SimulatedT = TypeVar("SimulatedT", bound=Any)

@@ -9,85 +9,65 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lcc_rl.agents.agent import Scene, derived_seed
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.agents.loop import REPORTED, derived_seed, episode_statistics
-from lcc_rl.agents.simulated import SimulatedAgent, SimulatedLoop, SimulatedSettings
+from lcc_rl.agents.loop import REPORTED, episode_statistics
+from lcc_rl.agents.simulated import SimulatedAgent, SimulatedLoop
 from lcc_rl.envs.rollout import DifferentiableRollout
-from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import ConfigError, how_to_install, require_positive, require_whole
+from lcc_rl.errors import ConfigError, how_to_install
+from lcc_rl.settings import Count, Positive
 
 MOST_WEIGHTS = 500  # beyond, the covariance of a generation's candidates says too little
 
 
-@dataclass(frozen=True)
-class TunedSettings(SimulatedSettings):
-    """Settings of the tuner.
-
-    Args:
-        candidates: weights tried on the same episodes before the search moves.
-        sigma: standard deviation of the candidates at the start; of a rule's constants that of
-            their logarithms.
-
-    Raises:
-        ConfigError: if a setting is out of range.
-    """
-
-    policy: str = "idm"
-    hidden: Sequence[int] = ()
-    limit_rate: float = 0.2
-    candidates: int = 10
-    sigma: float = 0.3
-
-    def __post_init__(self) -> None:
-        require_positive("agent", sigma=self.sigma)
-        require_whole("agent", 4, 1000, candidates=self.candidates)
-
-
 class Tuned(SimulatedAgent):
-    """A policy whose weights are tuned by search.
+    """A policy whose weights are tuned by search."""
 
-    Arguments as of :class:`lcc_rl.agents.simulated.SimulatedAgent`.
+    policy: Any = "idm"
+    hidden: Sequence[Count] = ()
+    limit_rate: Positive = 0.2
+    # Weights tried on the same episodes before the search moves.
+    candidates: Annotated[int, Field(ge=4, le=1000)] = 10
+    # Standard deviation of the candidates at the start; of a rule's constants that of their
+    # logarithms.
+    sigma: Positive = 0.3
 
-    Raises:
-        ConfigError: if a setting is out of range, or there are too many weights to search.
-    """
-
-    Settings: ClassVar[type[TunedSettings]] = TunedSettings
-
-    def _prepare(self, size: int) -> None:
+    def setup(self, scene: Scene) -> None:
+        name = self.policy
+        super().setup(scene)
         self.weights = [entry for entry in self.policy.parameters() if entry.requires_grad]
         count = sum(entry.numel() for entry in self.weights)
         if count > MOST_WEIGHTS:
             raise ConfigError(
-                f"agent.policy={self.settings.policy} has {count} weights, a search can tune "
-                f"{MOST_WEIGHTS}: say agent.policy=idm or acc, or a smaller agent.hidden"
+                f"agent.policy={name} has {count} weights, a search can tune "
+                f"{MOST_WEIGHTS}: use agent.policy=idm or acc, or a smaller agent.hidden"
             )
-        self.start = parameters_to_vector(self.weights).detach().double().cpu().numpy()
+        self.begun = parameters_to_vector(self.weights).detach().double().cpu().numpy()
         self.search = self._search()
         # Of every candidate so far: its cost, and its share of each limit, by name.
         self.costs: list[float] = []
         self.missed: list[list[float]] = []
         self.asked: list[np.ndarray] = []
-        self.center = self.start
+        self.center = self.begun
 
     def _search(self) -> Any:
         try:
             from cmaes import CMA
         except ImportError as error:
             raise ConfigError(f"agent=tuned needs cmaes: {how_to_install('tune')}") from error
-        size, seed = self.settings.candidates, derived_seed(self.seed, "search")
-        return CMA(self.start, self.settings.sigma, seed=seed, population_size=size)
+        size, seed = self.candidates, derived_seed(self.seed, "search")
+        return CMA(self.begun, self.sigma, seed=seed, population_size=size)
 
     def anneal(self, share: float) -> float:
         """Return the first step size of the search, which has no learning rate."""
-        return self.settings.sigma
+        return self.sigma
 
     def ask(self) -> None:
         """Give the policy the weights of the next candidate."""
@@ -101,7 +81,7 @@ class Tuned(SimulatedAgent):
         """
         self.costs.append(cost)
         self.missed.append([share for _, share in sorted(shares.items())])
-        count = self.settings.candidates
+        count = self.candidates
         if len(self.costs) % count == 0:
             self.search.tell(list(zip(self.asked, self.costs[-count:], strict=True)))
             self.asked, self.center = [], self.search.mean
@@ -128,7 +108,7 @@ class Tuned(SimulatedAgent):
         limits = self.objective.limits
         limits.logarithms = dict.fromkeys(limits.logarithms, 0.0)
         self.search, self.costs, self.missed = self._search(), [], []
-        self.asked, self.center = [], self.start
+        self.asked, self.center = [], self.begun
         names = sorted(self.objective.limited())
         for cost, shares in zip(state["costs"].tolist(), state["missed"].tolist(), strict=True):
             self.ask()
@@ -148,14 +128,14 @@ class SearchLoop(SimulatedLoop[Tuned]):
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Let a candidate drive a batch of episodes."""
         begun = time.perf_counter()
-        generation = self.iteration // self.agent.settings.candidates
+        generation = self.iteration // self.agent.candidates
         self.env.set_seed(derived_seed(self.seed, generation, "episodes"))
         self.agent.ask()
         with torch.no_grad():
             network = self.agent.policy.module
             _, record = source.play(source.start(), network, self.horizon)
             data = source.assemble(record)
-            check_batch(data, pieces_of(self.env))
+            check_batch(data)
             running = 1.0 - (data["next", "terminated"].cumsum(1) > 0).double()
             objective = self.objective.score(data) * running
         shares = self.objective.missed(data, running)
@@ -164,7 +144,7 @@ class SearchLoop(SimulatedLoop[Tuned]):
         self.agent.tell(cost, shares)
         self.agent.settle()
         self.iteration += 1
-        self.updates = self.iteration // self.agent.settings.candidates
+        self.updates = self.iteration // self.agent.candidates
         row = {
             "iteration": float(self.iteration),
             "episodes": float(self.iteration * self.env.batch_size[0]),

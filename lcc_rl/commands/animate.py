@@ -11,8 +11,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from lcc_rl.config import require
-from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file, in_words
 from lcc_rl.io.files import read_parquet
@@ -61,7 +60,7 @@ def run(
     if not 0 <= episode < len(found):
         raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
     label, rows = list(found.items())[episode]
-    motion = _cut(motion_of(rows, stored_config(folder).scenario), start, duration)
+    motion = _cut(motion_of(rows, stored_config(folder)["scenario"]), start, duration)
     title = f"{in_words(strategy)}: {label}"
     default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
     return animate(motion, title, out or default)

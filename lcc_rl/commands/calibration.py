@@ -9,26 +9,26 @@ from time import perf_counter
 
 import pandas as pd
 import torch
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from lcc_rl.config import CALLED, build_as, config_hash, plain
+from lcc_rl.config import config_hash
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.fit import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source
-from lcc_rl.errors import ConfigError
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
+from lcc_rl.nodes import CALLED, build
 from lcc_rl.results.cells import MISSING
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import claim
+from lcc_rl.schemas import CalibrateConfig
 
 ERRORS = (
     *(("rmspe", "RMSPE [%]"), ("gap_rmse_m", "gap RMSE [m]")),
@@ -36,7 +36,7 @@ ERRORS = (
 )
 
 
-def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
+def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
     """Calibrate the drivers of ``cfg.data`` as ``cfg.calibration`` says.
 
     Writes ``config.yaml``, ``drivers.parquet``, ``calibration.png`` and ``joint_distribution.png``.
@@ -59,13 +59,10 @@ def run(cfg: DictConfig, folder: str | Path, console: Console | None = None) -> 
         return _run(cfg, Path(folder), console or Console(highlight=False))
 
 
-def _run(cfg: DictConfig, folder: Path, console: Console) -> pd.DataFrame:
+def _run(cfg: CalibrateConfig, folder: Path, console: Console) -> pd.DataFrame:
     device = prepare_torch(cfg)
-    missing = [key for key in sorted(OmegaConf.missing_keys(cfg)) if key.startswith("data.")]
-    if missing:
-        raise ConfigError(f"missing settings: give {', '.join(f'{key}=…' for key in missing)}")
     # Settings are checked before the data are read, which may take long.
-    calibrator = build_as("a calibrator", CALLED, cfg.calibration, "calibration")
+    calibrator = build(cfg.calibration, "calibration", CALLED)
     dataset = build_source(cfg.data).load()
     _say(console, dataset.report)
     start = perf_counter()
@@ -96,14 +93,14 @@ def _calibrate(
         return calibrator(episodes, seed=seed, device=device, progress=show)
 
 
-def _write(result: Calibration, read: list[str], cfg: DictConfig, folder: Path) -> None:
-    settings = OmegaConf.masked_copy(cfg, ["data", "calibration", "seed"])
+def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:
+    settings = {key: getattr(cfg, key) for key in ("data", "calibration", "seed")}
     metadata = {
-        "config": json.dumps(plain(settings), default=str),
+        "config": json.dumps(settings),
         "config_hash": config_hash(settings),
         "report": "\n".join([*read, *result.report]),
     }
-    formats = cfg.get("figure_formats", ())
+    formats = cfg.figure_formats
     save(calibration_figure(result.drivers), folder / "calibration.png", formats=formats)
     save(joint_figure(result.drivers), folder / "joint_distribution.png", formats=formats)
     # Last: who finds it finds a finished calibration.

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
-from lcc_rl.agents.factory import build_agent, learns, make_trainer
-from lcc_rl.agents.sizes import check_length, check_window
-from lcc_rl.config import CALLED, build_as, load, plain, require
+from lcc_rl.agents.factory import build_agent, check_lengths, learns, make_trainer
+from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
     build_drivers,
@@ -20,14 +18,14 @@ from lcc_rl.envs.inputs import (
     string_of,
 )
 from lcc_rl.envs.rollout import OBSERVATION
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, require, unknown_name
 from lcc_rl.evaluation.episodes import any_leader, check_shard, plan_of
 from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
+from lcc_rl.nodes import CALLED, TARGET, build, find_target, settings_at
 from lcc_rl.runs.loggers import Silent
-from lcc_rl.schemas import TrainConfig
-from lcc_rl.targets import TARGET, find_target, settings_at
+from lcc_rl.schemas import StudyConfig, TrainConfig
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
 OBJECTIVES = {
@@ -53,7 +51,7 @@ MOMENTS = 24  # that a step of a training keeps of every entry, its gradients in
 RECORD = 4096  # bytes of an iteration's row in the record
 
 
-def check_settings(cfg: DictConfig, folder: Path) -> None:
+def check_settings(cfg: TrainConfig, folder: Path) -> None:
     """Check every setting of a training before the data are read, which may take long.
 
     Everything is built once, around a leader at constant speed.
@@ -71,16 +69,15 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
     check_objective(cfg)
     build_logger(cfg)
     build_source(cfg.data)
-    build_as("a split", CALLED, cfg.split, "split")
+    build(cfg.split, "split", CALLED)
     population = build_drivers(cfg)
     check_variant(cfg)
     trial = any_leader(cfg)
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if learns(cfg):
+        check_lengths(cfg)
         agent = build_agent(cfg, population, cfg.device)
-        check_length(cfg.training, horizon)
-        check_window(cfg.agent.get("best_window"), cfg.training)
         trial.training.environments, trial.training.episodes = 2, 2
         make_trainer(trial, agent, profiles, population, folder)
     env = build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
@@ -88,7 +85,7 @@ def check_settings(cfg: DictConfig, folder: Path) -> None:
         require_memory(training_bytes(cfg, env.reset()), cfg.device)
 
 
-def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
+def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:
     """Check that an evaluation fits into memory, once the data are read and nothing else is done.
 
     Raises:
@@ -99,7 +96,7 @@ def check_evaluation(cfg: DictConfig, inputs: Inputs) -> None:
     require_memory(evaluation_bytes(cfg, env.reset(), inputs), cfg.device)
 
 
-def training_bytes(cfg: DictConfig, moment: TensorDictBase) -> dict[str, float]:
+def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]:
     """Return the bytes that a training needs at the least, by the option that they are due to.
 
     Args:
@@ -112,15 +109,15 @@ def training_bytes(cfg: DictConfig, moment: TensorDictBase) -> dict[str, float]:
     needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD}
     if "buffer_size" in agent:
         played = MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition
-        learned = 2 * transition + 16 * sum(agent.hidden)
-        needs[f"agent.buffer_size={agent.buffer_size}"] = agent.buffer_size * transition
-        needs[f"agent.batch_size={agent.batch_size}"] = agent.batch_size * learned
+        learned = 2 * transition + 16 * sum(agent["hidden"])
+        needs[f"agent.buffer_size={agent['buffer_size']}"] = agent["buffer_size"] * transition
+        needs[f"agent.batch_size={agent['batch_size']}"] = agent["batch_size"] * learned
     else:
         played = MOMENTS * moment.bytes() * settings.segment
     return {f"training.environments={count}": count * played, **needs}
 
 
-def evaluation_bytes(cfg: DictConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
+def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
     """Return the bytes of the largest block of an evaluation; arguments as above."""
     settings, steps, count = cfg.evaluation, cfg.scenario.horizon, len(inputs.evaluation)
     if settings.rows == "episodes":
@@ -132,7 +129,7 @@ def evaluation_bytes(cfg: DictConfig, moment: TensorDictBase, inputs: Inputs) ->
     return {what: count * steps * moment.bytes()}
 
 
-def check_installed(cfg: DictConfig, compared: Sequence[str] = ()) -> None:
+def check_installed(cfg: StudyConfig, compared: Sequence[str] = ()) -> None:
     """Refuse controllers whose package is not installed, before data are read.
 
     Args:
@@ -144,18 +141,18 @@ def check_installed(cfg: DictConfig, compared: Sequence[str] = ()) -> None:
     """
     names = {*cfg.evaluation.baselines, *compared} - {DIRECT}
     others = [baseline_controller(name) for name in sorted(names) if applies(cfg, name)]
-    for key, _, target in settings_at([plain(cfg.scenario.controllers), *others]):
+    for key, _, target in settings_at([cfg.scenario.controllers, *others]):
         if key.endswith(f".{TARGET}"):
             getattr(find_target(str(target), key), "check_installed", lambda: None)()
 
 
-def build_logger(cfg: DictConfig) -> Any:
+def build_logger(cfg: TrainConfig) -> Any:
     """Build the logger of the training rows; a silent one where the run names none."""
-    node = cfg.get("logger")
-    return Silent() if node is None else build_as("a logger", ("opened",), node, "logger")
+    node = cfg.logger
+    return Silent() if node is None else build(node, "logger", ("opened",))
 
 
-def check_variant(cfg: DictConfig) -> None:
+def check_variant(cfg: StudyConfig) -> None:
     """Refuse a learner under the name of a variant that learns nothing, and the reverse.
 
     Raises:
@@ -171,29 +168,27 @@ def check_variant(cfg: DictConfig) -> None:
             "driver say variant=idm"
         )
     if learns(cfg) and not learns(own):
-        rules = (
-            "'compare=[idm,acc,…]' without variant=…" if cfg.get("task") else "a learned variant"
-        )
+        rules = "'compare=[idm,acc,…]' without variant=…" if cfg.task else "a learned variant"
         raise ConfigError(
             f"variant={cfg.variant} learns nothing: remove agent=…, or choose {rules}"
         )
 
 
-def _is_driven_as(cfg: DictConfig, own: DictConfig) -> bool:
+def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
     """Whether there is somebody to drive, by the same kind of controller as in another one."""
-    kinds = [part.scenario.controllers.automated.get(TARGET) for part in (cfg, own)]
+    kinds = [part.scenario.controllers[AUTOMATED].get(TARGET) for part in (cfg, own)]
     return string_of(cfg).count(AUTOMATED) > 0 and kinds[0] == kinds[1]
 
 
-def objectives(cfg: DictConfig) -> list[str]:
+def objectives(cfg: TrainConfig) -> list[str]:
     """Return the columns that ``objective`` names; a run made before there was any has none."""
-    wanted = cfg.get("objective", TrainConfig.objective)
+    wanted = cfg.objective
     names = [wanted] if isinstance(wanted, str) else list(wanted)
     vehicles = cfg.evaluation.rows == "vehicles"
     return [OBJECTIVES["vehicles"][0]] if vehicles and names == [TrainConfig.objective] else names
 
 
-def check_objective(cfg: DictConfig) -> None:
+def check_objective(cfg: TrainConfig) -> None:
     """Check that ``objective`` names columns of the summary.
 
     Raises:
@@ -207,7 +202,7 @@ def check_objective(cfg: DictConfig) -> None:
             raise unknown_name("objective", str(name), known)
 
 
-def check_sizes(cfg: DictConfig) -> None:
+def check_sizes(cfg: StudyConfig) -> None:
     """Check, before anything runs, what would fail only at its end.
 
     Raises:

@@ -24,18 +24,16 @@ from itertools import count
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig
 from rich.console import Console
 
 from lcc_rl.commands.pipeline import root_key
-from lcc_rl.config import load, require
+from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs, string_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
-from lcc_rl.evaluation.naming import check_distinct
-from lcc_rl.evaluation.strategies import Strategy, baseline, trained
+from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, trained
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.policies import load_policy
@@ -43,6 +41,7 @@ from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.schemas import EvaluateConfig
 from lcc_rl.studies.runner import check_overrides
 
 DRIVERS = 12
@@ -81,7 +80,7 @@ def _tell(
     progress.update(next(done), values)
 
 
-def start(cfg: DictConfig, path: str, inputs: Inputs) -> Strategy:
+def start(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
     """Read a policy to start from.
 
     Raises:
@@ -106,7 +105,7 @@ def blocks(inputs: Inputs, drivers: int | None) -> Iterator[tuple[int, Inputs]]:
 
 
 def block_rows(
-    cfg: DictConfig,
+    cfg: EvaluateConfig,
     learned: list[Strategy],
     block: Inputs,
     options: argparse.Namespace,

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
@@ -20,10 +19,12 @@ from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
-from lcc_rl.evaluation.naming import POLICY, check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
+    POLICY,
     Strategy,
     baselines,
+    check_distinct,
+    named_apart,
     no_policy,
     rules,
     studied,
@@ -41,6 +42,7 @@ from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present, claim, forget
+from lcc_rl.schemas import EvaluateConfig, StudyConfig
 
 log = logging.getLogger("lcc_rl")
 
@@ -49,7 +51,7 @@ ROWS = ("episodes", "vehicles")
 
 
 def run(
-    cfg: DictConfig,
+    cfg: EvaluateConfig,
     folder: str | Path,
     own: bool = True,
     quiet: bool = False,
@@ -75,23 +77,22 @@ def run(
         LccError: one clear error for whatever is wrong with settings, data or files.
     """
     folder = Path(folder)
-    if cfg.get("resume") is not None:
-        folder, cfg = Path(cfg.resume), _resumed(cfg)
+    if cfg.resume is not None:
+        folder, cfg = Path(cfg.resume), _resumed(cfg.resume, cfg.trust)
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
         return _run(cfg, folder, own, quiet, replace)
 
 
-def _resumed(cfg: DictConfig) -> DictConfig:
-    """Return the configuration of the stopped evaluation that another one names."""
-    check_links(Path(cfg.resume))
-    own = load_config(cfg.resume, tuple(cfg.trust))
-    own.trust = cfg.trust
+def _resumed(folder: str, trust: Sequence[str]) -> EvaluateConfig:
+    """Return the configuration of a stopped evaluation."""
+    check_links(Path(folder))
+    own: EvaluateConfig = load_config(folder, trust)
     return own
 
 
-def complete(cfg: DictConfig, folder: Path) -> None:
+def complete(cfg: EvaluateConfig, folder: Path) -> None:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
     if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
@@ -104,7 +105,7 @@ def complete(cfg: DictConfig, folder: Path) -> None:
     forget(folder)
 
 
-def _run(cfg: DictConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
+def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
     prepare_torch(cfg)
     check_sizes(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
@@ -134,7 +135,7 @@ def draw(folder: Path, rows: str = "episodes") -> None:
     write_figures(folder, rows)
 
 
-def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
+def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
     """Build all strategies of an evaluation, and read what they are evaluated on.
 
     Args:
@@ -178,7 +179,7 @@ def strategies_of(cfg: DictConfig, own: bool | None = None) -> tuple[list[Strate
 
 def evaluate_and_write(
     strategies: Sequence[Strategy],
-    cfg: DictConfig,
+    cfg: StudyConfig,
     inputs: Inputs,
     folder: Path,
     quiet: bool = False,
@@ -208,7 +209,7 @@ def evaluate_and_write(
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
-    for line in leader_too_fast(rows, cfg.get("task") is not None):
+    for line in leader_too_fast(rows, cfg.task is not None):
         log.warning(line)
     if not quiet:
         _show(rows, cfg, inputs)
@@ -217,7 +218,7 @@ def evaluate_and_write(
 
 def _by_blocks(
     strategies: Sequence[Strategy],
-    cfg: DictConfig,
+    cfg: StudyConfig,
     inputs: Inputs,
     folder: Path,
     metadata: dict[str, str],
@@ -244,7 +245,7 @@ def _play_missing(
     strategy: Strategy,
     store: Store,
     plan: episodes.Plan,
-    cfg: DictConfig,
+    cfg: StudyConfig,
     inputs: Inputs,
     folder: Path,
 ) -> None:
@@ -269,7 +270,7 @@ def _play_missing(
                 progress.update(done)
 
 
-def _show(rows: Rows, cfg: DictConfig, inputs: Inputs) -> None:
+def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the summary of an evaluation, or the scores of its task."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
         for source, part in by_source(rows):

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig
 
 from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.evaluation.responses import responses
@@ -16,6 +15,7 @@ from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
+from lcc_rl.schemas import StudyConfig
 
 log = logging.getLogger("lcc_rl")
 
@@ -26,7 +26,7 @@ LEAST_GAP, LEAST_REACH = 10.0, 2.0  # of the axes: largest gap [m], relative spe
 
 def write_responses(
     strategies: Sequence[Strategy],
-    cfg: DictConfig,
+    cfg: StudyConfig,
     population: Population,
     folder: Path,
     metadata: Mapping[str, str],
@@ -65,13 +65,13 @@ def write_responses(
         write_parquet(pd.concat(tables, ignore_index=True), folder / RESPONSES, metadata)
 
 
-def _motions(steps: pd.DataFrame, strategies: Sequence[Strategy], cfg: DictConfig) -> list[Motion]:
+def _motions(steps: pd.DataFrame, strategies: Sequence[Strategy], cfg: StudyConfig) -> list[Motion]:
     """Return the sample episodes that there are of strategies."""
     found = []
     for strategy in strategies:
         try:
             episodes = sample_episodes(steps, strategy.name)
-            found += [motion_of(rows, cfg.scenario) for rows in episodes.values()]
+            found += [motion_of(rows, vars(cfg.scenario)) for rows in episodes.values()]
         except ResultsError:  # none was kept
             continue
     return found

@@ -9,28 +9,28 @@ import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from functools import cache
+from dataclasses import fields
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_settings, check_sizes
-from lcc_rl.config import load, plain, require
+from lcc_rl.config import load, raw
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source, load_inputs
-from lcc_rl.errors import Interrupted, ResultsError
+from lcc_rl.errors import Interrupted, ResultsError, require
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.main_page import as_rich, caption_of, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_json
+from lcc_rl.nodes import forget_places
 from lcc_rl.results.tables import show
 from lcc_rl.results.trust import check_targets
 from lcc_rl.runs.cli import root_key
@@ -39,7 +39,7 @@ from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
-from lcc_rl.targets import forget_places
+from lcc_rl.schemas import KINDS, CalibrateConfig, PipelineConfig, TrainConfig, as_plain
 
 log = logging.getLogger("lcc_rl")
 
@@ -52,7 +52,7 @@ EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
-def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> Rows:
+def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     """Read trajectories, calibrate drivers, train the variants, evaluate and draw.
 
     A folder that already holds parts of the same job is completed.
@@ -72,7 +72,7 @@ def run(cfg: DictConfig, folder: str | Path, overrides: list[str]) -> Rows:
         return _run(cfg, Path(folder), overrides)
 
 
-def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
+def _run(cfg: PipelineConfig, folder: Path, overrides: list[str]) -> Rows:
     prepare_torch(cfg)
     require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
     for item in overrides:
@@ -85,7 +85,6 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
     for part in (*parts.values(), final):
-        OmegaConf.set_struct(part, False)
         part.data = cfg.data
     for name, part in parts.items():
         check_settings(part, folder / name)
@@ -93,12 +92,11 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     with atomic_path(folder / OVERRIDES) as temporary:
         temporary.write_text(json.dumps(overrides))
     drivers = calibrate_once(cfg, folder)
-    inputs = {
-        "data": _episodes(cfg, folder),
-        "drivers": {"_target_": BOOTSTRAP, "path": str(drivers)},
-    }
     for part in (*parts.values(), final):
-        part.update(inputs)
+        part.data, part.drivers = (
+            _episodes(cfg, folder),
+            {"_target_": BOOTSTRAP, "path": str(drivers)},
+        )
     tell(f"training {', '.join(cfg.variants)}, {cfg.jobs} at a time; details in */train.log")
     _train_all(parts, folder, cfg.jobs)
     final.compare = [
@@ -110,7 +108,7 @@ def _run(cfg: DictConfig, folder: Path, overrides: list[str]) -> Rows:
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
         place = folder / "evaluation" / "figures" / "learning_curve.png"
-        save(curve, place, formats=cfg.get("figure_formats", ()))
+        save(curve, place, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
         _conclude(folder, overrides, caption_of(parts.values()))
     return rows
@@ -144,34 +142,39 @@ def stored_overrides(path: Path, trust: Sequence[str]) -> list[str]:
         if "${" in item:
             raise ResultsError(f"{path}: {item} refers to another value; expected plain values")
     places: dict[str, str] = {}
-    for content in _composed(overrides):
-        check_targets(content, str(path), trust)
+    for content in _composed(overrides, path, trust):
         places |= {place.partition("=")[0]: place for place in forget_places(content)}
     for place in places.values():
         log.warning("%s: %s names a place to write and is left out", path, place)
     kept = [item for item in overrides if item.lstrip("+").partition("=")[0] not in places]
-    if any(forget_places(content) for content in _composed(kept)):
+    if any(forget_places(content) for content in _composed(kept, path, trust)):
         raise ResultsError(f"{path}: names a place to write: {', '.join(places.values())}")
     return kept
 
 
-def _composed(overrides: list[str]) -> list[dict[str, Any]]:
+def _composed(overrides: list[str], path: Path, trust: Sequence[str]) -> list[dict[str, Any]]:
     """Compose a job and the training of each of its variants, as plain containers."""
-    job = load("pipeline", overrides)
     shared = [item for item in overrides if root_key(item) not in OWN]
-    parts = [load("train", [*shared, f"variant={name}"]) for name in job.variants]
-    return [plain(cfg) for cfg in (job, *parts)]
+    job = _checked("pipeline", overrides, path, trust)
+    parts = ([*shared, f"variant={name}"] for name in job["variants"])
+    return [job, *(_checked("train", part, path, trust) for part in parts)]
 
 
-def _episodes(cfg: DictConfig, folder: Path) -> dict[str, Any]:
+def _checked(entry: str, overrides: list[str], path: Path, trust: Sequence[str]) -> dict[str, Any]:
+    """Compose one configuration; its targets are checked before one of them is imported."""
+    check_targets(raw(entry, overrides), str(path), trust)
+    return as_plain(load(entry, overrides))
+
+
+def _episodes(cfg: PipelineConfig, folder: Path) -> dict[str, Any]:
     """Return the node of the trajectories that a job keeps in its folder."""
     node: dict[str, Any] = {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
     if cfg.data.get("plausible"):
-        node["plausible"] = plain(cfg.data.plausible)
+        node["plausible"] = cfg.data["plausible"]
     return node
 
 
-def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
+def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     """Read the trajectories once, keep them, and calibrate; skip what is already there."""
     table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
     if not table.exists():
@@ -183,9 +186,8 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
         load_inputs(cfg, loaded.episodes).to_learn_from()  # whether they can be split
         write_episodes(loaded.episodes, table)
     if not drivers.exists():
-        own = OmegaConf.create(plain(cfg))
-        assert isinstance(own, DictConfig)
-        own.data = _episodes(cfg, folder)
+        shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
+        own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
         said = StringIO()
         found = calibration.run(own, drivers.parent, Console(file=said, width=100))
         for line in said.getvalue().splitlines():
@@ -194,15 +196,14 @@ def calibrate_once(cfg: DictConfig, folder: Path) -> Path:
     return drivers
 
 
-def _train_all(parts: dict[str, DictConfig], folder: Path, jobs: int) -> None:
+def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
     """Train the variants side by side, each in a process and a folder of its own."""
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name)}
     # A fresh interpreter per training: forking a process that has used torch's threads can hang.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _end_with_parent) as pool:
         futures: dict[str, Future[None]] = {
-            name: pool.submit(_train_one, plain(cfg), str(folder / name))
-            for name, cfg in todo.items()
+            name: pool.submit(_train_one, cfg, str(folder / name)) for name, cfg in todo.items()
         }
         try:
             watch({name: (folder / name, future) for name, future in futures.items()})
@@ -232,7 +233,7 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait_for_end, daemon=True).start()
 
 
-def _train_one(settings: dict[str, Any], folder: str) -> None:
+def _train_one(cfg: TrainConfig, folder: str) -> None:
     """Train one variant; runs in a process of its own, with a log file of its own."""
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
@@ -241,7 +242,6 @@ def _train_one(settings: dict[str, Any], folder: str) -> None:
         level=logging.INFO,
         format="[%(asctime)s][%(levelname)s] %(message)s",
     )
-    cfg = OmegaConf.create(settings)
     if (target / "checkpoint.pt").exists():
         cfg.resume = folder
     training.run(cfg, target, quiet=True)
@@ -253,9 +253,5 @@ def _finished(folder: Path) -> bool:
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:
     """Keep the overrides that an entry point has settings for."""
-    return [item for item in overrides if root_key(item) in _settings_of(entry)]
-
-
-@cache
-def _settings_of(entry: str) -> frozenset[str]:
-    return frozenset(map(str, load(entry))) | {"experiment"}
+    known = {"experiment", *KINDS[entry].__dataclass_fields__}
+    return [item for item in overrides if root_key(item) in known]

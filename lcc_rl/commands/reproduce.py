@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.schemas import FORMATS, check_formats
+from lcc_rl.schemas import FORMATS
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.alcc.settings import ABLATIONS, chooses_agent
@@ -141,7 +141,6 @@ def main(words: list[str]) -> int:
     if wrong or (overrides and "folder" in arguments):
         top.error(f"unknown: {' '.join(wrong or overrides)}")
     check_overrides(overrides)
-    check_formats((*arguments.formats, FORMATS[0]))
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     return int(arguments.run(arguments, shlex.join(["lcc-rl", "reproduce", *words])))

@@ -5,35 +5,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from lcc_rl.agents.factory import learns
-from lcc_rl.config import build_as, plain
 from lcc_rl.energy import build_energy
 from lcc_rl.errors import unknown_name
 from lcc_rl.evaluation.strategies import rules
+from lcc_rl.nodes import TARGET, build
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.scores import Task
 from lcc_rl.results.units import check_unit
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import EvaluateConfig, StudyConfig
 
 TASK = f"{Task.__module__}.{Task.__name__}"
 
 
-def task_of(cfg: DictConfig) -> Task | None:
+def task_of(cfg: StudyConfig) -> Task | None:
     """Return the task of a configuration; None without one.
 
     Raises:
         ConfigError: naming the option at fault.
     """
-    if cfg.get("task") is None:
+    if cfg.task is None:
         return None
-    task: Task = build_as("a task", Task, {TARGET: TASK, **plain(cfg.task)}, "task")
+    task: Task = build({TARGET: TASK, **cfg.task}, "task", Task)
     check_unit(task.unit, build_energy(cfg))
     return task
 
 
-def only_named(cfg: DictConfig) -> bool:
+def only_named(cfg: EvaluateConfig) -> bool:
     """Whether a task compares those that are named only: nobody's policy is its own variant's."""
     return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
 

@@ -7,20 +7,19 @@ from functools import partial
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
 from lcc_rl.commands.evaluation import EPISODES, IDENTITY, evaluate_and_write
-from lcc_rl.config import identity, require
+from lcc_rl.config import identity
 from lcc_rl.envs import Inputs, load_inputs
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows, parquet_metadata
-from lcc_rl.policies import shared_policy
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
 from lcc_rl.results.string_tables import case_table
@@ -28,6 +27,7 @@ from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
+from lcc_rl.schemas import TrainConfig
 
 log = logging.getLogger("lcc_rl")
 
@@ -35,7 +35,7 @@ POLICIES, POLICY, LAST, CHECKPOINT = "policies", "policy.pt", "policy_last.pt", 
 RECORD = "training.parquet"
 
 
-def run(cfg: DictConfig, folder: str | Path, quiet: bool = False, resume: bool = False) -> Rows:
+def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool = False) -> Rows:
     """Train the variant of a configuration, then evaluate it.
 
     Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
@@ -58,7 +58,7 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False, resume: bool =
             left in the folder as error.txt.
     """
     folder, named = Path(folder), cfg.resume is not None
-    if named:
+    if cfg.resume is not None:
         folder = Path(cfg.resume)
         cfg = _resumed(cfg, folder)
     elif (folder / CHECKPOINT).exists() and not resume:
@@ -72,13 +72,13 @@ def run(cfg: DictConfig, folder: str | Path, quiet: bool = False, resume: bool =
         return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
 
 
-def _resumed(cfg: DictConfig, folder: Path) -> DictConfig:
+def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
     """Return the configuration of the run in a folder, checked against what that run made.
 
     Where the rows are logged may be said anew: what is stored names no place to write.
     """
     check_links(folder)
-    own = load_config(folder, tuple(cfg.trust))
+    own: TrainConfig = load_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
         made_by = (
             parquet_metadata(folder / table).get(IDENTITY) if (folder / table).exists() else None
@@ -89,11 +89,11 @@ def _resumed(cfg: DictConfig, folder: Path) -> DictConfig:
                 f"{made_by}, not {identity(own)}); resume with the settings it was started with"
             )
     if not isinstance(build_logger(cfg), Silent):
-        OmegaConf.update(own, "logger", cfg.logger, force_add=True)
+        own.logger = cfg.logger
     return own
 
 
-def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
+def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     prepare_torch(cfg)
     check_settings(cfg, folder)
     inputs = load_inputs(cfg)
@@ -101,12 +101,12 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
         log.info(line)
     check_cases(deployed(cfg), inputs)
     check_evaluation(cfg, inputs)
-    if not learns(cfg) or cfg.get("policy") is not None:
+    if not learns(cfg) or cfg.policy is not None:
         save_config(cfg, folder)
     if not learns(cfg):
         log.info("variant %s learns nothing: evaluating it", cfg.variant)
         strategy = rule(cfg)
-    elif cfg.get("policy") is not None:
+    elif cfg.policy is not None:
         strategy = _given(cfg, inputs, folder)
     else:
         agent = build_agent(cfg, inputs.population, cfg.device)
@@ -115,14 +115,14 @@ def _run(cfg: DictConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
 
 
-def _given(cfg: DictConfig, inputs: Inputs, folder: Path) -> Strategy:
+def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
     """Build the strategy of a variant that builds on a trained policy."""
     require(
         cfg.deployed is not None,
         f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
         "or say lcc-rl evaluate to evaluate one",
     )
-    weights, own = load_policy(cfg.policy, cfg.variant, tuple(cfg.get("trust") or ()))
+    weights, own = load_policy(str(cfg.policy), cfg.variant, cfg.trust)
     check_policy(cfg, own)
     cfg.agent = own.agent
     save_config(cfg, folder)
@@ -131,7 +131,7 @@ def _given(cfg: DictConfig, inputs: Inputs, folder: Path) -> Strategy:
     return Strategy(cfg.variant, deployed(cfg), strategy.policy, own.seed)
 
 
-def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
+def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
     """Train an agent to the end, write its policy and leave the agent with it."""
     trainer = make_trainer(cfg, agent, inputs.to_learn_from(), inputs.population, folder)
     if resume:
@@ -147,13 +147,13 @@ def _train(cfg: DictConfig, agent: Agent, inputs: Inputs, folder: Path, resume: 
     save_policy(agent.policy.state_dict(), cfg, folder / POLICY)
 
 
-def keep_policy(agent: Agent, cfg: DictConfig, folder: Path, iteration: int) -> None:
+def keep_policy(agent: Agent, cfg: TrainConfig, folder: Path, iteration: int) -> None:
     """Write the policy as it is after an iteration to ``policies/<iteration>.pt``."""
     path = folder / POLICIES / f"{iteration:06d}.pt"
     save_policy(agent.policy.state_dict(), cfg, path)
 
 
-def complete(cfg: DictConfig, folder: Path) -> Rows:
+def complete(cfg: TrainConfig, folder: Path) -> Rows:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
     if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
@@ -164,7 +164,7 @@ def complete(cfg: DictConfig, folder: Path) -> Rows:
     return run(cfg, folder, quiet=True, resume=True)
 
 
-def objective(cfg: DictConfig, rows: Rows) -> float | list[float]:
+def objective(cfg: TrainConfig, rows: Rows) -> float | list[float]:
     """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
     # By its rows: a resumed run is not of the variant that the command line composed.
     vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows

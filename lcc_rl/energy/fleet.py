@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lcc_rl.config import build_as
 from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.motor import PaperMotor
 from lcc_rl.errors import ConfigError, require_in, unknown_name
+from lcc_rl.nodes import build
 
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
@@ -41,7 +41,7 @@ class Fleet:
         self.models = [
             model
             if isinstance(model, EnergyModel)
-            else build_as("an energy model", EnergyModel, model, f"energy.models.{name}")
+            else build(model, f"energy.models.{name}", EnergyModel)
             for name, model in models.items()
         ]
         shares = dict.fromkeys(self.names, 1.0) if shares is None else shares
@@ -125,7 +125,7 @@ def build_energy(cfg: Any) -> Fleet:
     Raises:
         ConfigError: naming the option at fault.
     """
-    node = cfg.get("energy")
+    node = cfg.energy
     if node is None:
         return as_fleet(None)
-    return as_fleet(build_as("an energy model", MEANT, node, "energy"))
+    return as_fleet(build(node, "energy", MEANT))

@@ -133,7 +133,6 @@ class StringCollector(BaseCollector):
     def collect(self) -> TensorDictBase:
         """Return the next batch, ``[*batch, steps]``."""
         record = []
-        self._begun = self.state, self.env.base_env.generator.get_state()
         for _ in range(self.steps):
             self.state, kept, over = self.advance(self.state)
             record.append(kept)
@@ -146,22 +145,6 @@ class StringCollector(BaseCollector):
         for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
             segment.set(key, torch.stack(values, len(batch)))
         return segment
-
-    @torch.no_grad()
-    def replay(self) -> None:
-        """Play the last batch again, uncompiled, to find what in it is not a number.
-
-        Raises:
-            Diverged: naming the first entry that is not, whether the batch holds it or not.
-        """
-        state, generator = self._begun
-        self.env.base_env.generator.set_state(generator)
-        running = torch.ones_like(state[DONE])
-        for _ in range(self.steps):
-            reached = self.step.checked(self._act(state), running)
-            state = {key: reached.get(key, value) for key, value in state.items()}
-            if reached[DONE].any():
-                state = self._renew(state, self._renewed)
 
     def _act(self, state: State) -> State:
         """Return a moment with the policy's action."""

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import CALLED, build_as, load
+from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import build_energy
 from lcc_rl.envs.checks import check_pieces
@@ -23,6 +22,7 @@ from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.io.memory import require_memory
+from lcc_rl.nodes import CALLED, build
 from lcc_rl.pieces import (
     Action,
     CBFFilter,
@@ -37,14 +37,14 @@ from lcc_rl.pieces import (
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.pieces.world import World
-from lcc_rl.schemas import check_ranges
+from lcc_rl.schemas import StudyConfig
 from lcc_rl.settings import parse
 
 MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
 
 
 def build_env(
-    cfg: DictConfig,
+    cfg: StudyConfig,
     profiles: Profiles,
     population: Population,
     batch_size: Sequence[int] | int = (),
@@ -70,7 +70,6 @@ def build_env(
         ConfigError: naming the option at fault, or saying what the batch needs in memory.
     """
     scenario = cfg.scenario
-    check_ranges(cfg)
     pieces = build_pieces(cfg, profiles, population, nominal)
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}
@@ -86,7 +85,7 @@ def build_env(
 
 
 def world_of(
-    cfg: DictConfig, profiles: Any = None, population: Any = None, nominal: bool = False
+    cfg: StudyConfig, profiles: Any = None, population: Any = None, nominal: bool = False
 ) -> World:
     """Return what the pieces of a configuration share; arguments as of :func:`build_env`."""
     scenario = cfg.scenario
@@ -110,7 +109,7 @@ def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
 
 
 def build_pieces(
-    cfg: DictConfig, profiles: Profiles, population: Population, nominal: bool = False
+    cfg: StudyConfig, profiles: Profiles, population: Population, nominal: bool = False
 ) -> list[Piece]:
     """Build the pieces of a configuration in the order in which they act.
 
@@ -136,7 +135,7 @@ def build_pieces(
     check_spacing(pieces, profiles)
     if not string.count(AUTOMATED):
         return pieces
-    pieces.append(build_as("a piece", Piece, cfg.observation, "observation", world=world))
+    pieces.append(build(cfg.observation, "observation", Piece, world=world))
     terms = cfg.reward.terms
     pieces += [_build(node, "reward.terms", world, name) for name, node in terms.items()]
     # The sum stays last, before collisions of the next step.
@@ -160,7 +159,7 @@ def _build(node: Any, group: str, world: World, name: str) -> Any:
     Raises:
         ConfigError: if the node describes something else.
     """
-    return build_as("a piece", Piece, node, f"{group}.{name}", world=world, name=name)
+    return build(node, f"{group}.{name}", Piece, world=world, name=name)
 
 
 def _leader(scenario: Any, node: Any, world: World) -> list[Piece]:
@@ -177,7 +176,7 @@ def _drivers(scenario: Any, world: World) -> list[Any]:
     """Build the controllers of the roles that occur, and their safety filters."""
     pieces, roles = [], world.string.names
     for group, needed in (("controllers", True), ("filters", False)):
-        nodes = scenario[group]
+        nodes = getattr(scenario, group)
         for role in roles:
             if nodes.get(role) is not None:
                 pieces.append(_build(nodes[role], f"scenario.{group}", world, role))
@@ -196,14 +195,14 @@ def _drivers(scenario: Any, world: World) -> list[Any]:
 def _motion(scenario: Any, world: World) -> StringMotion:
     string = world.string
     start = {
-        role: build_as("a start", CALLED, node, f"scenario.start.{role}")
+        role: build(node, f"scenario.start.{role}", CALLED)
         for role, node in scenario.start.items()
         if role in string.names and node is not None and not string.ring
     }
     if not string.ring and scenario.circumference is not None:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
     names = ("circumference", "vehicle_length", "initial_speed")
-    of_ring = {name: scenario[name] for name in names} if string.ring else {}
+    of_ring = {name: getattr(scenario, name) for name in names} if string.ring else {}
     return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 
 

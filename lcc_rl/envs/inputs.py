@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig
 
-from lcc_rl.config import CALLED, build_as, is_sweep, plain
-from lcc_rl.config_checks import string_of_scenario
+from lcc_rl.config import is_sweep
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.functional.pattern import RING, VehicleString
+from lcc_rl.functional.pattern import RING, VehicleString, parse_string
+from lcc_rl.nodes import CALLED, build
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.schemas import StudyConfig
 
 
 @dataclass(frozen=True)
@@ -51,29 +51,29 @@ class Inputs:
         """
         if not len(self.training):
             raise ConfigError(
-                "no profile is left to train on: split=none, or evaluation_share=1 of split or "
+                "no profile is left to train on: evaluation_share=1 of split or "
                 "leader, is for evaluations of what no training has seen; hold out less"
             )
         return self.training
 
 
-def string_of(cfg: DictConfig) -> VehicleString:
+def string_of(cfg: StudyConfig) -> VehicleString:
     """Return the string of vehicles of a configuration.
 
     Raises:
         ConfigError: pointing at the place in the pattern where it cannot be read.
     """
-    return string_of_scenario(cfg.scenario)
+    return parse_string(cfg.scenario.string, cfg.scenario.road)
 
 
-def build_drivers(cfg: DictConfig) -> Population:
+def build_drivers(cfg: StudyConfig) -> Population:
     """Build the human drivers of a configuration.
 
     Raises:
         ConfigError: naming the option at fault.
     """
     needed = ("desired_speed", "time_gap", "constants")
-    return cast(Population, build_as("a population", needed, cfg.drivers, "drivers"))
+    return cast(Population, build(cfg.drivers, "drivers", needed))
 
 
 def build_source(node: Any) -> Any:
@@ -82,10 +82,10 @@ def build_source(node: Any) -> Any:
     Raises:
         ConfigError: naming the option at fault.
     """
-    return build_as("a source of episodes", ("load",), node, "data")
+    return build(node, "data", ("load",))
 
 
-def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
+def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
     """Read what the leader drives, split it and build the population.
 
     Args:
@@ -120,13 +120,13 @@ def load_inputs(cfg: DictConfig, episodes: Any = None) -> Inputs:
     )
 
 
-def _source_of_leaders(cfg: DictConfig, episodes: Any) -> Any:
+def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
     """Build what ``leader`` describes; without it, the leaders of ``data`` divided by ``split``."""
-    if cfg.get("leader") is not None:
-        return build_as("a source of leaders", ("load",), cfg.leader, "leader")
+    if cfg.leader is not None:
+        return build(cfg.leader, "leader", ("load",))
     loaded = _load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
-    split = build_as("a split", CALLED, cfg.split, "split")
-    # All windows count: what is left out of them is for platoons, whose errors are shares.
+    split = build(cfg.split, "split", CALLED)
+    # Every window is kept: the low-variation filter is for platoons, whose errors are relative.
     return TrajectoryLeaders(
         source=loaded, split=split, source_step=cfg.scenario.time_step, least_variation=0.0
     )
@@ -144,12 +144,11 @@ def constant_profiles(
 _loaded: dict[str, LoadedEpisodes] = {}
 
 
-def _load_episodes(node: DictConfig) -> LoadedEpisodes:
+def _load_episodes(node: Mapping[str, Any]) -> LoadedEpisodes:
     """Load episodes; the runs of a sweep that one process does share those of the same files."""
     if not is_sweep():
         return build_source(node).load()
-    settings = plain(node)
-    key = json.dumps([settings, list(_stamps(settings))])
+    key = json.dumps([node, list(_stamps(node))])
     if key not in _loaded:
         loaded = build_source(node).load()
         _loaded.clear()
@@ -169,7 +168,7 @@ def _stamps(value: Any) -> Iterator[tuple[str, int, int]]:
                 yield name, stat.st_mtime_ns, stat.st_size
 
 
-def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
+def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:
     """Return a line for everything that an evaluation asks more of than there is.
 
     Args:
@@ -179,7 +178,8 @@ def shortfalls(cfg: DictConfig, available: Mapping[str, int]) -> list[str]:
     lines = []
     for what, count in available.items():
         name, _, source = what.partition(" ")
-        if cfg.evaluation[name] is not None and cfg.evaluation[name] > count:
+        wanted = getattr(cfg.evaluation, name)
+        if wanted is not None and wanted > count:
             only = f"only {count} {f'of {source} ' if source else ''}are available; taking all"
-            lines.append(f"evaluation.{name}={cfg.evaluation[name]}: {only}")
+            lines.append(f"evaluation.{name}={wanted}: {only}")
     return lines

@@ -16,14 +16,14 @@ from torch import Tensor, compiler, device, ones_like, zeros_like
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
-from lcc_rl.envs.finite import ACTION, Written, check_moment
+from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
 from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
-# Where none of these is lost after a step, nothing that matters is.
+# If these entries are finite after a step, all others that matter are.
 TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
 
 
@@ -50,18 +50,15 @@ class Step:
         self.pieces = [(piece, piece not in chosen) for piece in pieces]
         self.horizon = horizon
 
-    def __call__(self, before: State, watched: list[Written] | None = None) -> State:
+    def __call__(self, before: State) -> State:
         """Return the entries of the moment reached.
 
         Args:
             before: the entries of the moment left that the pieces read, the action among them.
-            watched: gets every entry as it is written, before another piece may replace it.
         """
         reached = tick(before[SEED], before[STEP] + 1, self.horizon)
         for piece, detached in self.pieces:
             piece.apply(before, reached, detached)
-            if watched is not None:
-                watched += [Written(key, reached[key], piece) for key in piece.targets]
         return reached
 
     def begin(self, seeds: Tensor) -> State:
@@ -79,25 +76,6 @@ class Step:
             start = piece._reset(given, start)
         return _read(start)
 
-    def checked(self, before: State, running: Tensor, who: str = "") -> State:
-        """Return the entries of the moment reached, all of them numbers.
-
-        Args:
-            before: see :meth:`__call__`.
-            running: whether each episode runs, ``[*batch, 1]``; of the others, what is not a
-                number becomes zero.
-            who: who drives, for the message.
-
-        Raises:
-            Diverged: naming the first entry that is not, its step and its episode.
-        """
-        watched = [Written(ACTION, before[ACTION])] if ACTION in before else []
-        reached = self(before, watched)
-        pieces = [piece for piece, _ in self.pieces]
-        if check_moment(watched, {**before, STEP: reached[STEP]}, running, pieces, who):
-            reached = {key: value.nan_to_num(0.0, 0.0, 0.0) for key, value in reached.items()}
-        return reached
-
 
 def written(pieces: Iterable[Piece]) -> set[Key]:
     """Return the keys that pieces write, without ``"next"``, their constants included."""
@@ -107,12 +85,6 @@ def written(pieces: Iterable[Piece]) -> set[Key]:
         if isinstance(piece, StepTransform):
             found |= set(piece.constants)
     return found
-
-
-def written_by(piece: Piece, moment: Any) -> list[Written]:
-    """Return what a piece has written to a moment, a mapping or a TensorDict, in order."""
-    found = [(key, moment.get(key, None)) for key in piece.targets]
-    return [Written(key, value, piece) for key, value in found if value is not None]
 
 
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
@@ -185,7 +157,7 @@ class Pieces(Compose):
         return next_tensordict
 
     def _check_numbers(self, td: TensorDictBase, next_td: TensorDictBase) -> None:
-        """Check that a step was taken from numbers to numbers.
+        """Check that a step was taken by and to numbers.
 
         Raises:
             Diverged: naming the first entry that is not, its step and its episode.
@@ -194,13 +166,13 @@ class Pieces(Compose):
         if not any_lost(value for value in telling if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
-        left, reached = ([w for p in pieces for w in written_by(p, x)] for x in (td, next_td))
-        if telling[0] is not None:
-            reached.insert(0, Written(ACTION, telling[0]))
+        named: dict[Key, Tensor | None] = {ACTION: telling[0]}
+        named |= {key: next_td.get(key, None) for piece in pieces for key in piece.targets}
         done = td.get(DONE, None)
         running = ones_like(next_td.get(DONE)) if done is None else ~done
-        for moment, watched in ((td, left), (next_td, reached)):
-            check_moment(watched, {**_read(td), STEP: moment.get(STEP)}, running, pieces)
+        batch = running.numel()
+        reached = {k: x.reshape(1, batch, -1) for k, x in named.items() if x is not None}
+        check_numbers(reached, running.reshape(1, batch, 1), int(next_td.get(STEP).max()))
 
     def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the inverse of what is not a piece, last first."""

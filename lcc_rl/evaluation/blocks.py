@@ -1,4 +1,4 @@
-"""Blocks of rows of an evaluation, on disk until all are there, so that it can be resumed."""
+"""Blocks of rows of an evaluation, stored one by one so that it can be resumed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, and time series of sample ep
 
 
 def mark_of(strategy: Strategy) -> str:
-    """Return a hash of all that a strategy's rows depend on: settings, weights, this package."""
+    """Return a hash of all that a strategy's rows depend on: settings, weights, version."""
     digest = hashlib.sha256(f"{__version__} {strategy.name} {strategy.seed} ".encode())
     digest.update(identity(strategy.cfg).encode())
     weights = getattr(strategy.policy, "state_dict", None)
@@ -32,12 +32,12 @@ def mark_of(strategy: Strategy) -> str:
 
 
 class Store:
-    """Keeps the blocks of several strategies: in a folder, or, of a single block, in memory.
+    """Keeps the blocks of several strategies in a folder, or a single block in memory.
 
     Args:
-        folder: of the run.
-        strategies: whose rows are kept.
-        blocks: the numbers of the blocks.
+        folder: folder of the run.
+        strategies: the strategies, which methods name by their place.
+        blocks: numbers of the blocks.
     """
 
     def __init__(self, folder: Path, strategies: Sequence[Strategy], blocks: Sequence[int]) -> None:
@@ -46,7 +46,7 @@ class Store:
         self.kept: dict[tuple[int, int], Tables] = {}
 
     def missing(self, strategy: int) -> list[int]:
-        """Return the blocks of a strategy, by its place, that are still to be played."""
+        """Return the blocks of a strategy that are still to be played."""
         return [block for block in self.blocks if not self._has(strategy, block)]
 
     def _paths(self, strategy: int, block: int) -> tuple[Path, Path]:
@@ -63,11 +63,7 @@ class Store:
         return found.get(MARK) == self.marks[strategy]
 
     def put(self, strategy: int, block: int, tables: Tables) -> None:
-        """Keep a block of a strategy.
-
-        Raises:
-            ResultsError: if it cannot be written.
-        """
+        """Keep a block of a strategy."""
         if len(self.blocks) == 1:
             self.kept[strategy, block] = tables
             return
@@ -79,7 +75,7 @@ class Store:
         write_parquet(tables[0], rows, metadata)
 
     def rows(self) -> Iterator[pd.DataFrame]:
-        """Yield each block, the rows of all strategies one after the other."""
+        """Yield the rows of each block, strategy by strategy."""
         for block in self.blocks:
             parts = [self._read(place, block, 0) for place in range(len(self.marks))]
             yield pd.concat(parts, ignore_index=True)
@@ -90,12 +86,12 @@ class Store:
         return pd.concat([self._read(*key, 1) for key in every], ignore_index=True)
 
     def _read(self, strategy: int, block: int, which: int) -> pd.DataFrame:
-        """Return the rows (0) or the time series (1) of a block; without any, an empty table."""
+        """Return the rows (0) or the time series (1) of a block."""
         if len(self.blocks) == 1:
             return self.kept[strategy, block][which]
         path = self._paths(strategy, block)[which]
         return read_parquet(path) if which == 0 or path.is_file() else pd.DataFrame()
 
     def clear(self) -> None:
-        """Remove the folder of the blocks: all rows are in one table."""
+        """Remove the folder of the blocks."""
         shutil.rmtree(self.folder, ignore_errors=True)

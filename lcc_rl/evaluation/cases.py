@@ -1,11 +1,12 @@
-"""Evaluation with one row per vehicle: cases, held-out windows and whole records."""
+"""Evaluation with one row per vehicle, on cases, held-out windows and whole records."""
 
 from __future__ import annotations
+
+from copy import deepcopy
 
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from lcc_rl.data.leaders import Case
@@ -17,6 +18,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
 from lcc_rl.results.savings import SOURCE
+from lcc_rl.schemas import StudyConfig
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")
@@ -24,12 +26,11 @@ RECORDED = ("speed", "gap", "acceleration", "jerk", *ERRORS)
 INDEX, REWARD = (AUTOMATED, "index"), (AUTOMATED, "reward")
 KEYS = [("leader", "speed"), *(("vehicles", name) for name in RECORDED), REWARD]
 KEYS += [INDEX, *((HYBRID, name) for name in ("winner", *COUNTERS))]
-# ``[time, runs, vehicles]``; of entries that only automated vehicles have, their rows alone.
-Series = dict[str, Tensor]
+Series = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
 def evaluate(
-    strategy: Strategy, cfg: DictConfig, inputs: Inputs
+    strategy: Strategy, cfg: StudyConfig, inputs: Inputs
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Drive one strategy through every case, the held-out windows and the whole records.
 
@@ -40,11 +41,14 @@ def evaluate(
     for case in cases_of(cfg, inputs):
         series = drive(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
         frame = measure(series)
-        frame.insert(0, "strategy", strategy.name)
-        frame.insert(1, "training_seed", pd.Series([strategy.seed] * len(frame), dtype="Int64"))
-        frame.insert(2, "case", case.name)
-        frame.insert(3, "profile", [case.profile.names[i] for i in frame["run_id"]])
-        frame.insert(4, "followers", int(frame["follower"].max()))
+        labels = {
+            "strategy": strategy.name,
+            "training_seed": pd.array([strategy.seed] * len(frame), dtype="Int64"),
+            "case": case.name,
+            "profile": [case.profile.names[i] for i in frame["run_id"]],
+            "followers": int(frame["follower"].max()),
+        }
+        frame = pd.concat([pd.DataFrame(labels), frame], axis=1)
         if inputs.evaluation.sources:
             own = case.profile.sources or [""] * len(case.profile)
             frame[SOURCE] = [own[i] for i in frame["run_id"]]
@@ -58,31 +62,22 @@ def evaluate(
     return pd.concat(rows, ignore_index=True), trails
 
 
-def cases_of(cfg: DictConfig, inputs: Inputs) -> list[Case]:
-    """Return what an evaluation drives: its cases, the held-out windows and whole records."""
+def cases_of(cfg: StudyConfig, inputs: Inputs) -> list[Case]:
+    """Return the cases of an evaluation, its held-out windows and its whole records."""
     windows = Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))
     return [*inputs.cases, windows, *(inputs.full_length if cfg.evaluation.full_length else ())]
 
 
-def check_cases(cfg: DictConfig, inputs: Inputs) -> None:
-    """Check, before anything expensive starts, that a strategy can follow the fastest leader.
-
-    Args:
-        cfg: configuration of the strategy.
-        inputs: what it will be evaluated on.
-
-    Raises:
-        ConfigError: naming what does not fit that leader.
-    """
+def check_cases(cfg: StudyConfig, inputs: Inputs) -> None:
+    """Check that the vehicles of a configuration can follow the fastest leader."""
     if cfg.evaluation.rows == "vehicles":
         case = max(cases_of(cfg, inputs), key=lambda case: float(case.profile.speeds.max()))
         build_pieces(of_case(cfg, case), case.profile, inputs.population, True)
 
 
-def of_case(cfg: DictConfig, case: Case) -> DictConfig:
+def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
     """Return the configuration of a case; a platoon has the case's number of vehicles."""
-    cfg = cfg.copy()
-    OmegaConf.set_struct(cfg, False)
+    cfg = deepcopy(cfg)
     cfg.scenario.horizon = case.horizon
     if set(string_of(cfg).names) == {AUTOMATED}:
         cfg.scenario.string = f"{AUTOMATED}*{case.followers}"
@@ -95,9 +90,9 @@ def drive(
     """Drive a strategy behind every record of a case, side by side.
 
     Returns:
-        ``leader`` ``[time + 1, runs, 1]``, speed ``[time + 1, runs, N]``; gap, acceleration,
-        jerk, errors ``[time, runs, N]``; reward and, of a hybrid, winner and counters, NaN for
-        vehicles that have none.
+        ``leader`` ``[time + 1, runs, 1]`` and ``speed`` ``[time + 1, runs, N]``; gap, acceleration,
+        jerk and errors ``[time, runs, N]``; reward and, for a hybrid, winner and counters, NaN for
+        vehicles that are not automated.
     """
     cfg = of_case(strategy.cfg, case)
     runs = len(case.profile)
@@ -117,12 +112,11 @@ def drive(
 
 
 def measure(series: Series) -> pd.DataFrame:
-    """Turn a record into one row per run and vehicle.
+    """Return one row per run and vehicle.
 
-    Speed errors are e_v(i,0), as in the paper's tables; ``energy_ratio`` is that of
-    Σ e_v(i,i−1)² to the same of the vehicle ahead (string stability: at most 1), missing for the
-    first vehicle and where nothing moves. ``max_gap_error_m`` is the largest |e_x(i,i−1)|, missing
-    for vehicles that are not automated: they keep no headway.
+    Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² over
+    that of the vehicle ahead (string stability: at most 1), missing for the first vehicle and
+    where nothing moves. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of an automated vehicle.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
     energy = series["speed_error"].square().sum(0)
@@ -155,16 +149,12 @@ def measure(series: Series) -> pd.DataFrame:
 
 
 def trace(series: Series, time_step: float) -> pd.DataFrame:
-    """Return the time series of the first run: a row per moment and vehicle, the leader's as 0."""
+    """Return a row per moment and vehicle of the first run; the leader is vehicle 0."""
     leader = series["leader"][1:, 0]
     steps, vehicles = series["jerk"].shape[0], series["jerk"].shape[2]
     columns = {"speed_mps": torch.cat([leader, series["speed"][1:, 0]], dim=-1)}
-    for name, label in (
-        ("gap", "gap_m"),
-        ("acceleration", "acceleration_mps2"),
-        ("jerk", "jerk_mps3"),
-        ("winner", "winner"),
-    ):
+    labels = {"gap": "gap_m", "acceleration": "acceleration_mps2", "jerk": "jerk_mps3"}
+    for name, label in {**labels, "winner": "winner"}.items():
         if name in series:
             own = series[name][:, 0].to(leader.dtype)
             columns[label] = torch.cat([torch.full_like(leader, torch.nan), own], dim=-1)

@@ -1,9 +1,8 @@
-"""The best drive there is for somebody who knows the whole profile: what a controller could save.
+"""Clairvoyant bound: the best drive that the gradient finds when the whole profile is known.
 
-Every episode is optimised by itself, by the gradient through the simulator. What is minimised is
-the energy of the car and of all drivers behind it without what the last speed stores more than
-the first: on 30 s, a driver who knows when the counting stops would otherwise brake just before
-and be paid for it (A2 returns more than twice the kinetic energy).
+Every episode is optimised by itself. The objective is the energy of the vehicle and of all drivers
+behind it, less what the last speed stores more than the first: otherwise braking just before the
+end would pay (A2 returns more than twice the kinetic energy).
 """
 
 from __future__ import annotations
@@ -18,12 +17,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.config import require
 from lcc_rl.energy import Fleet, as_fleet, build_energy
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.envs.rollout import ACTION
-from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import any_leader, pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
@@ -42,12 +40,7 @@ LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
 
 
 class Planned:
-    """A policy whose actions are moved by a plan, one number per episode and step.
-
-    Args:
-        policy: what is moved; reads and writes a TensorDict.
-        shifts: the plan, ``[steps, batch, A, 1]``.
-    """
+    """A policy plus a plan of shifts of its actions, ``[steps, batch, A, 1]``."""
 
     def __init__(self, policy: Any, shifts: Tensor) -> None:
         self.policy, self.shifts = policy, shifts
@@ -70,10 +63,10 @@ def clairvoyant(
     own: bool = False,
     report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None,
 ) -> Strategy:
-    """Return the best that was found, starting from a learned controller's drive.
+    """Return the best strategy found, starting from a learned controller's drive.
 
-    The limits (time-to-collision, time gap, gap) are priced, ever higher. The problem is not
-    convex: there may be better drives.
+    The prices of the limits (time-to-collision, time gap, gap) rise. The problem is not convex:
+    there may be better drives.
 
     Args:
         strategy: the controller to begin with; its policy must be a network of the observation.
@@ -81,11 +74,10 @@ def clairvoyant(
             given the same, and a batch that holds all episodes.
         iterations: steps along the gradient.
         compiled: compile the simulator.
-        own: minimise the energy of the automated vehicles only, without regard for others.
-        report: told the number of the iteration, the energy [kJ] and the price of the limits.
+        own: minimise the energy of the automated vehicles only.
+        report: receives the number of the iteration, the energy [kJ] and the price of the limits.
 
     Raises:
-        ConfigError: if there are no iterations.
         Diverged: if an action, or an entry that is minimised or limited, is not a number.
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
@@ -105,7 +97,7 @@ def clairvoyant(
         share = iteration / iterations
         _, record = source.play(source.start(given), network, steps, shifts)
         data = source.assemble(record)
-        check_batch(data, pieces_of(env), who=strategy.title)
+        check_batch(data, who=strategy.title)
         energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
         missed = misses(data, string)
         _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)
@@ -116,12 +108,11 @@ def clairvoyant(
 
 
 def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> None:
-    """Take a step along the gradient of every episode's price, smaller towards the end."""
     (group,) = optimizer.param_groups
     (shifts,) = group["params"]
     optimizer.zero_grad(set_to_none=True)
     price.sum().backward()
-    # Every episode is a problem of its own, whatever its scale.
+    # Every episode is a problem of its own, of its own scale.
     shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
     fall = 0.5 * (1.0 + math.cos(math.pi * share))
     group["lr"] = SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall
@@ -134,10 +125,7 @@ def path_energy(
     string: VehicleString | None = None,
     energy: Fleet | None = None,
 ) -> Tensor:
-    """Return the energy without what the last speed stores, ``[batch]`` [kJ].
-
-    Of all vehicles, or, given the string, of the automated ones.
-    """
+    """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ]."""
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
     if string is not None:
         views = Views(string, AUTOMATED, ["self.speed", "next.self.speed"])
@@ -151,7 +139,7 @@ def path_energy(
 
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
-    """Return by how much the limits are missed in an episode, ``[batch]``, zero where kept."""
+    """Return the price of the limits missed in each episode, ``[batch]``, zero where kept."""
     views = Views(string, AUTOMATED, [f"next.self.{name}" for name in MEASURED])
     gap, relative_speed, time_gap, _ = views(*(data.get(key) for key in views.keys))
     closing = -relative_speed

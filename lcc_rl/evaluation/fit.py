@@ -1,62 +1,48 @@
-"""Whether a trained policy fits the variant and the observation under study."""
+"""Whether a trained policy fits the variant, the observation and the action under study."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
-from lcc_rl.config import plain
-from lcc_rl.config_checks import AUTO
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.runs import differing, flatten
+from lcc_rl.schemas import AUTO, StudyConfig
+
+FIRST = "module.0.0.weight"  # of a policy's network
 
 
-def check_policy(cfg: DictConfig, own: DictConfig) -> None:
-    """Check that a policy was trained for the variant and the observation under study.
+def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
+    """Check that a policy was trained for the variant, observation and action under study.
+
+    Args:
+        cfg: configuration under study, whose ``policy`` names it.
+        own: configuration of the policy's training.
 
     Raises:
         ConfigError: naming what differs.
     """
-    hybrid = cfg.deployed is not None or own.get("deployed") is not None
+    path = f"policy={cfg.policy}"
+    hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained as variant {own.variant}, not {cfg.variant}; "
-            f"say variant={own.variant}"
-        )
-    trained_with, observed = (
-        dict(flatten(plain(node))) for node in (own.observation, cfg.observation)
-    )
-    changes = [
-        f"observation.{key}: {trained_with.get(key)}, got {observed.get(key)}"
-        for key in differing(trained_with, observed)
-    ]
-    if changes:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained with another observation than this: expected "
-            f"{'; '.join(changes)}; say +knowledge=… and observation.… as in its training"
-        )
-    # Entries are observed in the order of their scales.
-    orders = [
-        [key for key in node if key.startswith("scales.")] for node in (trained_with, observed)
-    ]
-    if orders[0] != orders[1]:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained with another order of observation.scales: expected "
-            f"{', '.join(orders[0])}, got {', '.join(orders[1])}"
-        )
-    check_action(str(cfg.policy), own, cfg)
-    remembered, asked = (node.scenario.pieces.get("memory") for node in (own, cfg))
-    if remembered != asked:
-        raise ConfigError(
-            f"policy={cfg.policy} was trained with another memory than this: "
-            f"expected scenario.pieces.memory={remembered}, got {asked}"
-        )
+        raise ConfigError(f"{path} was trained as variant {own.variant}, not {cfg.variant}")
+    _check_same(path, _observed(own), _observed(cfg))
+    check_action(path, own, cfg)
 
 
-def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
+def _observed(cfg: StudyConfig) -> dict[str, Any]:
+    """Return what makes an observation: its settings, the order of its entries, the memory."""
+    node = cfg.observation
+    order = [key for key, _ in flatten(node) if key.startswith("scales.")]
+    memory = cfg.scenario.pieces.get("memory")
+    found = {"observation": {**node, "order of scales": order}}
+    return found if memory is None else {**found, "scenario.pieces.memory": memory}
+
+
+def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that a policy to compare with was trained in the scenario under study.
 
     Raises:
@@ -69,8 +55,8 @@ def check_scenario(path: str, own: DictConfig, cfg: DictConfig) -> None:
         )
 
 
-def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
-    """Check that an action means what it did in training: how much, and for how long.
+def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
+    """Check that an action has the size and the duration that it had in training.
 
     Args:
         path: where the policy comes from, for the message.
@@ -80,20 +66,21 @@ def check_action(path: str, own: DictConfig, cfg: DictConfig) -> None:
     Raises:
         ConfigError: naming what differs.
     """
-    trained_with, asked = (
-        {"scenario.time_step": node.scenario.time_step}
-        | dict(flatten({AUTO: plain(node.scenario.controllers.automated)}))
+    one, other = (
+        {
+            "scenario.time_step": node.scenario.time_step,
+            AUTO: node.scenario.controllers[AUTOMATED],
+        }
         for node in (own, cfg)
     )
-    changes = [
-        f"{key}={trained_with.get(key)}, got {asked.get(key)}"
-        for key in differing(trained_with, asked)
-    ]
+    _check_same(path, one, other)
+
+
+def _check_same(path: str, own: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    one, other = dict(flatten(own)), dict(flatten(asked))
+    changes = [f"{key}={one.get(key)}, got {other.get(key)}" for key in differing(one, other)]
     if changes:
-        raise ConfigError(
-            f"policy={path}: its action means something else here: it was trained with "
-            f"{'; '.join(changes)}"
-        )
+        raise ConfigError(f"{path} was trained with {'; '.join(changes)}")
 
 
 def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str) -> None:
@@ -102,12 +89,9 @@ def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str)
     Raises:
         ConfigError: naming both numbers.
     """
-    first = "module.0.0.weight"
-    trained_with, observed = (state.get(first) for state in (weights, policy.state_dict()))
-    if trained_with is None or observed is None or trained_with.shape[1] == observed.shape[1]:
-        return
-    raise ConfigError(
-        f"policy={path} was trained with {trained_with.shape[1]} observed entries, in this "
-        f"scenario.string an automated vehicle has {observed.shape[1]}: where one may have nobody "
-        "behind it, one entry more per vehicle seen says so"
-    )
+    one, other = (state.get(FIRST) for state in (weights, policy.state_dict()))
+    if one is not None and other is not None and one.shape[1] != other.shape[1]:
+        raise ConfigError(
+            f"policy={path} was trained with {one.shape[1]} observed entries; in this "
+            f"scenario.string an automated vehicle has {other.shape[1]}"
+        )

@@ -1,4 +1,4 @@
-"""What a strategy does at each gap and relative speed, as rows: its policy as a map."""
+"""Policy maps: what a strategy does at each gap and relative speed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ INDEX = (AUTOMATED, "index")
 
 
 class Situation(NamedTuple):
-    """Where episodes begin, each ``[episodes, 1]``: speed, speed ahead [m/s] and gap [m]."""
+    """Starts of episodes, each ``[episodes, 1]``: speed, speed ahead [m/s] and gap [m]."""
 
     speed: Tensor
     ahead: Tensor
@@ -47,29 +47,29 @@ def responses(
 ) -> pd.DataFrame:
     """Return what a strategy's first automated vehicle does in the first step of episodes.
 
-    Every episode begins at another gap and relative speed. All else is steady: those ahead keep
-    their speed, those behind follow at the vehicle's own, and what it remembers, hears or expects
-    of others is the present. Filters and limits act as they do in an evaluation.
+    Every episode begins at another gap and relative speed. All else is steady: vehicles ahead keep
+    their speed, those behind follow at the vehicle's own, and memory, messages and previews hold
+    the present. Filters and limits act as in an evaluation.
 
     Args:
-        strategy: who drives.
-        population: the human drivers; those behind are the first of it.
+        strategy: the strategy.
+        population: the human drivers; those behind are its first ones.
         speeds: of the vehicle [m/s].
         gaps: to the vehicle ahead [m].
         relative_speeds: v_ahead − v [m/s]; those that would need a negative speed are left out.
 
     Returns:
-        One row per gap, speed and relative speed: the executed acceleration [m/s²] and, of
-        a hybrid, who drives: ``winner``, 0 for the rule and 1 for the policy.
-
-    Raises:
-        LccError: if the strategy cannot drive there.
+        One row per gap, speed and relative speed: the executed acceleration [m/s²] and, for a
+        hybrid, ``winner``: 0 for the rule, 1 for the policy.
     """
     pairs = torch.tensor([(v, x) for v in speeds for x in relative_speeds if v + x >= 0.0])
     place = torch.cartesian_prod(torch.tensor(gaps), torch.arange(len(pairs)).float())
     gap, profile = place[:, :1], place[:, 1].long()
     speed, relative = pairs[profile].split(1, -1)
-    leaders = _leaders(pairs.sum(-1).tolist(), strategy)
+    scenario = strategy.cfg.scenario
+    records = [torch.full((scenario.horizon + 1,), v) for v in pairs.sum(-1).tolist()]
+    names = [f"leader {number}" for number in range(len(records))]
+    leaders = from_records(records, names, names, scenario.time_step)
     situation = Situation(speed, speed + relative, gap)
     before, reached = _step(strategy, population, leaders, profile, situation)
     own = before.get(INDEX)[..., :1].unsqueeze(-1)
@@ -92,26 +92,17 @@ def _step(
     profile: Tensor,
     situation: Situation,
 ) -> tuple[TensorDictBase, State]:
-    """Return the first moment of episodes behind given leaders, and the one reached from it."""
     cfg, people = any_leader(strategy.cfg), len(population.time_gap)
     env = build_env(cfg, leaders, population, len(profile), 0, "cpu", nominal=True)
     given = reset_options(env, profile, torch.zeros_like(profile), cfg.seed, people)
     before = _begin(pieces_of(env), given, cfg.scenario.horizon, situation)
     policy = strategy.policy
-    if isinstance(policy, nn.Module):  # it may be on a GPU, which so little does not need
+    if isinstance(policy, nn.Module):
         policy = deepcopy(policy).to("cpu")
     with torch.no_grad():
         if policy is not None:
             before.set(ACTION, policy(before).get(ACTION))
         return before, Step(pieces_of(env), cfg.scenario.horizon)(entries(before))
-
-
-def _leaders(speeds: Sequence[float], strategy: Strategy) -> Profiles:
-    """Return a leader at each constant speed, for a whole episode."""
-    scenario = strategy.cfg.scenario
-    records = [torch.full((scenario.horizon + 1,), speed) for speed in speeds]
-    names = [f"{speed:g} m/s" for speed in speeds]
-    return from_records(records, names, names, scenario.time_step)
 
 
 def _begin(
@@ -120,7 +111,6 @@ def _begin(
     horizon: int,
     situation: Situation,
 ) -> TensorDictBase:
-    """Return the first moment of episodes that begin in given situations."""
     start: TensorDictBase = TensorDict(batch_size=given.batch_size)
     seeds = given.get(SEED)
     for key, value in tick(seeds, torch.zeros_like(seeds), horizon).items():
@@ -139,7 +129,6 @@ def _place(
     start: TensorDictBase,
     situation: Situation,
 ) -> None:
-    """Place the vehicles: all as they would follow steadily at a speed, but one and those ahead."""
     leader = start.get(LEADER_SPEED, None)
     if leader is not None:
         start.set(LEADER_SPEED, situation.speed)

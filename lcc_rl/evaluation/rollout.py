@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,8 +10,8 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.finite import ACTION, Written, check_moment
-from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written, written_by
+from lcc_rl.envs.finite import ACTION, check_numbers
+from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import MASK, STREAM, hash_bits
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
@@ -21,7 +20,7 @@ from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Record = dict[Key, Tensor]
 # The moment reached, the entries to keep, who still runs, and a sum of all that was written.
-Advanced = tuple[State, list[Tensor], Tensor, Tensor]
+Advanced = tuple[State, list[Tensor], Tensor]
 PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
 
 
@@ -67,6 +66,10 @@ class Player:
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
         needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
         self.step = Step(needed, self.horizon)
+        # What the policy and every controller wish is checked, too, whatever a filter makes of it.
+        wishes = [key for piece in needed for key in piece.targets if key[0] == "command"]
+        driven = [] if policy is None else [ACTION]
+        self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
         self.compiled = compiled
         self.record: Record = {}
         self.advance = Compiled(self._advance, "the evaluation", compiled)
@@ -87,54 +90,39 @@ class Player:
             Diverged: if the action, or an entry that is written, is not a number; what the policy
                 and every controller wish counts, not what a filter makes of it.
         """
-        start = self._begin(given)
-        record, alive, lost = self._played(start, self.advance if self.compiled else self._checked)
-        # A compiled step cannot name what is not a number, nor keep it out of what follows.
-        return self._played(start, self._checked)[:2] if lost else (record, alive)
-
-    def _played(self, state: State, advance: Callable[..., Any]) -> tuple[Record, Tensor, bool]:
-        """Return the record, who runs at each step, and whether anything is not a number."""
-        record = self.record
-        running, alive, sums = torch.ones_like(state[TERMINATED]), [], []
+        state, record = self._begin(given), self.record
+        running, alive = torch.ones_like(state[TERMINATED]), []
         for step in range(self.horizon):
             alive.append(running)
-            before, (state, kept, running, total) = state, advance(state, running)
-            for key, value in zip(self.kept, kept, strict=True):
+            before, (state, kept, running) = state, self.advance(state, running)
+            for key, value in zip(self.checked, kept, strict=True):
                 first = int(key[-1] == "speed")
                 if key not in record:  # written in place: a stack would hold everything twice
                     record[key] = value.new_empty((self.horizon + first, *value.shape))
                 if first and step == 0:
                     record[key][0] = before[key]
                 record[key][step + first] = value
-            sums.append(total)
-        return record, torch.stack(alive), not bool(torch.stack(sums).isfinite().all())
+        after = {key: record[key][-self.horizon :] for key in self.checked}
+        if check_numbers(after, torch.stack(alive), who=self.who):
+            for value in after.values():
+                value.nan_to_num_(0.0, 0.0, 0.0)
+        return {key: record[key] for key in self.kept}, torch.stack(alive)
 
     def _begin(self, given: TensorDictBase) -> State:
-        """Return the first moment of the episodes, whose entries are checked."""
+        """Return the first moment of the episodes."""
         state = entries(self.env.reset(given))
-        start = [entry for piece in self.pieces for entry in written_by(piece, state)]
-        check_moment(start, state, torch.ones_like(state[TERMINATED]), self.pieces, self.who)
         if self.policy is not None and not self.reads:
             return state  # it may read anything
         carried = {SEED, STEP, TERMINATED, *written(piece for piece, _ in self.step.pieces)}
         return {key: value for key, value in state.items() if key in carried}
 
-    def _checked(self, state: State, running: Tensor) -> Advanced:
-        """Take a step whose entries are checked, and made numbers where an episode is over."""
-        reached = self.step.checked({**state, **self._action(state)}, running, self.who)
-        return self._after(state, reached, running, running.new_zeros((), dtype=torch.float32))
-
     def _advance(self, state: State, running: Tensor) -> Advanced:
-        """Take a step and add up everything that it writes: a sum that no NaN or inf leaves."""
+        """Return the moment reached, the entries to keep, and who still runs."""
         before = {**state, **self._action(state)}
-        watched = [Written(ACTION, before[ACTION])] if ACTION in before else []
-        reached = self.step(before, watched)
-        sums = [entry.value.sum() for entry in watched if entry.value.is_floating_point()]
-        return self._after(state, reached, running, torch.stack(sums).sum())
-
-    def _after(self, state: State, reached: State, running: Tensor, total: Tensor) -> Advanced:
+        reached = self.step(before)
         after = {key: reached.get(key, value) for key, value in state.items()}
-        return after, [reached[key] for key in self.kept], running & ~reached[TERMINATED], total
+        shown = {**before, **reached}
+        return after, [shown[key] for key in self.checked], running & ~reached[TERMINATED]
 
     def _action(self, state: State) -> State:
         """Return the action of the policy; none where there is no policy."""

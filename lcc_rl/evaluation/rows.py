@@ -1,4 +1,4 @@
-"""Rows of episodes.parquet: what the record of a batch of episodes is turned into.
+"""Rows of episodes.parquet from the record of a batch of episodes.
 
 Columns named ``cav_…`` belong to the automated vehicles of the string, ``hdv_…`` to all others;
 energies and distances add up over them.
@@ -39,7 +39,7 @@ SUMMED = (
     "acceleration_loss_kj",
     "path_energy_kj",
 )
-# What a step of a sample episode says of its episode.
+# Columns of an episode that the steps of a sample episode repeat.
 SAMPLED = (
     "strategy",
     "training_seed",
@@ -57,7 +57,7 @@ Groups = dict[str, dict[str, Tensor]]
 
 
 def grouped(record: Record, string: VehicleString) -> Groups:
-    """Divide the record of a string into that of its automated vehicles and of all others."""
+    """Divide a record into the leader's, that of the automated vehicles and that of all others."""
     groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
     own = list(string.places(AUTOMATED))
     others = [place for place in range(len(string)) if place not in own]
@@ -76,7 +76,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
             taken = (place == index.unsqueeze(-1)).any(-2)
             order = taken.int().argsort(stable=True, dim=-1)
             rest = order[..., : len(others)].sort(-1).values
-            groups["cav"]["place"] = record[INDEX]  # no other entry tells it
+            groups["cav"]["place"] = record[INDEX]
             for group, chosen in (("cav", index), ("hdv", rest)):
                 at = chosen.expand(entry.shape[0], *chosen.shape)
                 groups[group][name] = gather(entry, at)
@@ -159,7 +159,7 @@ def describe(
     driver: Tensor,
     repeat: Tensor | None = None,
 ) -> pd.DataFrame:
-    """Say which episodes a batch holds: strategy, profile, its source, driver and repeat."""
+    """Return strategy, profile, driver and repeat of every episode of a batch."""
     columns = {
         "strategy": strategy.name,
         "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
@@ -176,7 +176,7 @@ def describe(
 
 
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
-    """Return v0 [m/s] by episode: that of the one driver of a strategy, or of the episode's."""
+    """Return v0 [m/s] by episode: the strategy's own one, or that of the episode's driver."""
     controllers = strategy.cfg.scenario.controllers
     own = controllers.get(AUTOMATED) if string_of(strategy.cfg).count(AUTOMATED) else None
     given = None if own is None else own.get("desired_speed")
@@ -185,14 +185,11 @@ def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
 
 
 def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> np.ndarray:
-    """Return the share of time in which the leader of each episode drives faster than v0."""
-    ids, place = np.unique(profile.numpy(), return_inverse=True)
+    """Return the share of time in which the leader of each episode drives faster than v0 [m/s]."""
     shares = np.zeros(len(desired))
-    for number, index in enumerate(ids):
-        speeds = np.sort(profiles.record(int(index)).numpy())
-        rows = place == number
-        slower = np.searchsorted(speeds, desired[rows], side="right")
-        shares[rows] = 1.0 - slower / len(speeds)
+    for index in profile.unique().tolist():
+        speeds, rows = profiles.record(index).numpy(), (profile == index).numpy()
+        shares[rows] = 1.0 - (speeds[:, None] <= desired[rows]).mean(0)
     return shares
 
 
@@ -203,15 +200,13 @@ def leader_measures(
 
     The leader has the first energy model.
     """
-    energy = as_fleet(energy)
-    ids, place = np.unique(profile.numpy(), return_inverse=True)
-    rows = []
-    for index in ids:
-        speed = profiles.record(int(index))
-        power = energy.path_power(speed[:-1], speed.diff() / profiles.time_step)
+    fleet, found = as_fleet(energy), {}
+    for index in profile.unique().tolist():
+        speed = profiles.record(index)
+        power = fleet.path_power(speed[:-1], speed.diff() / profiles.time_step)
         drawn = power.sum() * profiles.time_step * KILO
-        rows.append((float(drawn), float(speed.mean())))
-    return pd.DataFrame(np.array(rows)[place], columns=list(LEADER))
+        found[index] = (float(drawn), float(speed.mean()))
+    return pd.DataFrame([found[index] for index in profile.tolist()], columns=list(LEADER))
 
 
 def sample(

@@ -1,128 +1,120 @@
-"""Strategies: what drives the automated vehicles of a string in an evaluation.
+"""Strategies: policies and rules that drive the automated vehicles of an evaluation.
 
 All strategies of an evaluation share the scenario under study: its drivers, energy model, noise
-and pieces. A strategy differs in who drives the automated vehicles and what that one observes.
+and pieces. They differ in the controller of the automated vehicles and in its observation.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import load, plain, require, short_name
-from lcc_rl.config_checks import AUTO
+from lcc_rl.config import load
 from lcc_rl.envs.inputs import string_of
-from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.nodes import TARGET, short_name
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.policies import shared_policy
-from lcc_rl.targets import TARGET
+from lcc_rl.schemas import AUTO, StudyConfig
 
 log = logging.getLogger("lcc_rl")
 
-# Pieces that belong to what a policy observes, not to the traffic.
-KNOWLEDGE = ("memory", "preview")
-GAINS = ("path", "paper_like", "tuned")
-PLACE = "controller@scenario.controllers.automated"
-# Cruise controls whose constants were tuned, also behind the safety filter: they keep it.
+POLICY = "policy.pt"
+KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
+PLACE = f"controller@{AUTO}"
+# Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
 TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
 FILTERED = "_filtered"
-# Baselines by name: the controller of the automated vehicles, by what makes it.
+# Settings that make the controller of each baseline.
 BASELINES = {
     "idm": ("variant=idm",),
-    "human": ("variant=idm", *(f"{AUTO}.{x}=null" for x in ("desired_speed", "time_gap"))),
+    "human": ("variant=idm", f"{AUTO}.desired_speed=null", f"{AUTO}.time_gap=null"),
     **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
-    **{f"cacc {gains}": ("variant=cacc", f"gains={gains}") for gains in GAINS},
+    **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
+    # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
+    "mpc_far": ("variant=idm", f"{AUTO}.longest_gap=-4.0", f"{PLACE}=mpc"),
     "deadbeat": ("variant=deadbeat",),
-    "deadbeat oracle": ("variant=deadbeat", "scenario.controllers.automated.lookahead=oracle"),
+    "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
 }
-DIRECT = "direct"
+DIRECT = "direct"  # a string without automated vehicles
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
-TrainedPolicy = tuple[dict[str, Any], DictConfig]  # weights and configuration
+TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 
 @dataclass(frozen=True)
 class Strategy:
-    """A way to drive the automated vehicles.
+    """A controller of the automated vehicles, and its environment.
 
     Args:
-        name: how tables call it.
+        name: name in tables.
         cfg: configuration of its environment.
-        policy: writes ``("automated", "action")``, deterministic; None where a rule drives.
-        seed: training seed, for the tables; None where nothing was learned.
+        policy: deterministic, writes ``("automated", "action")``; None for a rule.
+        seed: training seed; None for a rule.
         source: file or folder that the policy was read from.
     """
 
     name: str
-    cfg: DictConfig
+    cfg: StudyConfig
     policy: Policy | None = None
     seed: int | None = None
     source: str = ""
 
     @property
     def title(self) -> str:
-        """How messages call it."""
+        """Name in messages."""
         return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
 
 
-def _copy(cfg: DictConfig) -> DictConfig:
-    cfg = cfg.copy()
-    OmegaConf.set_struct(cfg, False)
-    return cfg
-
-
-def deployed(cfg: DictConfig) -> DictConfig:
+def deployed(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration in which the automated vehicles drive as after training."""
-    return cfg if cfg.get("deployed") is None else driven_by(cfg, cfg.deployed)
+    return cfg if cfg.deployed is None else driven_by(cfg, cfg.deployed)
 
 
-def driven_by(cfg: DictConfig, controller: Any) -> DictConfig:
+def driven_by(cfg: StudyConfig, controller: Any) -> StudyConfig:
     """Return a configuration in which another controller drives the automated vehicles."""
-    cfg = _copy(cfg)
-    cfg.scenario.controllers.automated = controller
+    cfg = deepcopy(cfg)
+    cfg.scenario.controllers[AUTOMATED] = controller
     cfg.deployed = None
     return cfg
 
 
-def baselines(cfg: DictConfig, further: Sequence[str] = ()) -> list[Strategy]:
-    """Build the baselines that an evaluation names, and further ones, in the scenario under study.
-
-    Raises:
-        ConfigError: if there is none of a name.
-    """
+def baselines(cfg: StudyConfig, further: Sequence[str] = ()) -> list[Strategy]:
+    """Build the baselines that an evaluation names, and further ones."""
     names = [*cfg.evaluation.baselines, *further]
     return [baseline(cfg, name) for name in dict.fromkeys(names) if applies(cfg, name)]
 
 
-def applies(cfg: DictConfig, name: str) -> bool:
-    """Whether a baseline means anything for a string: there must be somebody to drive."""
+def applies(cfg: StudyConfig, name: str) -> bool:
+    """Return whether a string has the vehicles that a baseline drives."""
     roles = set(string_of(cfg).names)
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
-def baseline(cfg: DictConfig, name: str) -> Strategy:
-    """Build a baseline in the scenario under study; its own settings where it is the one studied.
+def baseline(cfg: StudyConfig, name: str) -> Strategy:
+    """Build a baseline in the scenario under study, with the settings of the variant under study.
 
     Raises:
-        ConfigError: if there is none of that name, or no filter for constants tuned behind it.
+        ConfigError: if the name is unknown, or needs the safety filter and there is none.
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
     behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
-    require(behind or not named, f"{name} drives behind the safety filter: say +filter=cbf")
+    require(behind or not named, f"{name} drives behind the safety filter: add +filter=cbf")
     controller = baseline_controller(name, suffix := FILTERED * (behind and name in TUNED))
     if named or suffix:
         return Strategy(name, driven_by(cfg, controller))
@@ -131,35 +123,39 @@ def baseline(cfg: DictConfig, name: str) -> Strategy:
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
-@cache  # looked up for every name
+@cache
 def rules() -> tuple[str, ...]:
-    """Return the names of all baselines and of the files of conf/controller, no name twice."""
+    """Return the names of all baselines and of the files of conf/controller."""
     shipped = Path(str(files("lcc_rl.conf"))) / "controller"
     found = sorted(path.stem for path in shipped.glob("*.yaml") if path.stem not in NEEDY)
     return tuple(dict.fromkeys([DIRECT, *BASELINES, *found]))
 
 
-@cache  # composed once: an evaluation asks for each several times
+@cache
 def baseline_controller(name: str, suffix: str = "") -> Any:
-    """Return the node of a baseline's controller, of a tuned one also behind the filter.
+    """Return the node of a baseline's controller.
+
+    Args:
+        name: name of the baseline.
+        suffix: ``"_filtered"`` for the constants of a tuned one behind the safety filter.
 
     Raises:
-        ConfigError: if there is none of that name.
+        ConfigError: if the name is unknown.
     """
     if name not in rules():
         raise unknown_name("baseline", name, rules())
     *first, last = BASELINES.get(name, ("variant=idm", f"{PLACE}={name}"))
-    return plain(load("evaluate", [*first, last + suffix]).scenario.controllers.automated)
+    return load("evaluate", [*first, last + suffix]).scenario.controllers[AUTOMATED]
 
 
-def without_filter(cfg: DictConfig) -> DictConfig:
+def without_filter(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration without a safety filter of the automated vehicles."""
-    cfg = _copy(cfg)
+    cfg = deepcopy(cfg)
     cfg.scenario.filters.pop(AUTOMATED, None)
     return cfg
 
 
-def without_automated(cfg: DictConfig) -> DictConfig:
+def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose string lacks the automated vehicles."""
     roles = [role for role in string_of(cfg).roles if role != AUTOMATED]
     cfg = without_filter(cfg)
@@ -167,35 +163,31 @@ def without_automated(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def rule(cfg: DictConfig) -> Strategy:
-    """Return the strategy of a configuration that learns nothing, named after its variant.
+def rule(cfg: StudyConfig) -> Strategy:
+    """Return the strategy of a configuration that learns nothing.
 
-    After the controller where that is another, and ``direct`` where nobody is automated.
+    Its name is that of the variant, or of the controller's class where that is not the variant's.
     """
     if not string_of(cfg).count(AUTOMATED):
         return Strategy(DIRECT, cfg)
     try:
         own = _target(load("evaluate", [f"variant={cfg.variant}"]))
-    except ConfigError:  # a variant of the user's own, known to this command line only
+    except ConfigError:  # a variant of the user's own that only this command line knows
         own = _target(cfg)
     name = cfg.variant if _target(cfg) == own else short_name(_target(cfg))
     return Strategy(name, deployed(cfg))
 
 
-def _target(cfg: DictConfig) -> str:
-    return str(cfg.scenario.controllers.automated.get(TARGET))
+def _target(cfg: StudyConfig) -> str:
+    return str(cfg.scenario.controllers[AUTOMATED].get(TARGET))
 
 
-def _baseline_controllers(cfg: DictConfig) -> list[Any]:
-    """Return the nodes of the controllers of all baselines in which somebody is automated."""
-    return [
-        plain(strategy.cfg.scenario.controllers.automated)
-        for strategy in baselines(cfg)
-        if strategy.name != DIRECT
-    ]
+def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
+    automated = (one for one in baselines(cfg) if one.name != DIRECT)
+    return [one.cfg.scenario.controllers[AUTOMATED] for one in automated]
 
 
-def no_policy(cfg: DictConfig) -> ConfigError:
+def no_policy(cfg: StudyConfig) -> ConfigError:
     """Return the error for a learned variant without a policy."""
     return ConfigError(
         f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
@@ -204,9 +196,9 @@ def no_policy(cfg: DictConfig) -> ConfigError:
 
 
 def studied(
-    cfg: DictConfig, policy: TrainedPolicy | None, population: Population
+    cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
-    """Build what the configuration asks for; of a hybrid, its parents and its oracle, too.
+    """Build the strategy under study; of a hybrid, its parents and its oracle, too.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.
@@ -214,11 +206,11 @@ def studied(
         population: the human drivers.
 
     Raises:
-        ConfigError: if it needs a policy and none is given, or the policy does not fit.
+        ConfigError: if the variant needs a policy that is not given, or the policy does not fit.
     """
     if not learns(cfg):
         strategy = rule(cfg)
-        known = plain(cfg.scenario.controllers.automated) in _baseline_controllers(cfg)
+        known = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
         same = known and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
         named = strategy.name in cfg.evaluation.baselines
         return [] if same or named else [strategy]
@@ -226,31 +218,37 @@ def studied(
         raise no_policy(cfg)
     weights, own_cfg = policy
     check_policy(cfg, own_cfg)
-    cfg = _copy(cfg)
-    cfg.agent = own_cfg.agent
-    if cfg.scenario.filters.get(AUTOMATED) is None and own_cfg.scenario.filters.get(AUTOMATED):
-        log.info("policy=%s was trained with a filter and keeps it", cfg.policy)
-        cfg.scenario.filters.automated = own_cfg.scenario.filters.automated
+    cfg = _of_training(cfg, own_cfg)
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
+
+
+def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
+    """Return the scenario under study with the agent, and where it has none the filter, of own."""
+    cfg = deepcopy(cfg)
+    cfg.agent = own.agent
+    if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
+        log.info("the policy of variant %s keeps the filter of its training", own.variant)
+        cfg.scenario.filters[AUTOMATED] = own.scenario.filters[AUTOMATED]
+    return cfg
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, the parents it is composed of, and its oracle."""
     cfg = strategy.cfg
-    parent = driven_by(cfg, cfg.scenario.controllers.automated)
+    parent = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
     found = [replace(strategy, name=short_name(cfg.agent[TARGET]), cfg=parent)]
-    parent_rule = plain(cfg.deployed).get("rule")
+    parent_rule = cfg.deployed.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
         found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
     if set(string_of(cfg).names) == {AUTOMATED}:
-        knowing = driven_by(cfg, {**plain(cfg.deployed), "lookahead": "oracle"})
+        knowing = driven_by(cfg, {**cfg.deployed, "lookahead": "oracle"})
         found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found
 
 
-def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
+def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
     """Build a trained strategy to compare with, in the scenario under study.
 
     Args:
@@ -260,17 +258,14 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
         population: the human drivers.
 
     Raises:
-        ConfigError, ResultsError: if the policy does not fit the scenario or its own network.
+        LccError: if the policy does not fit the scenario or its own network.
     """
     weights, own = policy
-    other = _copy(cfg)
     check_scenario(path, own, cfg)
-    for key in ("variant", "agent", "observation"):
-        other[key] = own[key]
-    other.deployed = own.get("deployed")
-    other.scenario.controllers.automated = own.scenario.controllers.automated
-    if other.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
-        other.scenario.filters.automated = own.scenario.filters.automated
+    other = _of_training(cfg, own)
+    other.variant, other.observation = own.variant, own.observation
+    other.deployed = own.deployed
+    other.scenario.controllers[AUTOMATED] = own.scenario.controllers[AUTOMATED]
     for name, node in own.scenario.pieces.items():
         if name in KNOWLEDGE or name not in other.scenario.pieces:
             other.scenario.pieces[name] = node
@@ -280,7 +275,7 @@ def trained(cfg: DictConfig, path: str, policy: TrainedPolicy, population: Popul
 
 
 def with_weights(
-    cfg: DictConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
+    cfg: StudyConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
 ) -> Strategy:
     """Build a strategy and load its policy's weights.
 
@@ -298,3 +293,53 @@ def with_weights(
         words = f"the weights do not fit the policy network: {' '.join(str(error).split())}"
         raise ResultsError(f"{path}: {words}") from error
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)
+
+
+def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Return strategies whose names differ wherever their training differs by more than the seed.
+
+    A variant that several kinds of agents learned gets the agent's name; one whose settings differ
+    otherwise gets the name of the file or folder that its policy comes from.
+    """
+    kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
+    found = _where_several(strategies, kinds, kinds)
+    return _where_several(found, [_settings(one) for one in found], [_place(one) for one in found])
+
+
+def _where_several(
+    strategies: Sequence[Strategy], marks: Sequence[str], labels: Sequence[str]
+) -> list[Strategy]:
+    different = Counter(
+        name for name, _ in {(s.name, m) for s, m in zip(strategies, marks, strict=True)}
+    )
+    return [
+        replace(one, name=f"{one.name} {label}") if different[one.name] > 1 else one
+        for one, label in zip(strategies, labels, strict=True)
+    ]
+
+
+def _settings(strategy: Strategy) -> str:
+    if strategy.policy is None:
+        return ""
+    cfg = strategy.cfg
+    return json.dumps([cfg.agent, cfg.scenario.filters], sort_keys=True)
+
+
+def _place(strategy: Strategy) -> str:
+    path = Path(strategy.source)
+    return path.parent.name if path.name == POLICY else path.name.removesuffix(".pt")
+
+
+def check_distinct(strategies: Sequence[Strategy]) -> None:
+    """Refuse two policies of one name and seed.
+
+    Raises:
+        ConfigError: naming the variant and the seed.
+    """
+    counts = Counter((strategy.name, strategy.seed) for strategy in strategies)
+    for name, seed in (key for key, count in counts.items() if count > 1):
+        which = name if seed is None else f"{name} with training seed {seed}"
+        raise ConfigError(
+            f"policy and compare name two policies of variant {which}, whose rows could not be "
+            "distinguished; evaluate them one after the other"
+        )

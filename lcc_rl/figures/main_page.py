@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
 from rich.markup import escape
 from rich.table import Table
 
@@ -16,6 +15,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.savings import UNTRAINED
 from lcc_rl.results.tables import PATH, ROWS, summary
+from lcc_rl.schemas import StudyConfig
 
 TITLE = "lcc_rl: data → drivers → policies → results"
 WHO = {
@@ -45,10 +45,11 @@ CAPTION = (
     "Energy of both cars per episode without what their motion stores; 95 % intervals over "
     "windows. Shares of the time: time-to-collision < 4 s; time gap > 2.5 s above 1 m/s."
 )
-LIMIT = "agent.limits.efficiency"
+LIMIT = "efficiency"
 HELD_TO = (
-    f"The networks learn within a limit of long time gaps, {LIMIT}={{limit}} of the time; rows "
-    "with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these data."
+    f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
+    "time; rows with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these "
+    "data."
 )
 # Files of figures, in the job's folder and without their ending, and their captions.
 RESULTS = {
@@ -62,13 +63,14 @@ DRIVERS = {
 }
 
 
-def caption_of(trainings: Iterable[DictConfig]) -> str:
+def caption_of(trainings: Iterable[StudyConfig]) -> str:
     """Return the caption of the table, with the limit that the networks are trained to keep.
 
     Args:
         trainings: configuration of each.
     """
-    limits = {OmegaConf.select(cfg, LIMIT) for cfg in trainings} - {None}
+    found = [((cfg.agent or {}).get("limits") or {}).get(LIMIT) for cfg in trainings]
+    limits = {limit for limit in found if limit is not None}
     held = ", ".join(f"{limit:.2g}" for limit in sorted(limits))
     return CAPTION if not limits else f"{CAPTION} {HELD_TO.format(limit=held)}"
 

@@ -1,7 +1,7 @@
-"""A policy or rule that drives vehicles of another simulator by what they measure.
+"""Policies and rules that drive vehicles of another simulator by their measurements.
 
-It is made of the pieces of the environment: the network with its filter (:mod:`.export`), the
-memory that it observes, or the controller. The other simulator takes the place of the motion.
+A driver consists of pieces of the environment: the network with its filter (:mod:`.export`), the
+memory that it observes, or the controller.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from lcc_rl.config import build_as
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.strategies import DIRECT, FILTERED, baseline_controller, rules
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
+from lcc_rl.nodes import build
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World
@@ -38,10 +38,10 @@ MEASURED: tuple[Key, ...] = (
 
 
 class Measured(NamedTuple):
-    """What one vehicle measures: of itself, the vehicle ahead and the one behind.
+    """Measurements of one vehicle, of the vehicle ahead and of the one behind.
 
     Speeds [m/s], gaps bumper to bumper [m], accelerations executed during the last step [m/s²];
-    ``present`` is 1 where there is a vehicle behind, else 0.
+    ``present`` is 1 if there is a vehicle behind, else 0.
     """
 
     speed: float
@@ -56,7 +56,7 @@ class Measured(NamedTuple):
 
 
 def entries(rows: Sequence[Measured]) -> State:
-    """Return the same as entries of an environment, one row per vehicle."""
+    """Return measurements as entries of an environment, one row per vehicle."""
     table = torch.tensor(rows, dtype=torch.float32)
     seen = dict(zip(Measured._fields, table.split(1, -1), strict=True))
     state: State = {PRESENT: seen["present"]}
@@ -71,7 +71,7 @@ def entries(rows: Sequence[Measured]) -> State:
 
 
 class Driver:
-    """Computes accelerations of any number of vehicles, and what each remembers.
+    """Computes accelerations of any number of vehicles, and updates their memories.
 
     Args:
         name: a run folder, a policy file, ``pretrained/<name>``, a rule (``"idm_acc"``), or the
@@ -80,12 +80,11 @@ class Driver:
         trust: modules outside this package that a policy may name.
 
     Attributes:
-        kept: keys of what is remembered from step to step.
+        kept: keys of the entries that are remembered from step to step.
 
     Raises:
-        ConfigError: if there is no such policy or rule, it reads what is not measured, or it was
-            trained with another step.
-        ResultsError: if the policy's file is missing or damaged.
+        LccError: if the policy or rule is unknown, was trained with another step, or reads an
+            entry that is not measured.
     """
 
     def __init__(
@@ -120,10 +119,9 @@ class Driver:
 
     def _build(self, kind: type[StepTransform], node: Any) -> Any:
         world = World(STRING, self.time_step, population=bootstrap())
-        return build_as(f"a {kind.__name__}", kind, node, self.name, world=world)
+        return build(node, self.name, kind, world=world)
 
     def _check(self) -> None:
-        """Check that all that is read is measured or remembered."""
         for key in self.reads():
             if key not in (*MEASURED, *self.kept):
                 known = ", ".join(".".join(key) for key in MEASURED)
@@ -132,13 +130,13 @@ class Driver:
                 )
 
     def reads(self) -> list[Key]:
-        """Return the keys of all that is read."""
+        """Return the keys of all entries that the driver reads."""
         names = [] if self.module is None else self.module.names
         sources = [key for piece in self.pieces for _, key in piece.needs]
         return [*sources, *(place(name)[0] for name in names)]
 
     def begin(self, measured: State) -> State:
-        """Return what vehicles remember that are driven for the first time.
+        """Return the memories of vehicles that are driven for the first time.
 
         Args:
             measured: the entries :data:`MEASURED`, one row per vehicle.
@@ -152,11 +150,11 @@ class Driver:
 
     @torch.no_grad()
     def __call__(self, measured: State, kept: State) -> tuple[Tensor, State]:
-        """Return accelerations ``[vehicles]`` [m/s²] and what is remembered from now on.
+        """Return accelerations ``[vehicles]`` [m/s²] and the memories after this step.
 
         Args:
             measured: the entries :data:`MEASURED`, one row per vehicle; see :func:`entries`.
-            kept: what the step before returned, or :meth:`begin`.
+            kept: memories of the step before, or of :meth:`begin`.
         """
         reached = dict(measured)
         for piece in self.pieces:
@@ -169,7 +167,7 @@ class Driver:
 
 
 def place(name: str) -> tuple[Key, int]:
-    """Return key and row, or column, at which a vehicle finds what an exported policy reads."""
+    """Return the key of an exported policy's input, and its row or column in that entry."""
     view, entry, *column = name.split(".")
     if (view, entry) == PRESENT:
         return PRESENT, int(*column)
@@ -180,13 +178,13 @@ def place(name: str) -> tuple[Key, int]:
 
 
 def value(state: State, name: str) -> Tensor:
-    """Return what an exported policy reads under a name, ``[vehicles]``."""
+    """Return an input of an exported policy, ``[vehicles]``."""
     key, index = place(name)
     return state[key].flatten(1)[:, index]
 
 
 def known_rules() -> list[str]:
-    """Return the names of the rules that drive by what is measured, without filter or messages."""
+    """Return the names of the rules that need neither messages nor the safety filter."""
     return [
         name
         for name in rules()

@@ -1,7 +1,7 @@
-"""Trained policies as files that other software runs: ONNX, or PyTorch's ``.pt2``.
+"""Export of trained policies as ONNX or PyTorch's ``.pt2``.
 
-An exported policy takes what one vehicle measures in SI units and returns its acceleration: the
-scales of the observation, the network and the safety filter, where it has one, are inside.
+An exported policy takes the measurements of one vehicle in SI units and returns its acceleration;
+it contains the scales of the observation, the network and the safety filter, if there is one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lcc_rl.pieces.entries import ENTRIES
 from lcc_rl.results.policies import load_policy
 from lcc_rl.version import __version__
 
-# What follows from other measurements is computed inside: v_ahead − v.
+# Entries computed inside from other measurements: v_ahead − v.
 DERIVED = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
@@ -52,10 +52,10 @@ class ExportedPolicy(nn.Module):
     """From measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
     Args:
-        network: of the scaled observation, with actions in [−1, 1].
-        observation: the piece that gathers and scales.
-        action: the piece that makes accelerations of actions.
-        safety: the filter behind them; None: none.
+        network: from the scaled observation to actions in [−1, 1].
+        observation: the piece that gathers and scales measurements.
+        action: the piece that turns actions into accelerations.
+        safety: the safety filter, or None.
     """
 
     constants: Tensor
@@ -80,7 +80,6 @@ class ExportedPolicy(nn.Module):
         return tuple(self.names.index(base) for base in bases)
 
     def _value(self, state: Tensor, places: tuple[int, ...]) -> Tensor:
-        """Return a measurement, or the difference of two where it exists, ``[batch, 1]``."""
         first, *others = (state[:, place : place + 1] for place in places)
         difference = first - others[0] if others else first
         return difference * others[1] if len(others) > 1 else difference
@@ -100,12 +99,12 @@ class ExportedPolicy(nn.Module):
         return filtered
 
     def inputs(self) -> list[Input]:
-        """Return what the columns of the input are, in order."""
+        """Return the columns of the input in order."""
         return [described(name) for name in self.names]
 
 
 def described(name: str) -> Input:
-    """Return unit and meaning of a measurement by its name, as ``"ahead.speed"``."""
+    """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
     view, entry = name.split(".")[:2]
     whose = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
     for key in (("vehicles", entry), (view, entry), ("role", entry)):
@@ -116,16 +115,7 @@ def described(name: str) -> Input:
 
 
 def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy:
-    """Build the module that is exported.
-
-    Args:
-        policy: a run folder, a policy file, or ``pretrained/<name>``.
-        trust: modules outside this package that it may name.
-
-    Raises:
-        ConfigError: if no such policy ships, or it cannot be exported.
-        ResultsError: if the file is missing or damaged.
-    """
+    """Build the module that is exported; arguments as for :func:`export`."""
     weights, cfg = load_policy(policy, trust=trust)
     population = bootstrap()
     scenario = cfg.scenario

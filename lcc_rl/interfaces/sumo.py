@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.errors import ConfigError
 from lcc_rl.interfaces.driver import PRESENT, Driver, Measured, entries
 from lcc_rl.pieces.base import SEED, STEP, State
 
@@ -40,25 +40,21 @@ def load_sumo() -> Any:
 class Bridge:
     """Lets a policy or a rule drive vehicles of the SUMO simulation that runs in libsumo.
 
-    The commands are executed exactly: SUMO's checks of speeds are off for the vehicles driven
-    (speed mode 0), those of right of way and traffic lights, too. A vehicle with nobody ahead
-    within ``sight`` is driven by SUMO's own model, and remembers nothing of before. One with
-    nobody behind, whose policy does not observe that, believes in one at its own speed and gap.
-    Lanes are SUMO's matter.
+    The commands are executed exactly: SUMO's checks of speeds, right of way and traffic lights are
+    off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees nobody
+    ahead within ``sight``; its memory then begins anew. Where nobody is behind and the policy does
+    not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
 
     Args:
         driver: a run folder, a policy file, ``pretrained/<name>``, a rule (``"idm_acc"``), or the
             node of a controller as in ``conf/controller``.
-        vehicles: ids of those driven, or a function that says of an id whether it is one; they may
-            enter later.
-        sight: how far ahead a vehicle is seen, bumper to bumper [m].
+        vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
+        sight: distance at which a vehicle ahead is seen, bumper to bumper [m].
         trust: modules outside this package that a policy may name.
-        seed: of the noise of drivers that have some.
+        seed: seed of the drivers' noise.
 
     Raises:
-        ConfigError: if libsumo is not installed or runs no simulation, or the driver is unknown,
-            of another step or reads what SUMO does not tell.
-        ResultsError: if the policy's file is missing or damaged.
+        LccError: if libsumo is missing or runs no simulation, or the driver cannot drive there.
     """
 
     def __init__(
@@ -69,10 +65,9 @@ class Bridge:
         trust: Sequence[str] = (),
         seed: int = 0,
     ) -> None:
-        require_positive("Bridge", sight=sight)
         self.sumo = load_sumo()
         if not self.sumo.isLoaded():
-            raise ConfigError("SUMO runs no simulation: say libsumo.start([…]) first")
+            raise ConfigError("SUMO runs no simulation: call libsumo.start([…]) first")
         self.driver = Driver(driver, self.sumo.simulation.getDeltaT(), trust)
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
@@ -86,7 +81,7 @@ class Bridge:
         """Set the speeds that the driven vehicles have after SUMO's next step.
 
         Args:
-            execute: False: only measure and remember, while SUMO's own model drives.
+            execute: False to update memories only, while SUMO's own model drives.
 
         Returns:
             The accelerations commanded, by vehicle [m/s²].
@@ -113,7 +108,7 @@ class Bridge:
         return commands
 
     def release(self) -> None:
-        """Let SUMO's own model drive all vehicles again."""
+        """Return all vehicles to SUMO's own model."""
         present = self.sumo.vehicle.getIDList()
         for car in list(self.driven):
             self._release(car, car in present)
@@ -137,7 +132,6 @@ class Bridge:
             self.sumo.vehicle.setSpeed(car, RELEASED)
 
     def _measured(self, car: str) -> Measured | None:
-        """Return what a vehicle measures; None with nobody ahead in sight."""
         cars = self.sumo.vehicle
         ahead, free = cars.getLeader(car, self.sight) or ("", 0.0)
         gap = free + cars.getMinGap(car)  # SUMO's gaps are without the least one desired

@@ -8,29 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.config import complete, plain
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.trust import trusted
+from lcc_rl.schemas import StudyConfig, as_text
 
 PRETRAINED = "pretrained"
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
-# What evaluating a policy reads of the configuration of its training.
-POLICY_KEYS = (
-    *("agent", "observation", "scenario.controllers.automated", "scenario.pieces"),
-    "scenario.filters",
-)
 
 
-def save_policy(weights: Mapping[str, Any], cfg: DictConfig, path: Path) -> None:
+def save_policy(weights: Mapping[str, Any], cfg: StudyConfig, path: Path) -> None:
     """Write a policy's weights and, as text, the configuration of its training."""
     # Copies: weights that are parts of one vector would be stored with all of it.
     own = {name: weight.clone() for name, weight in weights.items()}
-    write_torch({"weights": own, "config": OmegaConf.to_yaml(plain(cfg))}, path)
+    write_torch({"weights": own, "config": as_text(cfg)}, path)
 
 
 def pretrained_path(variant: str) -> Path:
@@ -52,7 +46,7 @@ def pretrained_path(variant: str) -> Path:
 
 def load_policy(
     path: str | Path, variant: str = "", trust: Sequence[str] = ()
-) -> tuple[dict[str, Any], DictConfig]:
+) -> tuple[dict[str, Any], StudyConfig]:
     """Read a policy file without running code from it.
 
     Args:
@@ -79,15 +73,8 @@ def load_policy(
     weights = content["weights"]
     check_weights(weights, path)
     cfg, _ = trusted(parse_yaml(str(content["config"]), f"{path} (config)"), str(path), trust)
-    if not (isinstance(cfg.get("agent"), DictConfig) and isinstance(cfg.get("seed"), int)):
-        raise ResultsError(f"{path}: not the configuration of a training: it has no agent or seed")
-    for key in POLICY_KEYS:
-        if not isinstance(OmegaConf.select(cfg, key), DictConfig):
-            raise ResultsError(f"{path}: its configuration is damaged: {key} is missing")
-    try:
-        complete(cfg)
-    except ConfigError as error:
-        raise ResultsError(f"{path}: its configuration is damaged: {error}") from error
+    if not isinstance(cfg, StudyConfig) or cfg.agent is None:
+        raise ResultsError(f"{path}: not the configuration of a training: it has no agent")
     return weights, cfg
 
 

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any, Literal, overload
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
 from pyarrow.dataset import Dataset
 
-from lcc_rl.config import plain
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, as_dataset, parquet_metadata, read_parquet
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
+from lcc_rl.schemas import BaseConfig, as_plain, as_text
 
 log = logging.getLogger("lcc_rl")
 
@@ -28,13 +27,13 @@ KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "overrides.json"
 SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
 
 
-def save_config(cfg: DictConfig, folder: Path) -> None:
+def save_config(cfg: BaseConfig, folder: Path) -> None:
     """Write the resolved configuration of a run into its folder."""
     with atomic_path(folder / CONFIG) as temporary:
-        temporary.write_text(_as_text(cfg))
+        temporary.write_text(as_text(cfg))
 
 
-def check_folder(cfg: DictConfig, folder: Path) -> None:
+def check_folder(cfg: BaseConfig, folder: Path) -> None:
     """Refuse to write into a folder that holds results, or a stopped run, of other settings.
 
     Raises:
@@ -44,7 +43,7 @@ def check_folder(cfg: DictConfig, folder: Path) -> None:
     if not kept:
         return
     stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
-    keys = differing(dict(flatten(stored)), dict(flatten(parse_yaml(_as_text(cfg), CONFIG))))
+    keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
         raise ResultsError(
@@ -64,11 +63,7 @@ def check_links(folder: Path) -> None:
         raise ResultsError(f"{link}: a link, which may lead out of the folder; put the file there")
 
 
-def _as_text(cfg: DictConfig) -> str:
-    return OmegaConf.to_yaml(OmegaConf.create(plain(cfg)))
-
-
-def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:
+def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     """Read the configuration of a run.
 
     Args:
@@ -88,13 +83,13 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> DictConfig:
     return cfg
 
 
-def stored_config(folder: Path) -> DictConfig:
+def stored_config(folder: Path) -> dict[str, Any]:
     """Read the configuration of a run to draw by, not to build from: it may name any module.
 
     Raises:
         ResultsError: if it is missing or damaged.
     """
-    return DictConfig(read_settings(folder / CONFIG))
+    return read_settings(folder / CONFIG)
 
 
 def read_settings(path: Path) -> dict[str, Any]:

@@ -64,9 +64,9 @@ class Task:
             require_in("task.limits", "[0, inf)", **{column: bound})
 
     def among(self, strategies: Iterable[str]) -> Task:
-        """Return the task; where whom it compares with is not there, with the first who is.
+        """Return the task for an evaluation of these strategies.
 
-        A training ends with an evaluation of its own policy, which meets nobody.
+        If the strategy to compare against was not evaluated, the first that was is used.
         """
         names = list(dict.fromkeys(map(str, strategies)))
         return self if self.against in names else replace(self, against=names[0])

@@ -6,20 +6,19 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.targets import TARGET, find_target, forget_places, settings_at
+from lcc_rl.nodes import TARGET, find_target, forget_places, settings_at
+from lcc_rl.schemas import parse_config
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
-ROOMS = "agents data drivers energy evaluation functional pieces policies runs.loggers synthetic"
+ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
 
 
 def trusted(
     content: dict[str, Any], where: str, trust: Sequence[str] = ()
-) -> tuple[DictConfig, list[str]]:
+) -> tuple[Any, list[str]]:
     """Return a stored configuration that can be built without harm.
 
     Args:
@@ -34,18 +33,17 @@ def trusted(
     Raises:
         ResultsError: naming the key at fault.
     """
+    for key, _, value in settings_at(content):
+        if isinstance(value, str) and "${" in value:
+            raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
     check_targets(content, where, trust)
     places = forget_places(content)
     if "trust" in content:
         content["trust"] = list(trust)
     try:
-        cfg = OmegaConf.create(content)
-    except Exception as error:  # OmegaConf raises many kinds
-        raise ResultsError(f"{where}: damaged: {error}") from error
-    for key, kind in (("variant", str), ("scenario", Mapping), ("evaluation", Mapping)):
-        if not isinstance(content.get(key), kind):
-            raise ResultsError(f"{where}: not the configuration of a run: {key} is missing")
-    return cfg, places
+        return parse_config(content), places
+    except ConfigError as error:
+        raise ResultsError(f"{where}: not the configuration of a run: {error}") from error
 
 
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
@@ -62,8 +60,6 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
         ResultsError: naming the target, or a reference instead of a value.
     """
     for key, _, value in settings_at(content):
-        if isinstance(value, str) and "${" in value:
-            raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
         if key.rpartition(".")[2] == TARGET and not is_registered(str(value), where, trust):
             module = str(value).rpartition(".")[0]
             raise ResultsError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
@@ -17,13 +18,9 @@ import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config import complete, explained, is_sweep, leave_out_foreign
-from lcc_rl.config_checks import as_meant, check_ignored
-from lcc_rl.config_errors import check_keys, refused_by_hydra
+from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.runs.interrupts import (
     BAD_INPUT,
@@ -35,10 +32,10 @@ from lcc_rl.runs.interrupts import (
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
-from lcc_rl.schemas import check_ranges
+from lcc_rl.schemas import StudyConfig
 
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
-INPUT_ERRORS = (LccError, HydraException, OmegaConfBaseException, OSError)
+INPUT_ERRORS = (LccError, *HYDRA_ERRORS, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 SWEEP = {"-m", "--multirun"}
 NO_BEST = "No trials are completed"  # message of Optuna
@@ -46,7 +43,7 @@ NO_BEST = "No trials are completed"  # message of Optuna
 
 def entry_point(
     config_name: str, work: str
-) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+) -> Callable[[Callable[[Any], Any]], Callable[[], None]]:
     """Decorate a function of a configuration as a Hydra command.
 
     An input error (option, file, row) is one line on stderr, exit code 2 and ``error.txt`` in the
@@ -60,19 +57,14 @@ def entry_point(
             no torch. The function imports from it inside its body.
     """
 
-    def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], None]:
+    def decorate(function: Callable[[Any], Any]) -> Callable[[], None]:
         def checked(config: DictConfig) -> Any:
             heed_logs()
-            check_keys(config)
-            typed = list(HydraConfig.get().overrides.task)
-            leave_out_foreign(config, typed)
-            complete(config)
-            check_ignored(config, typed, is_sweep())
-            check_ranges(config)
+            cfg = parsed(config, config_name, list(HydraConfig.get().overrides.task), is_sweep())
             if not is_sweep():
                 with ending_quietly():
                     import_module(work)
-            return function(config)
+            return function(cfg)
 
         @wraps(function)
         def job(config: DictConfig) -> Any:
@@ -88,19 +80,19 @@ def entry_point(
         def main() -> None:
             if SWEEP.intersection(sys.argv):
                 import_module(work)
-            start(command, config_name)
+            start(command)
 
         return main
 
     return decorate
 
 
-def start(command: Callable[[], Any], config_name: str) -> None:
+def start(command: Callable[[], Any]) -> None:
     """Run a Hydra command with this package's error messages and signal handlers."""
     wanted = TRACEBACK in os.environ
     # Hydra raises errors instead of printing them.
     os.environ.setdefault(TRACEBACK, "1")
-    guarded = run_sorted if wanted else main_guard(explaining(run_sorted, config_name))
+    guarded = run_sorted if wanted else main_guard(explaining(run_sorted))
     try:
         with interruptible(), unbroken_output():
             guarded(command)
@@ -170,20 +162,19 @@ def sweep(command: Callable[[], Any]) -> None:
         conclude(folder)
 
 
-def explaining(function: Callable[..., Any], entry: str) -> Callable[..., Any]:
-    """Add the nearest existing option to Hydra's message about a wrong one."""
+def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Turn what Hydra refuses into an error with the nearest option that exists."""
 
     def explained_function(*arguments: Any) -> Any:
         try:
             return function(*arguments)
-        except Exception as error:
-            if isinstance(error, OmegaConfBaseException) or not refused_by_hydra(error):
+        except (*HYDRA_ERRORS, ValueError, TypeError) as error:
+            *_, last = traceback.walk_tb(error.__traceback__)
+            module = str(last[0].f_globals["__name__"])
+            if not module.startswith(("hydra.", "omegaconf.")):
                 raise
-            overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
-            clearer = explained(error, entry, overrides)
-            if clearer is error:
-                raise
-            raise clearer from error
+            typed = [word for word in sys.argv[1:] if "=" in word]
+            raise input_error(error) or explained(error, typed) from error
 
     return explained_function
 
@@ -263,7 +254,7 @@ def run_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def resumed_folder(cfg: DictConfig, own: Sequence[str]) -> Path:
+def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
     """Return the folder of the run that ``resume`` names; without it that of the present run.
 
     Args:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 
 import torch
-from omegaconf import DictConfig
 
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.schemas import check_ranges
+from lcc_rl.schemas import BaseConfig
 
 log = logging.getLogger("lcc_rl")
 
@@ -17,13 +16,12 @@ PRECISIONS = ("highest", "high", "medium")
 SINGLE = 1e-4  # relative error beyond which products are no longer single precision
 
 
-def prepare_torch(cfg: DictConfig) -> torch.device:
+def prepare_torch(cfg: BaseConfig) -> torch.device:
     """Check the numbers of a configuration and its device, set up torch and return the device.
 
     Raises:
         ConfigError: if a number is out of range or the device impossible on this machine.
     """
-    check_ranges(cfg)
     try:
         device = torch.device(cfg.device)
         torch.empty(0, device=device)
@@ -34,7 +32,7 @@ def prepare_torch(cfg: DictConfig) -> torch.device:
     if device.type not in DEVICES:
         raise ConfigError(f"device must be cpu, cuda or one such as cuda:0, got {cfg.device!r}")
     torch.set_num_threads(cfg.threads)
-    set_precision(cfg.get("matmul_precision", "highest"))
+    set_precision(cfg.matmul_precision)
     # TorchRL logs every buffer it allocates.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     return device

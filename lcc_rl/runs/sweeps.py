@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.live import Live
 
-from lcc_rl.config import NOT_IDENTITY, complete, identity, leave_out_foreign
+from lcc_rl.config import NOT_IDENTITY, identity, parsed
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
@@ -73,14 +73,12 @@ def run_name(*, _root_: DictConfig) -> str:
 
 
 def _mark(root: DictConfig) -> str:
-    """Return a short hash of a run's settings; of what was typed where its job will refuse them."""
+    """Return a short hash of a run's settings; of what was typed if its job will refuse them."""
     settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
     typed = [str(item) for item in root.hydra.overrides.task]
     try:
-        leave_out_foreign(settings, typed)
-        complete(settings)
-        return identity(settings)[:8]
-    except (LccError, OmegaConfBaseException):
+        return identity(parsed(settings, root.hydra.job.config_name, typed, True))[:8]
+    except LccError:
         return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8]
 
 

@@ -16,16 +16,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
-from lcc_rl.config import NOT_IDENTITY, identity, load, plain, require
-from lcc_rl.errors import ConfigError, Interrupted
+from lcc_rl.config import NOT_IDENTITY, identity, load
+from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
 from lcc_rl.runs.sweeps import key_of
+from lcc_rl.schemas import StudyConfig, as_plain
 
 log = logging.getLogger("lcc_rl")
 
@@ -42,7 +41,7 @@ class Run:
     folder: Path
     overrides: tuple[str, ...]
 
-    def compose(self) -> DictConfig:
+    def compose(self) -> StudyConfig:
         """Return its configuration; a ConfigError for an unknown or wrong override."""
         return load("train", self.overrides)
 
@@ -110,12 +109,12 @@ def check_overrides(words: Sequence[str]) -> None:
             )
 
 
-def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> list[str]:
+def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> list[str]:
     """List the settings of a stored run that differ from the wanted ones, ``key: found → wanted``.
 
     ``accept`` names dotted keys, or their beginnings, that may differ (``data``, ``drivers.path``).
     """
-    found, asked = (dict(flatten(plain(cfg))) for cfg in (load_config(run.folder), wanted))
+    found, asked = (dict(flatten(as_plain(cfg))) for cfg in (load_config(run.folder), wanted))
     ignored = (*NOT_IDENTITY, *accept)
     return [
         f"{key}: {found.get(key)} → {asked.get(key)}"
@@ -124,7 +123,7 @@ def differences(run: Run, wanted: DictConfig, accept: Sequence[str] = ()) -> lis
     ]
 
 
-def up_to_date(cfg: DictConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:
+def up_to_date(cfg: StudyConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:
     """Whether a folder holds the evaluation of a configuration, not older than its policies."""
     table = folder / EPISODES
     if not table.exists():

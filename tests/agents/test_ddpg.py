@@ -6,13 +6,12 @@ from copy import deepcopy
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from lcc_rl.agents import DDPG
-from lcc_rl.agents.ddpg import DDPGSettings
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.off_policy import leaves
-from lcc_rl.errors import ConfigError
+from lcc_rl.config import load
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.policies import save_policy
 
@@ -35,7 +34,7 @@ def transitions(count: int, seed: int) -> TensorDict:
 
 def agent(**settings: object) -> DDPG:
     own = {"batch_size": 64, "buffer_size": 64, "critic_lr": 2e-3, "tau": 0.05, **settings}
-    return DDPG(7, 1, seed=3, settings=DDPGSettings(**own))  # type: ignore[arg-type]
+    return DDPG(**own).start(Scene(7, seed=3))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("hidden", [[200, 100, 50], [16]])
@@ -62,7 +61,7 @@ def network(weights: list[torch.Tensor], *parts: torch.Tensor) -> torch.Tensor:
 def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
     """A8–A9, H7–H10 in plain torch: two losses, a step of Adam each, soft targets."""
     learner = agent(fused=fused, saturation=0.0, hidden=[32, 16])
-    own = learner.settings
+    own = learner
     names = ("actor", "value", "target_actor", "target_value")
     found = [leaves(getattr(learner.loss, f"{name}_network_params")) for name in names]
     hand = [[tensor.detach().clone() for tensor in part] for part in found]
@@ -119,7 +118,7 @@ def test_networks_that_learn_at_two_rates_do_so_where_one_rate_is_nearly_zero() 
 
 def test_a_policys_file_holds_its_weights_only(tmp_path) -> None:
     learner = agent()
-    save_policy(learner.policy.state_dict(), OmegaConf.create({}), tmp_path / "policy.pt")
+    save_policy(learner.policy.state_dict(), load("train"), tmp_path / "policy.pt")
     found = read_torch(tmp_path / "policy.pt")["weights"]
     for name, weight in learner.policy.state_dict().items():
         assert torch.equal(found[name], weight)
@@ -185,16 +184,3 @@ def test_a_restored_agent_keeps_count_of_its_target_steps() -> None:
     second.load_state_dict(deepcopy(first.state_dict()))
     for step in range(4, 9):
         assert first.update(transitions(64, step)) == second.update(transitions(64, step))
-
-
-@pytest.mark.parametrize(
-    ("every", "words"),
-    [
-        ({"actor": 1}, "entries actor and critic, got actor"),
-        ({"actor": 1, "critic": 0}, "critic"),
-        ({"actor": 1, "critc": 1}, "critc"),
-    ],
-)
-def test_target_every_is_checked(every: dict[str, int], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        agent(target_every=every)

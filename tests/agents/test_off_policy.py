@@ -12,13 +12,12 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.off_policy import leaves
 from lcc_rl.agents.replay import Trainer, draws
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
-from lcc_rl.errors import ConfigError
-from lcc_rl.policies import shared_policy
 
 SMALL = (
     "training.episodes=16",
@@ -180,22 +179,3 @@ def test_sac_explores_around_the_policy_that_is_kept() -> None:
     assert spread > 0.02
     made.noise.sigma.fill_(0.0)
     assert torch.allclose(made.noise(td)[ACTION], kept, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("agent", "override", "words"),
-    [
-        ("td3", "agent.policy_delay=0", "policy_delay"),
-        ("td3", "agent.policy_noise=-1", "policy_noise"),
-        ("td3", "agent.gamma=1", "gamma"),
-        ("sac", "agent.alpha_init=0", "alpha_init"),
-        ("sac", "agent.alpha_lr=-1", "alpha_lr"),
-        ("td3", "agent.critic_lr=0", "critic_lr"),
-        ("ddpg", "agent.actor_lr=-1", "actor_lr"),
-        ("ddpg", "agent.saturation=-1", "saturation"),
-        ("sac", "agent.batch_size=5000000", "buffer_size"),
-    ],
-)
-def test_impossible_settings(agent, override, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        make_agent(compose("alcc", f"agent={agent}", override))

@@ -14,7 +14,7 @@ from lcc_rl.agents.off_policy import Exploration
 from lcc_rl.agents.replay import Trainer, transitions
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
-from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
+from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.io.tensors import write_torch
 
@@ -143,22 +143,6 @@ def test_a_literal_training_resumes_bit_for_bit(tmp_path) -> None:
     assert all(torch.equal(value, kept[key]) for key, value in second.best["weights"].items())
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("agent.best_window=6", "best_window .6. must be a multiple of training.environments"),
-        ("agent.best_window=24", "best_window .24."),
-        ("agent.best_window=0", "best_window"),
-        ("agent.learning_starts=201", "learning_starts .201. must be between 0 and"),
-        ("agent.exploration.decay_per_update=0.9", "either decay_share or decay_per_update"),
-        ("agent.exploration.decay_share=null", "either decay_share or decay_per_update"),
-    ],
-)
-def test_settings_of_the_literal_learner_are_checked(tmp_path, override, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        make(tmp_path, override).run()
-
-
 def test_sigint_saves_and_says_how_to_go_on(tmp_path) -> None:
     expected = make(tmp_path / "whole").run()
     before = signal.getsignal(signal.SIGINT)
@@ -198,25 +182,6 @@ def test_damaged_checkpoints(tmp_path, damage) -> None:
         write_torch({"identity": Exploration()}, path)
     with pytest.raises(ResultsError, match=r"checkpoint\.pt"):
         trainer.load()
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("training.episodes=2", "at least"),
-        ("training.episodes=21", "multiple"),
-        ("training.checkpoint_every=0", "checkpoint_every"),
-        ("training.keep_every=0", "keep_every"),
-    ],
-)
-def test_contradictory_lengths(tmp_path, override, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        make(tmp_path, override)
-
-
-def test_an_unknown_collector_is_refused(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="collector must be one of string, torchrl, got 'ray'"):
-        make(tmp_path, "training.collector=ray")
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import POPULATION, compose, make_agent, wavy_profiles
 
-from lcc_rl.agents.loop import derived_seed
+from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.tuned import SearchLoop
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env

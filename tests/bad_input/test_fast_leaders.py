@@ -68,7 +68,7 @@ def test_the_warning_stands_in_table_and_page(tmp_path: Path, share: float, said
     page = Page(tmp_path)
     add_main(page)
     words = "variant=idm scenario.controllers.automated.desired_speed=45"
-    assert (words in page.sections[0].text) == said
+    assert (words in " ".join(page.sections[0]["paragraphs"])) == said
 
 
 def test_rows_without_the_share_give_no_warning() -> None:

@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,9 +28,9 @@ from commands import (
     tiny,
     wait_for,
 )
-from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.commands import calibration, evaluation, training
+from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
@@ -102,8 +103,10 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "a.parquet": lambda path: write_parquet(pd.DataFrame({"x": noise()}), path),
     "a.png": figure,
     "error.txt": text,
-    "config.yaml": lambda path: save_config(OmegaConf.create({"x": "x" * 20_000}), path.parent),
     "report.html": page,
+    "config.yaml": lambda path: save_config(
+        load("train", ["trust=[" + "x," * 9_000 + "x]"]), path.parent
+    ),
 }
 
 
@@ -234,7 +237,7 @@ def test_a_folder_is_held_while_a_command_works_and_free_afterwards(
 ) -> None:
     held = []
 
-    def observed(cfg: DictConfig, folder: Path) -> None:
+    def observed(cfg: Any, folder: Path) -> None:
         held.append(is_claimed(folder))
         save_config(cfg, folder)
 

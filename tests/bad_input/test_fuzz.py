@@ -43,46 +43,6 @@ def test_other_errors_hangs_and_too_much_memory_are_failures(monkeypatch, does, 
     assert sum(counts.values()) == 1
 
 
-# What it found, one for each kind.
-FOUND = (
-    ("~drivers", "drivers is required: say drivers=…"),
-    ("~threads", "threads is required: say threads=…"),
-    ("~scenario.controllers.automated", "scenario.controllers names only human"),
-    ("scenario.controllers.human='???'", "scenario.controllers.human is required: say"),
-    ("+experiment@deployed=single_profile", "Could not override 'split@deployed.split'"),
-    ("agent=null", "agent=null: Config group override must be a string or a list"),
-    ("logger=[nan,1]", r"logger=\[nan,1\]: argument of type 'int'"),
-    ("evaluation.baselines.x=1", r"evaluation\.baselines\.x=1: invalid literal"),
-    (f"data.seed=1{'0' * 400}", r"data\.seed must be a number of 63 bits, got one of 1329"),
-    ("reward.terms.safety.weight=${scenario.start}", "weight must be a valid number"),
-    ("+scenario.controllers.human.time_gap=${scenario}", "Interpolation to parent node"),
-)
-
-
-@pytest.mark.parametrize(("override", "words"), FOUND)
-def test_what_it_found_stays_mended(override, words) -> None:
-    with pytest.raises(ConfigError, match=words) as caught:
-        fuzz.build_study(("variant=alcc", *fuzz.SMALL, override))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_number_where_a_controller_belongs() -> None:
-    with pytest.raises(ConfigError, match=r"scenario\.controllers\.automated"):
-        fuzz.build_study(("variant=ddpg", *fuzz.SMALL, "++scenario.controllers.automated=-0.0"))
-
-
-def test_two_wrong_options_of_which_the_second_shows_without_the_first() -> None:
-    wrong = ("knowledge@deployed=preview", "++evaluation.baselines.weight=0.5")
-    with pytest.raises(ConfigError, match="unknown option 'knowledge'; valid: agent") as caught:
-        fuzz.build_study(("variant=own_energy", *fuzz.SMALL, *wrong))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_reference_in_a_circle_that_arises_when_the_policy_is_deployed() -> None:
-    with pytest.raises(ConfigError, match="clamp must be a valid boolean"):
-        fuzz.build_study(("variant=hcfs", *fuzz.SMALL, "deployed.clamp=${scenario}"))
-
-
 def test_an_agent_whose_action_nobody_takes() -> None:
     words = r"scenario\.controllers\.automated \(handover\) takes no action .* agent=none"
     handover = "controller@scenario.controllers.automated=handover"

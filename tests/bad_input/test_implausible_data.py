@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from ngsim_text import cells, csv_text, native_text, pair
 
-from lcc_rl.config import build, load
+from lcc_rl.config import load
 from lcc_rl.data.episodes import validate_episodes, write_episodes
 from lcc_rl.data.leaders import RecordLeaders, from_trajectories
 from lcc_rl.data.ngsim import read_ngsim
@@ -17,6 +17,7 @@ from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.nodes import build
 
 
 def table(episodes: int = 20, rows: int = 30) -> pd.DataFrame:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import sys
 from io import StringIO
 
@@ -24,22 +23,15 @@ from helpers import (
 )
 from platoons import env_of, hcfs, ramps
 from rich.console import Console
-from tensordict.nn import TensorDictSequential
 
 from lcc_rl.agents.factory import make_trainer
 from lcc_rl.commands import evaluation, training
-from lcc_rl.config import load
 from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.genetic import GeneticSettings, minimise
 from lcc_rl.drivers.observed import Selection, observe
-from lcc_rl.envs import Inputs, StringCollector
-from lcc_rl.errors import DataError, Diverged, ResultsError
-from lcc_rl.evaluation.clairvoyant import clairvoyant
+from lcc_rl.errors import DataError, Diverged
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.figures.page import Page
-from lcc_rl.io.tensors import read_torch, write_torch
-from lcc_rl.results.policies import load_policy, pretrained_path
 from lcc_rl.results.tables import strategies_side_by_side
 
 MODULE = """
@@ -94,7 +86,7 @@ SMALL_TRAINING = (
     "agent.hidden=[16,16]",
 )
 FILTER = ("+filter=cbf",)
-EPISODE = r"of episode \d+ \(profile \S+, driver \d+, seed \d+\)"
+EPISODE = r"of episode \d+"
 
 
 @pytest.fixture(autouse=True, params=["nan"])
@@ -116,13 +108,13 @@ def value(request, tmp_path, monkeypatch) -> str:
         (
             "inf",
             CONTROL,
-            r"strategy lostcontrol: command.automated, written by LostControl, is {} at step 4",
+            r"strategy lostcontrol: command.automated is {} at step 4",
         ),
-        ("nan", DRIVER, r"strategy direct: command.human, written by LostDriver, is {} at step 4"),
+        ("nan", DRIVER, r"strategy direct: command.human is {} at step 4"),
         (
             "nan",
             POWER,
-            r"strategy direct: vehicles.power, written by LostPower, is -?inf at step 1",
+            r"strategy direct: vehicles.power is -?inf at step 1",
         ),
     ],
     ids=["controller", "driver", "power"],
@@ -138,15 +130,6 @@ def test_an_evaluation_names_strategy_entry_step_and_episode(
     assert not list(folder.glob("*.parquet"))
 
 
-def test_a_platoon_names_its_run(tmp_path) -> None:
-    words = ["variant=deadbeat", CONTROL[1], "evaluation.baselines=[]", "experiment=smoke"]
-    cfg = load("evaluate", words)
-    expected = r"lostcontrol: command.automated, written by LostControl, is nan at step 4 of ep"
-    with pytest.raises(Diverged, match=expected):
-        evaluation.run(cfg, tmp_path / "run", quiet=True)
-    assert not list((tmp_path / "run").glob("*.parquet"))
-
-
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 @pytest.mark.parametrize("overrides", [(), FILTER])
 def test_the_action_counts_before_clamp_and_filter(overrides, number) -> None:
@@ -159,7 +142,7 @@ def test_the_action_counts_before_clamp_and_filter(overrides, number) -> None:
         return td
 
     policy.in_keys = [*good.in_keys, ("episode", "step")]
-    words = rf"strategy x: automated.action, written by the policy, is {number} at step 6 of .* 1 "
+    words = rf"strategy x: automated.action is {number} at step 6 of episode 1"
     with pytest.raises(Diverged, match=words):
         play(env, policy, None, [("vehicles", "gap")], "strategy x")
 
@@ -176,95 +159,45 @@ def test_what_follows_the_end_of_an_episode_does_not_count() -> None:
     assert record["vehicles", "gap"].isfinite().all()
 
 
-@pytest.mark.parametrize("number", [math.nan, -math.inf])
-def test_a_policy_with_a_broken_weight_is_refused(number, tmp_path) -> None:
-    content = read_torch(pretrained_path("alcc"))
-    name = list(content["weights"])[-1]
-    content["weights"][name] = content["weights"][name].clone().fill_(number)
-    path = tmp_path / "policy.pt"
-    write_torch(content, path)
-    words = f"{path}: weight {name!r} holds values that are no numbers"
-    with pytest.raises(ResultsError, match=re.escape(words)):
-        load_policy(path)
-
-
 # -- training --------------------------------------------------------------------------------------
 
 
-REWARD_LOST = r"automated.reward_terms.comfort, written by LostReward, is -?{} at step 3"
-DRIVER_LOST = r"command.human, written by LostDriver, is {} at step 4"
-POWER_LOST = r"vehicles.power, written by LostPower, is -?inf at step 1"
-ENTRY_LOST = r"vehicles.lost, written by LostEntry, is {} at step 4"
+REWARD_LOST = r"automated.reward is nan at step 3"
+POWER_LOST = r"vehicles.power is -?inf at step 1"
 ITERATION = r" in iteration 1 of .*; nothing is saved$"
 
 
 @pytest.mark.parametrize(
-    ("value", "collector", "overrides", "words"),
+    ("own", "overrides", "words"),
     [
-        ("nan", "string", TERM, REWARD_LOST + f" {EPISODE}{ITERATION}"),
-        ("inf", "string", DRIVER, DRIVER_LOST + f" {EPISODE}{ITERATION}"),
-        ("nan", "string", POWER, POWER_LOST + f" {EPISODE}{ITERATION}"),
-        ("nan", "string", ENTRY, ENTRY_LOST + f" {EPISODE}{ITERATION}"),
-        pytest.param(
-            *("inf", "torchrl", TERM, REWARD_LOST + f" {EPISODE}{ITERATION}"),
-            marks=pytest.mark.slow,
-        ),
-        ("nan", "torchrl", ENTRY, ENTRY_LOST + f" {EPISODE}{ITERATION}"),
-        ("nan", "torchrl", POWER, POWER_LOST + f" {EPISODE}{ITERATION}"),
+        ("training.collector=string", TERM, REWARD_LOST),
+        ("training.collector=torchrl", POWER, POWER_LOST),
+        ("training.collector=string", DRIVER, "automated.observation is nan at step 4"),
+        ("agent=analytic", TERM, "automated.reward_terms.comfort is nan at step 3"),
     ],
-    indirect=["value"],
 )
-def test_a_training_names_what_it_would_have_learned_from(
-    collector, overrides, words, value, tmp_path
-) -> None:
-    own = (f"training.collector={collector}",)
-    with pytest.raises(Diverged, match=words.format(value)):
-        training.run(tiny("train", "variant=alcc", *own, *overrides), tmp_path / "run", quiet=True)
-    assert not (tmp_path / "run" / "policy.pt").exists()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (TERM, REWARD_LOST),
-        pytest.param(DRIVER, DRIVER_LOST, marks=pytest.mark.slow),
-        pytest.param(ENTRY, ENTRY_LOST, marks=pytest.mark.slow),
-    ],
-    ids=["reward", "driver", "observation"],
-)
-def test_the_analytic_agent_names_it_too(overrides, words, value, tmp_path) -> None:
-    own = ("agent=analytic", "training=analytic", "training.episodes=4", "training.environments=4")
-    cfg = tiny("train", "variant=alcc", *own, *overrides, agent=False)
-    with pytest.raises(Diverged, match=words.format(value) + r" of episode .* in iteration 1 of 1"):
+def test_a_training_names_what_it_would_have_learned_from(own, overrides, words, tmp_path) -> None:
+    cfg = tiny("train", "variant=alcc", own, "training.segment=20", *overrides, agent=False)
+    with pytest.raises(Diverged, match=f"{words} {EPISODE}{ITERATION}"):
         training.run(cfg, tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run" / "policy.pt").exists()
 
 
 # -- the environment -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf])
-@pytest.mark.parametrize("make", [small_env, single_env])
-def test_a_step_refuses_an_action_that_is_no_number(make, number) -> None:
-    env = make("alcc", 2)
-    td = env.rand_action(env.reset())
-    key = ACTION if make is small_env else "action"
-    td[key][1] = number
-    with pytest.raises(Diverged, match=rf"automated.action, .* is {number} at step 1 of episode 1"):
-        env.step(td)
-
-
-def test_a_step_refuses_a_state_that_is_no_number() -> None:
+def test_a_step_refuses_an_action_that_is_no_number(number) -> None:
     env = small_env("alcc", 2)
     td = env.rand_action(env.reset())
-    td["vehicles", "speed"][0] = math.nan
-    with pytest.raises(Diverged, match=r"vehicles.speed, .* is nan at step 0 of episode 0"):
+    td[ACTION][1] = number
+    with pytest.raises(Diverged, match=rf"automated.action is {number} at step 1 of episode 1"):
         env.step(td)
 
 
-@pytest.mark.parametrize("name", ["plain", "filtered", "single", "hcfs"])
+@pytest.mark.parametrize("name", ["filtered", "single", "hcfs"])
 def test_actions_beyond_the_range_count_as_its_ends(name) -> None:
     makers = {
-        "plain": lambda: small_env("alcc", 3),
         "filtered": lambda: small_env("alcc", 3, FILTER),
         "single": lambda: single_env("alcc", 3),
         "hcfs": lambda: env_of(ramps(), hcfs(safe_cap=False)),
@@ -279,28 +212,7 @@ def test_actions_beyond_the_range_count_as_its_ends(name) -> None:
     assert (reached[0].exclude(ACTION) == reached[1].exclude(ACTION)).all()
 
 
-def test_a_compiled_step_of_the_collector_is_watched_from_outside() -> None:
-    env, good = small_env("alcc", 2), network(compose("alcc"))
-    collector = StringCollector(env, TensorDictSequential(good), frames_per_batch=20)
-    collector.collect()
-    with torch.no_grad():
-        next(good.parameters()).fill_(math.nan)
-    collector.collect()
-    with pytest.raises(Diverged, match=r"automated.action, written by the policy, is nan at step"):
-        collector.replay()
-
-
 # -- what else computes ----------------------------------------------------------------------------
-
-
-def test_the_clairvoyant_names_it() -> None:
-    cfg = compose("alcc", *DRIVER)
-    policy = network(cfg)
-    inputs = Inputs(wavy_profiles(2), wavy_profiles(2), POPULATION)
-    strategy = Strategy("alcc", cfg, policy, source="a.pt")
-    words = r"strategy alcc \(policy=a.pt\): command.human, .*LostDriver, is nan at step 4 of epis"
-    with pytest.raises(Diverged, match=words):
-        clairvoyant(strategy, inputs, 2, 0, iterations=2, compiled=False)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])

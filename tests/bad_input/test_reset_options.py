@@ -7,7 +7,6 @@ from collections import deque
 import pytest
 import torch
 from helpers import compose, single_env, small_env, wavy_profiles
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from lcc_rl.drivers.population import bootstrap
@@ -141,7 +140,8 @@ class RememberingFeature(Feature):
 
 def driven_by(node: dict, where: str = "scenario.controllers.automated"):
     cfg = compose("idm")
-    OmegaConf.update(cfg, where, node, merge=False, force_add=True)
+    group, _, name = where.removeprefix("scenario.").partition(".")
+    getattr(cfg.scenario, group)[name] = node
     return build_env(cfg, wavy_profiles(), bootstrap(), 2)
 
 

@@ -143,7 +143,7 @@ def test_a_mixture_of_nothing() -> None:
     ("overrides", "words"),
     [
         (["leader=udds", "data.seed=3"], "data.seed=3 has no effect: the leader drives"),
-        (["leader=udds", "split=vehicle"], "split=vehicle has no effect"),
+        (["leader=udds", "split.by=vehicle"], "split.by=vehicle has no effect"),
         (["leader=udds", "leader.full_length=null"], "leader.full_length=null has no effect"),
         (["leader=udds", "leader.cases={}"], "leader.cases={} has no effect"),
     ],
@@ -151,22 +151,22 @@ def test_a_mixture_of_nothing() -> None:
 def test_options_that_the_leader_ignores(overrides, words) -> None:
     with pytest.raises(ConfigError, match=words):
         load("train", ["variant=alcc", *overrides])
-    load("train", ["variant=alcc", *MIXTURE, "split=vehicle"])
+    load("train", ["variant=alcc", *MIXTURE, "split.by=vehicle"])
 
 
 @pytest.mark.slow
 def test_nothing_is_learned_from_what_is_all_for_evaluation(tmp_path) -> None:
-    cfg = tiny("train", "variant=alcc", "split=none")
-    with pytest.raises(ConfigError, match="no profile is left to train on: split=none"):
+    cfg = tiny("train", "variant=alcc", "split.evaluation_share=1")
+    with pytest.raises(ConfigError, match="no profile is left to train on: evaluation_share=1"):
         training.run(cfg, tmp_path / "t", quiet=True)
     with pytest.raises(ConfigError, match="no profile is left"):
-        lcc_rl.make_env("alcc", 2, ["split=none", *DATA])
+        lcc_rl.make_env("alcc", 2, ["split.evaluation_share=1", *DATA])
     rows = evaluation.run(
-        tiny("evaluate", "variant=idm", "split=none", agent=False), tmp_path / "e"
+        tiny("evaluate", "variant=idm", "split.evaluation_share=1", agent=False), tmp_path / "e"
     )
     assert rows["collided"].sum() == 0
     everything = load_inputs(
-        tiny("train", "variant=alcc", "split=none", "evaluation.profiles=null")
+        tiny("train", "variant=alcc", "split.evaluation_share=1", "evaluation.profiles=null")
     )
     usual = load_inputs(tiny("train", "variant=alcc", "evaluation.profiles=null"))
     assert len(everything.training) == 0

@@ -6,20 +6,18 @@ import gzip
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from ngsim_text import START_MS, cells, csv_text, pair
 
 import lcc_rl.conf
-from lcc_rl.config import build
+from lcc_rl.config import load
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource, NgsimSource, find_files
 from lcc_rl.errors import DataError
+from lcc_rl.nodes import build
 
 
 def configured(name: str, *overrides: str) -> NgsimSource | EpisodesSource:
-    with initialize_config_module("lcc_rl.conf", version_base="1.3"):
-        config = compose(f"data/{name}", overrides=list(overrides))
-    return build(config.data, "data")
+    return build(load("calibrate", [f"data={name}", *overrides]).data, "data")
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from table_text import GAP, LENGTH, long_table, openacc_text, speed
 
-from lcc_rl.config import build, load
+from lcc_rl.config import load
 from lcc_rl.data.episodes import read_episodes, validate_episodes
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
@@ -18,6 +18,7 @@ from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.nodes import build
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
 BY_GAP = {**BASE, "leader": "ahead", "gap": "gap"}
@@ -67,7 +68,7 @@ def test_the_leader_is_named_or_the_next_on_the_lane(tmp_path, name, columns) ->
 def test_all_from_the_command_line(tmp_path) -> None:
     path = written(tmp_path, long_table())
     columns = "{vehicle: id, time: t, speed: v, leader: ahead, gap: gap, position: x}"
-    said = ["variant=alcc", "split=vehicle", "data=table", f"data.path={path}"]
+    said = ["variant=alcc", "split.by=vehicle", "data=table", f"data.path={path}"]
     inputs = load_inputs(load("train", [*said, f"data.columns={columns}"]))
     assert (len(inputs.training), len(inputs.evaluation)) == (1, 1)
 

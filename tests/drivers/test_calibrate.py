@@ -9,11 +9,11 @@ import pytest
 import torch
 from commands import run_command
 from helpers import slow_but
-from omegaconf import OmegaConf
 from rich.console import Console
 
 import lcc_rl.conf
 from lcc_rl.commands import calibration
+from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.laws import LAWS
@@ -36,21 +36,10 @@ def source(tmp_path, uneven_lengths):
 @pytest.fixture
 def cfg(source):
     """Configuration of a small calibration in both modes."""
-    calibration = OmegaConf.load(CONF / "calibration" / "base.yaml")
-    quick = {"population": 8, "generations": 2, "founders": 1}
-    changes = {"modes": ["local", "global"], "local_genetic": quick, "global_genetic": quick}
-    data = OmegaConf.load(CONF / "data" / "episodes.yaml")
-    data.pop("defaults")  # Hydra's; the thresholds are those of the constructor
-    data.path = str(source / "episodes.parquet")
-    return OmegaConf.create(
-        {
-            "seed": 0,
-            "threads": 1,
-            "device": "cpu",
-            "data": data,
-            "calibration": OmegaConf.merge(calibration, changes),
-        }
-    )
+    quick = ("population=8", "generations=2", "founders=1")
+    words = [f"calibration.{mode}_genetic.{word}" for mode in ("local", "global") for word in quick]
+    path = f"data.path='{source / 'episodes.parquet'}'"
+    return load("calibrate", ["data=episodes", path, "calibration=both", *words])
 
 
 def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
@@ -70,8 +59,8 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 
 @pytest.mark.parametrize("model", slow_but(["idm", "gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
-    cfg.calibration.model, cfg.calibration.objective = model, "both"
-    cfg.calibration.holdout = 0.3
+    cfg.calibration["model"], cfg.calibration["objective"] = model, "both"
+    cfg.calibration["holdout"] = 0.3
     out = io.StringIO()
     calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     for text in ("held out: RMSPE", "gap NRMSE [%], held out", "time gap [s]"):
@@ -88,9 +77,6 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     [
         ("data.path", "/no/such", DataError, "/no/such: no such file"),
         ("data.path", "???", ConfigError, "data.path"),
-        ("seed", "abc", ConfigError, "seed"),
-        ("threads", 0, ConfigError, "threads"),
-        ("device", "abacus", ConfigError, "abacus"),
         ("calibration.modes", ["locl"], ConfigError, "local"),
         ("calibration.bounds.time_gap", [2.0, 1.0], ConfigError, "time_gap"),
         ("calibration.local_genetic.population", 2, ConfigError, "population"),
@@ -103,17 +89,15 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     ],
 )
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, error, message):
-    OmegaConf.update(cfg, key, value)
+    node = cfg.calibration if key.startswith("calibration.") else cfg.data
+    *path, last = key.split(".")[1:]
+    for part in path:
+        node[part] = dict(node[part] or {})
+        node = node[part]
+    node[last] = value
     with pytest.raises(error, match=message):
         calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
     assert not (tmp_path / "run").exists()
-
-
-def test_every_mode_and_population_file_composes():
-    for name in ("local", "global", "both"):
-        node = OmegaConf.load(CONF / "calibration" / f"{name}.yaml")
-        assert set(node.modes) <= {"local", "global"}
-    assert OmegaConf.missing_keys(OmegaConf.load(CONF / "drivers" / "calibrated.yaml")) == {"path"}
 
 
 @pytest.mark.parametrize(
@@ -156,8 +140,7 @@ def test_guard_lets_bugs_through():
 
 
 def test_device_and_threads_are_prepared():
-    cfg = OmegaConf.create({"seed": 0, "threads": 1, "device": "cpu"})
-    assert prepare_torch(cfg).type == "cpu"
+    assert prepare_torch(load("calibrate")).type == "cpu"
 
 
 @pytest.fixture

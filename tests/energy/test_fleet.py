@@ -47,7 +47,7 @@ def test_classes_are_drawn_by_share_and_constant(string) -> None:
     data = env.rollout(2, break_when_any_done=False)
     kinds = data[CLASS]
     assert (kinds[:, 0] == kinds[:, 1]).all()
-    names = list(load("train", overrides).energy.models)
+    names = list(load("train", overrides).energy["models"])
     index = data["automated", "index"][:, 0]
     own = kinds[:, 0].squeeze(-1).gather(-1, index)
     assert (own == names.index("electric")).all()
@@ -71,7 +71,7 @@ def test_an_episode_has_the_same_vehicles_whoever_drives() -> None:
     assert len(kinds[0].unique()) > 2
 
 
-@pytest.mark.parametrize("energy", ["mixture", "midsize", "electric"])
+@pytest.mark.parametrize("energy", ["mixture", "fuel", "electric"])
 def test_environments_fit_their_specs(energy) -> None:
     check_env_specs(lcc_rl.make_env("alcc", 3, [f"energy={energy}"]), seed=0)
 
@@ -95,7 +95,7 @@ def test_power_of_an_environment_is_that_of_the_models() -> None:
         (lambda: Fleet(MODELS, None, {"human": {"bus": 1.0}}), r"energy.roles.human.*'bus'"),
         (lambda: build_energy(load("train", ["energy._target_=builtins.dict"])), "energy"),
         (lambda: lcc_rl.make_env("alcc", 1, ["energy=petrol"]), "petrol"),
-        (lambda: lcc_rl.make_env("alcc", 1, ["energy=midsize", "energy.vehicle=van"]), "van"),
+        (lambda: lcc_rl.make_env("alcc", 1, ["energy=fuel", "energy.vehicle=van"]), "van"),
     ],
 )
 def test_mistakes_are_named(make, words) -> None:

@@ -11,12 +11,12 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs.transforms import RewardSum
 
+from lcc_rl.agents.actor import GaussianExploration, shared_policy
 from lcc_rl.agents.replay import LEARNED_FROM
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import Step, pieces_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, as_key
-from lcc_rl.policies import GaussianExploration, shared_policy
 
 KEYS = (*LEARNED_FROM, ("next", *TERMS), ("vehicles", "gap"))
 # Half the horizon ahead is far enough to run into the leader, so that episodes end early, too.

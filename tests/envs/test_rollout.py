@@ -24,9 +24,9 @@ from helpers import (
 )
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.agents.actor import make_actor, shared_policy
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import DifferentiableRollout, build_env
-from lcc_rl.policies import make_actor, shared_policy
 
 WANTED = [("vehicles", name) for name in ("gap", "power", "relative_speed")]
 OBSERVED = [REWARD, (*TERMS, "hdv_energy"), (*TERMS, "safety")]

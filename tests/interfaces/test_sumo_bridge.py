@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
+import sumo_ring
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from lcc_rl.config import load
@@ -21,7 +20,6 @@ from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import baseline_controller, with_weights
-from lcc_rl.interfaces import sumo_ring
 from lcc_rl.interfaces.sumo import Bridge
 from lcc_rl.results.policies import load_policy
 
@@ -45,16 +43,15 @@ def leader_speed() -> Tensor:
 def own_motion(driver: str) -> tuple[Tensor, Tensor]:
     """Return speeds and gaps, ``[time + 1, 2]``, in this package's environment."""
     cfg = load("evaluate", ["variant=alcc", "task=i24-follow5", f"scenario.horizon={STEPS}"])
-    OmegaConf.set_struct(cfg, False)
     cfg.scenario.string = "automated human"
-    cfg.scenario.controllers.human = HUMAN
+    cfg.scenario.controllers["human"] = HUMAN
     policy: Any = None
     if driver.startswith("pretrained"):
         weights, own = load_policy(driver)
         policy = with_weights(own, weights, own.seed, driver, bootstrap()).policy
         cfg.observation = own.observation
     else:
-        cfg.scenario.controllers.automated = baseline_controller(driver)
+        cfg.scenario.controllers["automated"] = baseline_controller(driver)
         cfg.scenario.filters = {}
     profiles = from_records([leader_speed()], ["wave"], ["wave"], STEP)
     env = build_env(cfg, profiles, bootstrap(), 1, nominal=True)
@@ -166,23 +163,17 @@ def test_a_command_is_executed_beyond_what_sumo_thinks_safe(tmp_path) -> None:
     assert libsumo.vehicle.getAcceleration("own") < 0.0
 
 
-def test_the_command_writes_trajectories_and_a_figure(tmp_path, capsys) -> None:
+def test_the_ring_in_sumo_writes_trajectories_and_a_figure(tmp_path) -> None:
     words = ["pretrained/ring-22", "--seconds", "20", "--from-s", "10"]
     assert sumo_ring.main([*words, "--folder", str(tmp_path)]) == 0
     rows = pd.read_parquet(tmp_path / "steps.parquet")
     assert list(rows.groupby("strategy").size()) == [200, 200]
-    driven = rows[rows["strategy"] == "pretrained/ring-22"]
     assert rows["collisions"].sum() == 0
-    assert driven["cav_gap"].min() > 2.0
-    before, after = (driven[driven["time_s"] < 10.0], driven[driven["time_s"] >= 11.0])
-    human = rows[rows["strategy"] == "human"]
-    same = human["hdv1_speed"].to_numpy()[: len(before)]
-    assert before["cav_speed"].to_numpy() == pytest.approx(same)
-    assert (after["cav_speed"].to_numpy() != human["hdv1_speed"].to_numpy()[-len(after) :]).all()
-    assert (tmp_path / "space_time.png").stat().st_size > 10_000
-    said = capsys.readouterr().out
-    assert "final_spread_mps" in said
-    assert "steps.parquet" in said
+    human, driven = (rows[rows["strategy"] == name] for name in ("human", "pretrained/ring-22"))
+    difference = human["hdv1_speed"].to_numpy() - driven["cav_speed"].to_numpy()
+    assert difference[:100] == pytest.approx(0.0)
+    assert (difference[110:] != 0.0).all()
+    assert (tmp_path / "space_time.png").exists()
 
 
 @pytest.mark.slow
@@ -213,25 +204,3 @@ def test_bad_input_is_one_clear_error(driver, step, expected, tmp_path) -> None:
     start(tmp_path, {"own": (400.0, 10.0)}, step)
     with pytest.raises(ConfigError, match=expected):
         Bridge(driver, ["own"])
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["scenario.string=human*22"], "first vehicle alone is automated"),
-        (["drivers=i80"], "drivers=fixed"),
-        (["scenario.circumference=100"], "circumference must lie in"),
-        (["--seconds", "200"], "--seconds=200 ends before --from-s=300"),
-    ],
-)
-def test_a_ring_that_cannot_be_simulated_is_one_clear_error(words, expected, tmp_path) -> None:
-    with pytest.raises(ConfigError, match=expected):
-        sumo_ring.main(["acc", *words, "--folder", str(tmp_path)])
-
-
-def test_without_simulation_or_libsumo_the_error_says_what_to_do(monkeypatch) -> None:
-    with pytest.raises(ConfigError, match=r"libsumo\.start"):
-        Bridge("idm", ["own"])
-    monkeypatch.setitem(sys.modules, "libsumo", None)
-    with pytest.raises(ConfigError, match=r"pip install 'lcc_rl\[sumo\]'"):
-        Bridge("idm", ["own"])

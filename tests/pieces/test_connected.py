@@ -29,6 +29,7 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
+from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
@@ -37,7 +38,6 @@ from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.cacc import Gains
 from lcc_rl.pieces import CACC, HCFS, Communication, DeadBeat, parse_string
 from lcc_rl.pieces.world import World
-from lcc_rl.policies import ControllerPolicy
 
 # -- dead-beat -------------------------------------------------------------------------------------
 
@@ -96,7 +96,7 @@ def test_cacc_closes_its_gaps() -> None:
     # From disturbed gaps behind a steady leader back to equilibrium: h plus what the delay hides.
     steady = leader(torch.full((401,), 10.0))
     cfg = composed("variant=cacc", "scenario.horizon=400")
-    cfg.scenario.pieces.leader.perturbation = 0.0
+    cfg.scenario.pieces["leader"]["perturbation"] = 0.0
     env = build_env(cfg, steady, POPULATION, 4)
     td = env.reset()
     assert (td["vehicles", "gap"] - 5.0).abs().max() > 0.5

@@ -14,13 +14,14 @@ from scipy.optimize import minimize
 
 from lcc_rl.commands.checks import check_settings
 from lcc_rl.commands.evaluation import run
-from lcc_rl.config import build, load, plain
+from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.kinematics import advance_gap
 from lcc_rl.functional.mpc import MPCSettings
 from lcc_rl.functional.power import acceleration_loss, steady_power
+from lcc_rl.nodes import build
 from lcc_rl.pieces import MPC
 
 AUTO = "scenario.controllers.automated"
@@ -217,7 +218,7 @@ class TestWithOSQP:
         ],
     )
     def test_a_bad_setting_is_named(self, key, value) -> None:
-        node = plain(compose("idm", *DRIVEN[:1]).scenario.controllers.automated)
+        node = compose("idm", *DRIVEN[:1]).scenario.controllers["automated"]
         with pytest.raises(ConfigError, match=rf"{key} must"):
             build({**node, key: value}, AUTO)
 

@@ -348,7 +348,7 @@ def test_a_handover_switches_at_its_moment() -> None:
     human = composed("variant=idm", "controller@scenario.controllers.automated=human")
     node = {
         "_target_": "lcc_rl.pieces.Handover",
-        "before": human.scenario.controllers.automated,
+        "before": human.scenario.controllers["automated"],
         "after": {"_target_": "lcc_rl.pieces.ConstantAcceleration", "acceleration": 0.25},
         "from_s": 1.0,
     }

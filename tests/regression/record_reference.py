@@ -25,17 +25,17 @@ import pandas as pd
 import pyarrow.parquet as pq
 import torch
 from helpers import POPULATION, VARIANTS, wavy_profiles
-from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from lcc_rl import evaluate, train
+from lcc_rl.agents.actor import ConstantPolicy
 from lcc_rl.config import load
 from lcc_rl.envs.factory import build_agent, build_env, build_policy
-from lcc_rl.policies import ConstantPolicy
 from lcc_rl.results.files import read_parquet
 from lcc_rl.results.policies import load_policy
+from lcc_rl.schemas import TrainConfig
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
 SHARED = "<shared>"  # stands for the folder of the real data in what is written
@@ -188,7 +188,7 @@ def chosen(td: TensorDictBase) -> dict[str, Tensor]:
     return values
 
 
-def drive(cfg: DictConfig, policy: Any) -> dict[str, np.ndarray]:
+def drive(cfg: TrainConfig, policy: Any) -> dict[str, np.ndarray]:
     """Play one episode in every slot, without resets: [batch, time (+ 1), …]."""
     env = build_env(cfg, wavy_profiles(), POPULATION, BATCH, SEED)
     with torch.no_grad():
@@ -210,7 +210,7 @@ def drive(cfg: DictConfig, policy: Any) -> dict[str, np.ndarray]:
     }
 
 
-def driver(cfg: DictConfig, who: Driver) -> Any:
+def driver(cfg: TrainConfig, who: Driver) -> Any:
     """Build what drives a case."""
     if isinstance(who, float):
         return ConstantPolicy(who)

@@ -16,6 +16,7 @@ from helpers import slow_but
 from renames import PLATOON_POLICY, renamed
 from tensordict import TensorDict
 
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
@@ -24,7 +25,6 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.safety import NEVER
-from lcc_rl.policies import shared_policy
 from lcc_rl.results.policies import load_policy
 
 REFERENCE = Path(__file__).parent / "reference"

@@ -10,7 +10,6 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-import compare_launchers
 import pandas as pd
 import pytest
 from commands import DATA, HORIZON, run_command, tiny
@@ -35,21 +34,23 @@ from lcc_rl.runs.sweeps import (
     run_name,
     sweep_name,
 )
+from lcc_rl.schemas import as_plain
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_same_command_gets_the_same_folder() -> None:
     one = sweep_name(None, ["seed=0,1", "variant=alcc"])
-    assert one == sweep_name(None, ["variant=alcc", "seed=0,1", "logger=wandb"])
+    assert one == sweep_name(None, ["variant=alcc", "seed=0,1", "logger=rows"])
     assert one != sweep_name(None, ["variant=alcc", "seed=0,1,2"])
     assert sweep_name("mine", ["seed=0,1"]) == "mine"
 
 
 def hydra_like(sweep: Path, *overrides: str):
     """Return a job's whole configuration as Hydra builds it: the run's, and Hydra's own node."""
-    cfg = OmegaConf.create(OmegaConf.to_container(load("train", overrides)))
+    cfg = OmegaConf.create(as_plain(load("train", overrides)))
     own = {"overrides": {"task": list(overrides)}, "sweep": {"dir": str(sweep)}, "sweeper": {}}
+    own["job"] = {"config_name": "train"}
     cfg.hydra = own
     return cfg
 
@@ -84,7 +85,7 @@ def test_plans_know_grids_and_searches(tmp_path) -> None:
     cfg.hydra.overrides.task = ["seed=range(8)", "variant=alcc,reference", "agent.gamma=0.9"]
     assert make_plan(cfg) == Plan(16, ["seed", "variant"])
     # Where its rows are sent to does not make another run.
-    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,tensorboard"]
+    cfg.hydra.overrides.task = ["seed=range(8)", "logger=none,rows"]
     assert make_plan(cfg) == Plan(8, ["seed"])
     cfg.hydra.sweeper = {"n_trials": 40, "params": {"agent.tau": "interval(0.001,0.01)"}}
     cfg.hydra.overrides.task = []
@@ -238,13 +239,20 @@ def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit", "ray"])
-def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher, capsys) -> None:
-    if not compare_launchers.installed(compare_launchers.LAUNCHERS[launcher][1]):
-        pytest.skip("extras sweeps, ray")
-    arguments = ["serial", launcher, "--seeds=1", f"--out={tmp_path}"]
-    assert compare_launchers.main(arguments) == 0
-    assert capsys.readouterr().out.count("those of serial") == 2
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
+def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher) -> None:
+    package = f"hydra_{launcher.removesuffix('_local')}_launcher"
+    pytest.importorskip(f"hydra_plugins.{package}", reason="extras sweeps, ray")
+    small = ["experiment=smoke", "agent.batch_size=64", "agent.hidden=[16,16]"]
+    words = ["-m", *small, "training.episodes=24", "variant=alcc,reference", "seed=0"]
+    for name in ("basic", f"lcc_{launcher}"):
+        where = [f"hydra/launcher={name}", f"hydra.sweep.dir={tmp_path / name}"]
+        subprocess.run([sys.executable, "-m", "lcc_rl.train", *words, *where], check=True)
+    for table in ("training", "episodes", "steps"):
+        serial, other = (
+            results.load(tmp_path / name, table) for name in ("basic", f"lcc_{launcher}")
+        )
+        pd.testing.assert_frame_equal(other, serial, check_exact=True)
 
 
 @pytest.mark.slow

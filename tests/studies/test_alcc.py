@@ -7,26 +7,28 @@ from pathlib import Path
 import pytest
 
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.schemas import as_plain
 from lcc_rl.studies.alcc import report, study
 from lcc_rl.studies.alcc.settings import PRECISE, followers_change, followers_study
 
 
 def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> None:
     own = study.Study(tmp_path, "paper_alcc", 1)
-    main = own.runs(tmp_path)[0].compose()
+    main = as_plain(own.runs(tmp_path)[0].compose())
     seen = []
     for name, change in study.ABLATIONS.items():
         runs = own.runs(tmp_path, change)
         assert [f"variant={x}" for x in change.variants] == [run.overrides[1] for run in runs]
-        cfg = runs[0].compose()
+        cfg = as_plain(runs[0].compose())
         assert (cfg == main) == (name in ("recipe_paper_alcc", "gamma_0.9"))
         assert cfg == main or cfg not in seen
         seen.append(cfg)
     quick = study.Study(tmp_path, "quickstart", 1)
-    assert quick.runs(tmp_path, study.ABLATIONS["recipe_paper_alcc"])[0].compose() == main
+    change = study.ABLATIONS["recipe_paper_alcc"]
+    assert as_plain(quick.runs(tmp_path, change)[0].compose()) == main
     single = study.Change(("split.profile=5",), recipes=("single_profile",))
     cfg = own.runs(tmp_path, single)[0].compose()
-    assert (cfg.split.profile, cfg.scenario.pieces.leader.start) == (5, "first")
+    assert (cfg.split["profile"], cfg.scenario.pieces["leader"]["start"]) == (5, "first")
     assert cfg.training.episodes == 3000
 
 
@@ -43,7 +45,7 @@ def test_followers_learn_with_the_analytic_agent_unless_another_is_asked_for(tmp
     assert change.overrides == (*PRECISE[1:], "scenario.string='automated human*1'")
     assert change.evaluation == ()
     cfg = followers_study(own).runs(tmp_path, change)[0].compose()
-    assert (cfg.agent.batch_size, cfg.training.episodes) == (64, 40)
+    assert (cfg.agent["batch_size"], cfg.training.episodes) == (64, 40)
 
 
 @pytest.mark.parametrize(
@@ -71,4 +73,4 @@ def test_a_folder_without_an_evaluation_has_no_page(tmp_path) -> None:
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
     run = study.Study(folder, "smoke", 1).runs(folder / "train")[0]
-    assert Path(run.compose().data.path) == folder / "trajectories.parquet"
+    assert Path(run.compose().data["path"]) == folder / "trajectories.parquet"

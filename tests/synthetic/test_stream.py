@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ import pandas as pd
 import pytest
 import torch
 from helpers import MIXED, slow_but
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
+from lcc_rl.config import load
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
@@ -23,6 +21,7 @@ from lcc_rl.drivers.population import bootstrap, fixed
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.io.files import read_parquet
+from lcc_rl.nodes import build
 from lcc_rl.synthetic.lane import Stream, draw_drivers
 from lcc_rl.synthetic.stop_and_go import StopAndGo, jumps, stratified_normal
 from lcc_rl.synthetic.stream import StreamSource, truth_path
@@ -195,8 +194,7 @@ def test_jumps_hold_as_long_as_stated() -> None:
 
 
 def test_the_configuration_holds_the_defaults() -> None:
-    file = resources.files("lcc_rl.conf") / "data" / "stream.yaml"
-    source = instantiate(OmegaConf.create(file.read_text(encoding="utf-8")))
+    source = build(load("train", ["data=stream"]).data, "data")
     default = StreamSource(leader=StopAndGo(), criteria=Criteria())
     assert repr(replace(source, duration_s=tuple(source.duration_s))) == repr(default)
 

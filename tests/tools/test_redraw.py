@@ -9,9 +9,6 @@ import pytest
 import redraw
 from matplotlib.image import imread
 
-from lcc_rl.errors import ResultsError
-from lcc_rl.figures.page import Page
-
 ROOT = Path(__file__).parents[2]
 
 
@@ -22,7 +19,6 @@ def test_everything_is_drawn_again_and_the_page_is_the_same(tmp_path) -> None:
     assert page.read_text() == (ROOT / "docs" / "tasks.md").read_text()
     images = [path for path in written if path.suffix == ".png"]
     assert {path.name for path in images} == {
-        "calibration.png",
         "fleets.png",
         "fleets_ring.png",
         "ring.png",
@@ -42,11 +38,3 @@ def test_the_page_of_hcfs_holds_the_tables_that_are_kept(tmp_path) -> None:
     _, report = redraw.redraw_hcfs(tmp_path, tmp_path)
     assert page.read_text() == (ROOT / "docs" / "hcfs.md").read_text()
     assert report.read_text().count("<img ") == 13  # speeds, jerk, two of switching; learning
-
-
-def test_a_marked_table_that_does_not_exist_is_named(tmp_path) -> None:
-    text = "<!-- table: nowhere -->\n<!-- end -->\n"
-    (tmp_path / "page.md").write_text(text)
-    with pytest.raises(ResultsError, match="no table 'nowhere'"):
-        Page(tmp_path).fill(tmp_path / "page.md")
-    assert (tmp_path / "page.md").read_text() == text

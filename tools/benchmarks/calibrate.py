@@ -5,14 +5,13 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import astuple
-from functools import partial
 from typing import Any
 
+import numba
 import numpy as np
-import pandas as pd
 from scipy.optimize import differential_evolution
 
-from benchmarks.harness import TOLERANCE, Row, Run, alternate, installed, rows_of, stream
+from benchmarks.harness import Row, Run, agree, alternate, rows_of, stream
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.observed import Observed, observe
@@ -20,14 +19,14 @@ from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants
 
 NAMES = ("desired_speed", "time_gap")
-IDENTITY = "episode"
 OURS, PYTHON, NUMBA = "fit", "scipy, scaled from few", "scipy and numba"
+Objective = Callable[[Any], float]
 
 
 def squared_error(
     candidate: Any, leader: Any, follower: Any, gap: float, dt: float, known: Any
 ) -> float:
-    """Sum of squared speed errors of one driver with (v0, T), plain Python numbers (A3, A6).
+    """Return the sum of squared speed errors of one driver with (v0, T), plain numbers (A3, A6).
 
     Args:
         candidate: desired speed and time gap.
@@ -52,104 +51,83 @@ def squared_error(
     return total
 
 
-class Problem:
-    """RMSPE of one driver as a function of (v0, T).
+def objective(observed: Observed, index: int, compiled: Any = None) -> Objective:
+    """Return the RMSPE (0.07 is 7 %) of one driver as a function of (v0, T).
 
     Args:
         observed: the episodes.
         index: which of them.
         compiled: :func:`squared_error` as numba compiled it; None: in plain Python.
     """
-
-    def __init__(
-        self, observed: Observed, index: int, compiled: Callable[..., float] | None = None
-    ) -> None:
-        part = slice(int(observed.samples[index]))
-        speeds = [x[part, index].numpy() for x in (observed.leader_speed, observed.follower_speed)]
-        norm = float((speeds[1] ** 2).sum())
-        if compiled is None:
-            speeds = [speed.tolist() for speed in speeds]
-        known = astuple(IDMConstants())
-        settings: tuple[Any, ...] = (*speeds, float(observed.gap[index]), observed.time_step, known)
-        self.function: Callable[..., float] = compiled or squared_error
-        self.settings, self.norm = settings, norm
-
-    def __call__(self, candidate: Any) -> float:
-        """Return the error; 0.07 is 7 %."""
-        return float((self.function(candidate, *self.settings) / self.norm) ** 0.5)
+    part = slice(int(observed.samples[index]))
+    speeds = [x[part, index].numpy() for x in (observed.leader_speed, observed.follower_speed)]
+    norm = float((speeds[1] ** 2).sum())
+    if compiled is None:
+        speeds = [speed.tolist() for speed in speeds]
+    settings: tuple[Any, ...] = (
+        *speeds,
+        float(observed.gap[index]),
+        observed.time_step,
+        astuple(IDMConstants()),
+    )
+    function = compiled or squared_error
+    return lambda candidate: float((function(candidate, *settings) / norm) ** 0.5)
 
 
 def calibrate(options: Namespace) -> list[Row]:
-    """Seconds to fit (v0, T) of every driver, beside scipy driver by driver.
+    """Return the seconds to fit (v0, T) of every driver, beside scipy driver by driver.
 
     scipy's differential evolution runs with its own defaults: with an objective that numba
     compiled (before the clock starts) for every driver, and with one in plain Python for a few,
     scaled to all by the number of samples. Ours is the default search, compiled in the untimed run
-    before.
+    before. The mean RMSPE of each way is a row, too.
     """
     source = EpisodesSource(path=options.episodes) if options.episodes else stream(options.quick)
     observed = observe(source.load().episodes)
-    found: dict[str, Any] = {}
     few = np.linspace(0, observed.count - 1, 2 if options.quick else 6).round().astype(int)
-    limit = {"maxiter": 2} if options.quick else {}
-    runs: dict[str, Run] = {OURS: partial(ours, found, observed, options)}
-    runs[PYTHON] = partial(scipy, found, PYTHON, [Problem(observed, int(i)) for i in few], limit)
-    if installed("numba"):
-        runs[NUMBA] = partial(scipy, found, NUMBA, numba_problems(observed), limit)
+    compiled = numba.njit(squared_error)
+    everyone = [objective(observed, index, compiled) for index in range(observed.count)]
+    everyone[0](np.array([20.0, 1.0]))  # compiles
+    found: dict[str, Any] = {}
+    plain = [objective(observed, int(index)) for index in few]
+    runs = {
+        OURS: ours(found, observed, options.device),
+        PYTHON: scipy(found, PYTHON, plain, options.quick),
+        NUMBA: scipy(found, NUMBA, everyone, options.quick),
+    }
     spent = alternate(runs, options.repeats)
     spent[PYTHON] = spent[PYTHON] * (observed.samples.sum() / observed.samples[few].sum())
-    check_objective(found[OURS], observed, few)
-    rows = rows_of("calibrate", spent, "s", PYTHON, observed.count)
-    if NUMBA in spent:
-        pair = {OURS: spent[OURS], NUMBA: spent[NUMBA]}
-        rows += rows_of("calibrate", pair, "s", NUMBA, observed.count)[:1]
-    return rows + errors(found, few, observed.count)
+    fitted = found[OURS][["desired_speed_mps", "time_gap_s", "rmspe"]].to_numpy()
+    for own, (*parameters, error) in zip(plain, fitted[few], strict=True):
+        agree("our objective", error, own(parameters))
+    rows = rows_of(spent, "s", {OURS: [PYTHON, NUMBA], NUMBA: [PYTHON]}, observed.count)
+    errors = fitted[:, 2]
+    for other, own, count in (
+        (PYTHON, errors[few], len(few)),
+        (NUMBA, errors, observed.count),
+    ):
+        means = {OURS: np.array([100 * own.mean()]), other: np.array([100 * found[other].mean()])}
+        rows += rows_of(means, "% RMSPE", {OURS: [other]}, count)
+    return rows
 
 
-def ours(found: dict[str, Any], observed: Observed, options: Namespace) -> None:
-    """Fit every driver at once."""
-    result = fit(observed, device=options.device)
-    found[OURS] = result.drivers.set_index(IDENTITY).loc[observed.identity[IDENTITY]]
+def ours(found: dict[str, Any], observed: Observed, device: str) -> Run:
+    """Return the fit of every driver at once."""
+
+    def run() -> None:
+        drivers = fit(observed, device=device).drivers.set_index("episode")
+        found[OURS] = drivers.loc[observed.identity["episode"]]
+
+    return run
 
 
-def scipy(
-    found: dict[str, Any], name: str, problems: Sequence[Problem], limit: dict[str, int]
-) -> None:
-    """Fit drivers one by one."""
+def scipy(found: dict[str, Any], name: str, objectives: Sequence[Objective], quick: bool) -> Run:
+    """Return the fit of drivers one by one."""
     bounds = [DEFAULT_BOUNDS[parameter] for parameter in NAMES]
-    results = [differential_evolution(p, bounds, seed=0, **limit) for p in problems]
-    found[name] = np.array([result.fun for result in results])
+    limit = {"maxiter": 2} if quick else {}
 
+    def run() -> None:
+        results = [differential_evolution(x, bounds, seed=0, **limit) for x in objectives]
+        found[name] = np.array([result.fun for result in results])
 
-def numba_problems(observed: Observed) -> list[Problem]:
-    """Every driver's problem with a compiled objective."""
-    import numba
-
-    compiled = numba.njit(squared_error)
-    problems = [Problem(observed, index, compiled) for index in range(observed.count)]
-    problems[0](np.array([20.0, 1.0]))  # compiles
-    return problems
-
-
-def check_objective(fitted: pd.DataFrame, observed: Observed, few: np.ndarray) -> None:
-    """Hold our error against the plain objective at the parameters found."""
-    columns = ["desired_speed_mps", "time_gap_s", "rmspe"]
-    for index in few:
-        desired_speed, headway, rmspe = fitted[columns].iloc[index].tolist()
-        off = abs(Problem(observed, int(index))((desired_speed, headway)) - rmspe)
-        if not off <= TOLERANCE:
-            raise RuntimeError(f"the objectives differ by {off:g}")
-
-
-def errors(found: dict[str, Any], few: np.ndarray, count: int) -> list[Row]:
-    """Mean RMSPE of every way, of the few and of all drivers."""
-
-    def mean(values: Any) -> np.ndarray:
-        return np.array([100 * np.mean(values)])
-
-    fitted = found[OURS]["rmspe"].to_numpy()
-    some = {OURS: mean(fitted[few]), PYTHON: mean(found[PYTHON])}
-    rows = rows_of("calibrate", some, "% RMSPE", PYTHON, len(few))
-    whole = {OURS: mean(fitted)}
-    whole |= {NUMBA: mean(found[NUMBA])} if NUMBA in found else {}
-    return rows + rows_of("calibrate", whole, "% RMSPE", NUMBA if NUMBA in found else None, count)
+    return run

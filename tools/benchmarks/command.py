@@ -8,6 +8,7 @@ Every row also goes into one parquet file (--out). What each measures: docs/benc
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -61,34 +62,27 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
     return options
 
 
-def devices(options: Namespace, name: str) -> list[str]:
-    """Return where to run a benchmark; the reader knows no device."""
-    if name == "read":
-        return ["cpu"]
-    if options.device is not None:
-        return [options.device]
-    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print and write; 1 where the input is at fault."""
+    """Measure, print and write; return 1 if the input is at fault."""
     options = parse(arguments)
     torch.set_num_threads(options.threads)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     console, rows = Console(), []
     console.width = max(console.width, 110)
-    missing = [name for name in EXTRA if not installed(name)]
-    if missing:
-        console.print(escape(f"left out: {', '.join(missing)} ({how_to_install('bench')})"))
+    if not installed():
+        console.print(escape(f"left out: {', '.join(EXTRA)} ({how_to_install('bench')})"))
+    here = {"threads": options.threads, "machine": processor(), "torch": torch.__version__}
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     try:
         for name in options.names:
             if name not in BENCHMARKS:
                 raise unknown_name("benchmark", name, BENCHMARKS)
-        here = {"threads": options.threads, "machine": processor(), "torch": torch.__version__}
         for name in options.names or BENCHMARKS:
-            for device in devices(options, name):
+            chosen = [options.device] if options.device else devices
+            for device in ["cpu"] if name == "read" else chosen:
                 measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))
                 console.print(drawn(f"{name}, {device}", measured))
-                rows += [{**row, "device": device} for row in measured]
+                rows += [{"benchmark": name, **row, "device": device} for row in measured]
                 # After each, so that what is measured stays whatever happens to the next.
                 table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
                 write_parquet(table, options.out)

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-import numpy as np
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
-from benchmarks.harness import Row, Run, alternate, endings, first_calls, rows_of
+from benchmarks.harness import Row, Run, endings, rates
 from benchmarks.plain import PlainLoop, alcc, check_physics
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.rollout import ACTION, OBSERVATION
 from lcc_rl.pieces.rewards import REWARD
 
-Rates = dict[str, np.ndarray]
-
 
 def env(options: Namespace) -> list[Row]:
-    """Steps per second of the ALCC environment with zero actions, beside the plain loop.
+    """Return steps per second of the ALCC environment with zero actions, beside the plain loop.
 
     "step" is what TorchRL's collector calls (``step_and_maybe_reset``) and keeps nothing, like the
     plain loop; "StringCollector" is the training's own, which keeps the rewards; "rollout" stacks
@@ -28,20 +25,19 @@ def env(options: Namespace) -> list[Row]:
     """
     check_physics(options, 20 if options.quick else 250)
     rows: list[Row] = []
+    steps = 10 if options.quick else 100
     for batch in (1, 16) if options.quick else (1, 64, 1024, 8192):
         for ending in endings(options):
-            rates, first = env_rates(options, batch, ending)
-            rows += rows_of("env", rates, "steps/s", f"plain loop{ending}", batch)
-            rows += rows_of("env", first, "s, first call", None, batch)
+            runs = ways(options, batch, steps, ending)
+            plain, counts = f"plain loop{ending}", dict.fromkeys(runs, batch * steps)
+            against = {name: [plain] for name in runs if name != plain}
+            rows += rates(options, runs, "steps/s", counts, against, batch, first=bool(ending))
     return rows
 
 
-def env_rates(options: Namespace, batch: int, ending: str) -> tuple[Rates, Rates]:
-    """Steps per second of every way to step, all eager or, with an ending, all compiled.
-
-    And the seconds of the first call of those compiled.
-    """
-    steps, env = 10 if options.quick else 100, alcc(options, batch, 30)
+def ways(options: Namespace, batch: int, steps: int, ending: str) -> dict[str, Run]:
+    """Return every way to take so many steps, all eager or, with an ending, all compiled."""
+    env = alcc(options, batch, 30)
     zero = torch.zeros(batch, 1, 1, device=options.device)
     plain, start = PlainLoop(env), env.reset()
     advance = plain.step
@@ -67,16 +63,12 @@ def env_rates(options: Namespace, batch: int, ending: str) -> tuple[Rates, Rates
             state, _ = advance(state, action)
 
     collect = collecting(alcc(options, batch, 30), zero, steps, bool(ending))
-    ways = {"rollout": rollout, "StringCollector": collect, "step": step, "plain loop": loop}
-    runs = {f"{name}{ending}": way for name, way in ways.items()}
-    with torch.no_grad():
-        first = first_calls(runs) if ending else {}
-        spent = alternate(runs, options.repeats)
-    return {name: batch * steps / seconds for name, seconds in spent.items()}, first
+    runs = {"rollout": rollout, "StringCollector": collect, "step": step, "plain loop": loop}
+    return {f"{name}{ending}": run for name, run in runs.items()}
 
 
 def collecting(env: TransformedEnv, action: torch.Tensor, steps: int, compiled: bool) -> Run:
-    """So many steps of the training's own collector with one action, of which rewards are kept."""
+    """Return so many steps of the training's own collector with one action, keeping rewards."""
     collector = StringCollector(
         env,
         TensorDictModule(lambda _: action, [OBSERVATION], [ACTION]),

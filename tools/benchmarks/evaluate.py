@@ -13,8 +13,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from benchmarks.harness import TOLERANCE, Row, Run, alternate, endings, rows_of
+from benchmarks.harness import TOLERANCE, Row, Run, agree, endings, rates
 from benchmarks.plain import PlainLoop, study
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.evaluation.episodes import Episodes, Plan
 from lcc_rl.evaluation.metrics import LONG_TIME_GAP, PACE, UNSAFE_TTC
@@ -26,14 +27,12 @@ from lcc_rl.functional.power import acceleration_loss, motor_power, steady_power
 from lcc_rl.functional.random import uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.io.files import write_parquet
-from lcc_rl.policies import shared_policy
 
-OTHER = "plain loop"
 Sums = dict[str, Tensor]
 
 
 def evaluate(options: Namespace) -> list[Row]:
-    """Episodes per second of an untrained actor, rows and time series written.
+    """Return episodes per second of an untrained actor, rows and time series written.
 
     The plain loop runs the same network and physics, adds up the same measures as it goes and
     writes nothing.
@@ -53,13 +52,13 @@ def evaluate(options: Namespace) -> list[Row]:
             given = reset_options(env, *plan.episodes(0)[:2], settings.seed, plan.population)
             plain = PlainEvaluation(env, agent.policy.module, bool(ending))
             check(episodes, plain, given)
+            own, other = f"evaluation{ending}", f"plain loop{ending}"
             runs: dict[str, Run] = {
-                f"evaluation{ending}": partial(written, episodes, Path(name)),
-                f"{OTHER}{ending}": partial(plain.measure, given),
+                own: partial(written, episodes, Path(name)),
+                other: partial(plain.measure, given),
             }
-            spent = alternate(runs, options.repeats)
-            rates = {case: len(plan) / seconds for case, seconds in spent.items()}
-            rows += rows_of("evaluate", rates, "episodes/s", f"{OTHER}{ending}", plan.size)
+            counts = dict.fromkeys(runs, len(plan))
+            rows += rates(options, runs, "episodes/s", counts, {own: [other]}, plan.size)
     return rows
 
 
@@ -76,9 +75,9 @@ def check(episodes: Episodes, plain: PlainEvaluation, given: TensorDictBase) -> 
     rows, sums = episodes.play(0)[0], plain.measure(given)
     for name in ("cav_path_energy_kj", "hdv_energy_kj", "min_gap_m", "share_time_gap_long"):
         expected = torch.from_numpy(rows[name].to_numpy(copy=True))
-        off = float((sums[name].cpu().flatten()[: len(expected)] - expected).abs().max())
-        if not off <= 10.0 * TOLERANCE * max(1.0, float(expected.abs().max())):
-            raise RuntimeError(f"{name} of the plain evaluation is off by {off:g}")
+        own = sums[name].cpu().flatten()[: len(expected)]
+        tolerance = 10.0 * TOLERANCE * max(1.0, float(expected.abs().max()))
+        agree(f"{name} of the plain evaluation", own, expected, tolerance)
 
 
 class PlainEvaluation(PlainLoop):

@@ -1,4 +1,4 @@
-"""Benchmarks, the harness: timing in turn, rows, and the table they are shown in."""
+"""Timing in turn, comparison with alternatives, and the rows that come out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 from argparse import Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -17,34 +17,26 @@ from rich.table import Table
 from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
-EXTRA = ("stable_baselines3", "gymnasium", "numba")  # the alternatives
+EXTRA = ("stable_baselines3", "gymnasium")  # alternatives of the extra bench
 Row = dict[str, Any]
 Run = Callable[[], Any]
-Values = Mapping[str, np.ndarray]
+Against = Mapping[str, Sequence[str]]  # names of a case's alternatives
 
 
 def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
-    """Seconds of every run, ``repeats`` times in turn; once before that, untimed."""
+    """Return the seconds of every run, ``repeats`` times in turn; once before that, untimed."""
     spent: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(repeats + 1):
         for name, run in runs.items():
-            begun = clock()
-            run()
-            spent[name].append(clock() - begun)
-    return {name: np.array(seconds[1:]) for name, seconds in spent.items()}
+            spent[name].append(seconds(run))
+    return {name: np.array(each[1:]) for name, each in spent.items()}
 
 
-def first_calls(runs: Mapping[str, Run]) -> dict[str, np.ndarray]:
-    """Seconds of the first call of every run, with nothing kept of an earlier compilation."""
-    spent = {}
-    config: Any = torch.compiler.config  # torch adds its method patch on import
-    with config.patch(force_disable_caches=True), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that caches are disabled
-        for name, run in runs.items():
-            begun = clock()
-            run()
-            spent[name] = np.array([clock() - begun])
-    return spent
+def seconds(run: Run) -> float:
+    """Return the seconds of a run, from when to when the accelerator has nothing left to do."""
+    begun = clock()
+    run()
+    return clock() - begun
 
 
 def clock() -> float:
@@ -54,25 +46,71 @@ def clock() -> float:
     return time.perf_counter()
 
 
-def rows_of(
-    benchmark: str, values: Values, unit: str, other: str | None = None, batch: int | None = None
+def rates(
+    options: Namespace,
+    runs: Mapping[str, Run],
+    unit: str,
+    counts: Mapping[str, int],
+    against: Against,
+    batch: int | None = None,
+    first: bool = False,
+    grad: bool = False,
 ) -> list[Row]:
-    """One row per case; ``values`` holds the repeats of each, in the order they were taken."""
-    columns = ("benchmark", "case", "batch", "value", "unit", "spread_low", "spread_high")
+    """Time runs in turn and return their rates.
+
+    Args:
+        options: those of the command line.
+        runs: the cases by name.
+        unit: unit of the rates.
+        counts: what one call of each run makes or does.
+        against: the alternatives of each case; those that are no case are left out.
+        batch: the batch size.
+        first: add the seconds of each first call, with nothing kept of an earlier compilation.
+        grad: keep gradients.
+    """
+    rows: list[Row] = []
+    with torch.set_grad_enabled(grad):
+        if first:
+            config: Any = torch.compiler.config  # torch adds its method patch on import
+            with config.patch(force_disable_caches=True), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that caches are disabled
+                calls = {name: np.array([seconds(run)]) for name, run in runs.items()}
+            rows = rows_of(calls, "s, first call", batch=batch)
+        spent = alternate(runs, options.repeats)
+    values = {name: counts[name] / each for name, each in spent.items()}
+    return rows_of(values, unit, against, batch) + rows
+
+
+def rows_of(
+    values: Mapping[str, np.ndarray],
+    unit: str,
+    against: Against | None = None,
+    batch: int | None = None,
+) -> list[Row]:
+    """Return a row per case and alternative; ``values`` holds the repeats in their order."""
     rows = []
     for case, each in values.items():
-        figures = (benchmark, case, batch, np.median(each), unit, each.min(), each.max())
-        against = other if case != other else None
-        ratio = np.nan if against is None else np.median(each / values[against])
-        row = dict(zip(columns, figures, strict=True))
-        rows.append({**row, "alternative": against, "ratio": ratio})
+        others = [name for name in (against or {}).get(case, ()) if name in values]
+        row = {"case": case, "batch": batch, "value": np.median(each), "unit": unit}
+        row |= {"spread_low": each.min(), "spread_high": each.max()}
+        if not others:
+            rows.append({**row, "alternative": None, "ratio": np.nan})
+        for other in others:
+            ratio = np.median(each / values[other])
+            rows.append({**row, "alternative": other, "ratio": ratio})
     return rows
 
 
-def times(count: int, function: Run) -> None:
-    """Call a function so many times."""
-    for _ in range(count):
-        function()
+def agree(what: str, one: Any, other: Any, tolerance: float = TOLERANCE) -> None:
+    """Check that two ways lead to the same result.
+
+    Raises:
+        RuntimeError: if they do not.
+    """
+    one, other = (torch.as_tensor(x, dtype=torch.float64).cpu() for x in (one, other))
+    off = float((one - other).abs().max())
+    if not off <= tolerance:
+        raise RuntimeError(f"{what} is off by {off:g}")
 
 
 def stream(quick: bool) -> StreamSource:
@@ -80,12 +118,9 @@ def stream(quick: bool) -> StreamSource:
     return StreamSource(2, 3, 3, (35.0, 45.0)) if quick else StreamSource()
 
 
-def installed(*names: str) -> bool:
-    """Whether all these packages, of the extra ``bench`` or numba, are at hand."""
-    try:
-        return all(find_spec(name) is not None for name in names)
-    except ModuleNotFoundError:  # of a package within one that is missing
-        return False
+def installed() -> bool:
+    """Return whether the packages of the extra ``bench`` are installed."""
+    return all(find_spec(name) is not None for name in EXTRA)
 
 
 def endings(options: Namespace) -> tuple[str, ...]:
@@ -94,16 +129,15 @@ def endings(options: Namespace) -> tuple[str, ...]:
 
 
 def drawn(name: str, rows: list[Row]) -> Table:
-    """The rows of one benchmark, for the terminal."""
+    """Return the rows of one benchmark as a table for the terminal."""
     table = Table(title=name, caption=f"load average {os.getloadavg()[0]:.1f}")
     for heading in ("case", "batch", "median", "smallest … largest", "unit", "ratio", "to"):
         table.add_column(heading, justify="left" if heading in ("case", "unit", "to") else "right")
     for row in rows:
         numbers = (row["value"], row["spread_low"], row["spread_high"])
         value, low, high = (f"{x:,.0f}" if x >= 1000 else f"{x:.3g}" for x in numbers)
-        batch = "" if row["batch"] is None else str(row["batch"])
-        other = (
-            ("", "") if row["alternative"] is None else (f"{row['ratio']:.3g}", row["alternative"])
-        )
-        table.add_row(row["case"], batch, value, f"{low} … {high}", row["unit"], *other)
+        batch, other = row["batch"] or "", row["alternative"]
+        ratio = f"{row['ratio']:.3g}" if other else ""
+        spread = f"{low} … {high}"
+        table.add_row(row["case"], str(batch), value, spread, row["unit"], ratio, other or "")
     return table

@@ -1,20 +1,20 @@
-"""Benchmarks, the study and its plain loop: the physics as one function of tensors."""
+"""The ALCC study and its plain loop: the physics as one function of tensors."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable
+from copy import deepcopy
 from functools import cache
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from benchmarks.harness import TOLERANCE, stream
+from benchmarks.harness import agree, stream
 from lcc_rl.config import load
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.rollout import ACTION
@@ -26,10 +26,14 @@ from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.pieces.rewards import TOUCH
+from lcc_rl.schemas import StudyConfig
+
+State = dict[str, Tensor]
+Played = tuple[State, State, Tensor]  # the next state, what was written, the next observation
 
 
 @cache
-def study(quick: bool) -> tuple[DictConfig, Inputs]:
+def study(quick: bool) -> tuple[StudyConfig, Inputs]:
     """Configuration and inputs of the ALCC study on the synthetic stream."""
     cfg = load("train", ["variant=alcc"])
     return cfg, load_inputs(cfg, stream(quick).load().episodes)
@@ -46,9 +50,8 @@ def alcc(
 ) -> TransformedEnv:
     """Build the ALCC environment; the automated vehicle starts with the given time gap [s]."""
     cfg, inputs = study(options.quick)
-    cfg = cfg.copy()
-    cfg.scenario.start.automated.time_gap = initial_time_gap
-    cfg.scenario.start.automated.gap_range = [1.0, 1.0]
+    cfg = deepcopy(cfg)
+    cfg.scenario.start["automated"] |= {"time_gap": initial_time_gap, "gap_range": [1.0, 1.0]}
     cfg.scenario.string = f"automated human*{followers}"
     return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 
@@ -73,7 +76,7 @@ class PlainLoop:
         energies = (terms["cav_energy"], terms["hdv_energy"])
         self.cav_price, self.hdv_price = (term.weight * term.factor for term in energies)
 
-    def start(self, td: TensorDictBase) -> dict[str, Tensor]:
+    def start(self, td: TensorDictBase) -> State:
         """Begin where a reset of the environment begins.
 
         Entries are ``[batch, 1]``, of the human drivers ``[batch, n, width]``.
@@ -92,7 +95,7 @@ class PlainLoop:
             **{key: td["human", key] for key in keys},
         }
 
-    def step(self, now: dict[str, Tensor], action: Tensor) -> tuple[dict[str, Tensor], ...]:
+    def step(self, now: State, action: Tensor) -> tuple[State, State]:
         """Return the next state and what the environment writes beside it."""
         dt, drivers = self.motion.time_step, self.human.drivers
         leader = self.leader.speeds[now["place"] + now["step"] + 1]
@@ -129,18 +132,18 @@ class PlainLoop:
         after = {**now, "step": now["step"] + 1, **reached, **learned}
         return after, {**written, "observation": self.observe(after)}
 
-    def observe(self, now: dict[str, Tensor]) -> Tensor:
+    def observe(self, now: State) -> Tensor:
         """Return what the automated vehicle sees."""
         leader, cav, speed, gap = now["leader"], now["cav"], now["speed"][:, 0], now["gap"][:, 0]
         seen = [leader, cav, leader - cav, now["cav_gap"], speed, cav - speed, gap]
         return torch.cat(seen, dim=-1) * self.scales
 
-    def over(self, now: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def over(self, now: State) -> tuple[Tensor, Tensor]:
         """Return where an episode ends by a collision, and where it ends at all."""
         crashed = (now["cav_gap"] <= 0.0) | (now["gap"] <= 0.0).any(-2)
         return crashed, crashed | (now["step"] >= self.horizon)
 
-    def begin(self, seed: Tensor) -> dict[str, Tensor]:
+    def begin(self, seed: Tensor) -> State:
         """Return the first moment of the episodes of some seeds, ``[n, 1]``."""
         leader, human, believed = self.leader, self.human, self.estimator
         starts = self.motion.starts
@@ -169,9 +172,12 @@ class PlainLoop:
             "desired_time_gap": headway,
         }
 
-    def play(
-        self, now: dict[str, Tensor], action: Tensor, seeds: Tensor
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+    def play_on(self, now: State, action: Tensor, _: Any) -> Played:
+        """Take a step; an episode that ends goes on."""
+        after, written = self.step(now, action)
+        return after, written, written["observation"]
+
+    def play(self, now: State, action: Tensor, seeds: Any) -> Played:
         """Take a step, replace episodes that end; return state, what was written, observation.
 
         Made for the compiler: every episode is begun anew, and that taken where one is over.
@@ -183,9 +189,7 @@ class PlainLoop:
         written |= {"terminated": crashed, "done": over}
         return after, written, chosen(over, self.observe(new), written["observation"])
 
-    def play_eagerly(
-        self, now: dict[str, Tensor], action: Tensor, seeds: Tensor
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+    def play_eagerly(self, now: State, action: Tensor, seeds: Any) -> Played:
         """The same without a compiler: only episodes that are over are begun anew."""
         after, written = self.step(now, action)
         crashed, over = self.over(after)
@@ -232,9 +236,8 @@ def _check_steps(env: TransformedEnv, steps: int) -> None:
         td = env.step(td.set(ACTION, action.unsqueeze(-2)))
         state, written = plain.step(state, action)
         for name in ("observation", "reward"):
-            off = float((td["next", "automated", name].squeeze(-2) - written[name]).abs().max())
-            if not off <= TOLERANCE:
-                raise RuntimeError(f"step {step}: {name} of the plain loop is off by {off:g}")
+            own = td["next", "automated", name].squeeze(-2)
+            agree(f"step {step}: {name} of the plain loop", written[name], own)
         td = step_mdp(td)
 
 
@@ -244,6 +247,4 @@ def check_resets(options: Namespace) -> None:
     plain, td = PlainLoop(env), env.reset()
     begun, wanted = plain.begin(td[SEED]), plain.start(td)
     for name, value in wanted.items():
-        off = float((begun[name] - value).abs().max())
-        if not off <= TOLERANCE:
-            raise RuntimeError(f"first moment: {name} of the plain loop is off by {off:g}")
+        agree(f"first moment: {name} of the plain loop", begun[name], value)

@@ -13,12 +13,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
-from benchmarks.harness import Row, alternate, rows_of, stream
+from benchmarks.harness import Row, rates, rows_of, stream
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.errors import DataError
 
 # The kernel's mark of this very process: ru_maxrss may begin at that of the one that started it.
-PEAK = """
+PROGRAM = """
 import resource, sys
 from pathlib import Path
 from lcc_rl.data.ngsim import read_ngsim
@@ -30,10 +30,11 @@ before = peak()
 read_ngsim(sys.argv[1], sys.argv[2] or None)
 print(peak() - before)
 """
+PEAK = "peak memory"
 
 
 def read(options: Namespace) -> list[Row]:
-    """Rows per second of the NGSIM reader, and by how much reading raises the peak of memory.
+    """Return rows/s of the NGSIM reader, and by how much reading raises the peak of memory.
 
     Memory is the largest resident size of a process of its own, less that before reading. The
     file of four times the rows holds one copy under each of four Locations.
@@ -45,15 +46,15 @@ def read(options: Namespace) -> list[Row]:
         path = Path(options.ngsim or path)
         runs = {"read_ngsim": lambda: read_ngsim(path), "pandas": lambda: pd.read_csv(path)}
         count = read_ngsim(path).report.rows_read
-        rates = {name: count / spent for name, spent in alternate(runs, options.repeats).items()}
+        counts, against = dict.fromkeys(runs, count), {"read_ngsim": ["pandas"]}
+        rows = rates(options, runs, "rows/s", counts, against)
         write_copies(path, fourfold, ("a", "b", "c", "d"))
         memory = {
-            "peak memory": peak_memory(path, ""),
+            PEAK: peak_memory(path, ""),
             "… 4 × the rows, ¼ kept": peak_memory(fourfold, "a"),
             "… 4 × the rows": peak_memory(fourfold, ""),
         }
-    speed = rows_of("read", rates, "rows/s", "pandas")
-    return speed + rows_of("read", memory, "MiB", "peak memory")
+    return rows + rows_of(memory, "MiB", {name: [PEAK] for name in memory if name != PEAK})
 
 
 def write_copies(path: Path, target: Path, locations: Sequence[str]) -> None:
@@ -70,7 +71,7 @@ def write_copies(path: Path, target: Path, locations: Sequence[str]) -> None:
 
 
 def peak_memory(path: Path, location: str) -> np.ndarray:
-    """By how much reading raises the peak of a fresh process [MiB]."""
-    command = [sys.executable, "-c", PEAK, str(path), location]
+    """Return by how much reading raises the peak of a fresh process [MiB]."""
+    command = [sys.executable, "-c", PROGRAM, str(path), location]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return np.array([float(done.stdout)])

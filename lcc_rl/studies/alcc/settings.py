@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lcc_rl.commands.pipeline import TRAJECTORIES, known_settings, root_key
-from lcc_rl.config import require
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require, unknown_name
 from lcc_rl.runs.sweeps import key_of
 from lcc_rl.studies.runner import (
     EPISODES,
@@ -47,6 +46,11 @@ class Change:
 
 
 UNCHANGED = Change()
+# One profile for training, the usual held-out recordings for evaluation.
+ONE_PROFILE = (
+    "split=single",
+    "split.held_out={_target_: lcc_rl.data.profiles.Split, by: recording, evaluation_share: 0.34}",
+)
 MAIN = Change(variants=(*VARIANTS, CONTROL))
 ABLATIONS = {
     "no_safety": Change(("reward.terms.safety.weight=0",)),
@@ -56,7 +60,7 @@ ABLATIONS = {
     "true_acceleration": Change(("reward.terms.hdv_energy.power=vehicles.power",), ("alcc",)),
     "population_mean": Change(("scenario.pieces.estimator.learning_time=null",), ("alcc",)),
     "no_recuperation": Change(("scenario.pieces.power.recuperation=false",)),
-    "one_training_profile": Change(("split=single_training", "scenario.pieces.leader.start=first")),
+    "one_training_profile": Change((*ONE_PROFILE, "scenario.pieces.leader.start=first")),
     "constant_rate": Change(("agent.final_lr_fraction=1.0",)),
     "short_training": Change(("training.episodes=320",)),
     **{f"recipe_{name}": Change(recipes=(name,)) for name in RECIPES},

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig
 
 from lcc_rl.commands import evaluation
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, root_key
@@ -16,6 +15,7 @@ from lcc_rl.config import load
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.profiles import leader_profiles
 from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.schemas import PipelineConfig, StudyConfig
 from lcc_rl.studies.alcc.settings import (
     ABLATIONS,
     CONTROL,
@@ -62,7 +62,7 @@ def run(study: Study, parts: Sequence[str] | None = None, command: str = "") -> 
     return list(outcomes.values())
 
 
-def check(study: Study, parts: Sequence[str]) -> DictConfig:
+def check(study: Study, parts: Sequence[str]) -> StudyConfig:
     """Check settings before any work, and return the configuration of a main training."""
     for part in parts:
         if part not in PARTS:
@@ -90,13 +90,13 @@ def calibrate(study: Study) -> None:
     calibrate_once(_calibration(study), study.folder)
 
 
-def _calibration(study: Study) -> DictConfig:
+def _calibration(study: Study) -> PipelineConfig:
     skipped = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
     own = [item for item in study.overrides if root_key(item) not in skipped]
     return load("pipeline", ["calibration=both", *own])
 
 
-def _main(study: Study, wanted: DictConfig) -> list[Outcome]:
+def _main(study: Study, wanted: StudyConfig) -> list[Outcome]:
     outcomes, usable = _trained(study)
     evaluate_all(study.settings("evaluate", "alcc"), usable, study.folder / "evaluation")
     return outcomes
@@ -109,7 +109,7 @@ def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
     return outcomes, outcomes + study.earlier(folder, MAIN)
 
 
-def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
+def _filter(study: Study, wanted: StudyConfig) -> list[Outcome]:
     """Put the filter on the policies of the main part, with several settings."""
     outcomes, usable = _trained(study)
     # The variant cbf, the filter without a policy, is evaluated too; it learns nothing.
@@ -122,9 +122,9 @@ def _filter(study: Study, wanted: DictConfig) -> list[Outcome]:
     return outcomes
 
 
-def _ablations(study: Study, wanted: DictConfig) -> list[Outcome]:
+def _ablations(study: Study, wanted: StudyConfig) -> list[Outcome]:
     # Ablations that change nothing are left out, and of short runs those that train long.
-    left_out = {f"gamma_{wanted.agent.gamma:g}", f"recipe_{study.recipe}"}
+    left_out = {f"gamma_{wanted.agent['gamma']:g}", f"recipe_{study.recipe}"}
     if study.recipe in (None, SMOKE):
         left_out |= set(OF_DDPG)
     chosen = study.ablations or tuple(name for name in ABLATIONS if name not in left_out)
@@ -132,7 +132,7 @@ def _ablations(study: Study, wanted: DictConfig) -> list[Outcome]:
     return _each(study, {folder / n: c for n, c in map(chosen_ablation, chosen)})
 
 
-def _single(study: Study, wanted: DictConfig) -> list[Outcome]:
+def _single(study: Study, wanted: StudyConfig) -> list[Outcome]:
     chosen = spread_profiles(study.folder / TRAJECTORIES, wanted, study.profiles)
     folder, recipes = study.folder / "single", ("single_profile",)
     return _each(
@@ -141,7 +141,7 @@ def _single(study: Study, wanted: DictConfig) -> list[Outcome]:
     )
 
 
-def _followers(study: Study, wanted: DictConfig) -> list[Outcome]:
+def _followers(study: Study, wanted: StudyConfig) -> list[Outcome]:
     changes = {
         study.folder / "followers" / str(number): followers_change(study.overrides, number)
         for number in sorted(set(study.followers))
@@ -171,7 +171,7 @@ def _each(
     return outcomes
 
 
-def spread_profiles(table: Path, cfg: DictConfig, count: int) -> list[int]:
+def spread_profiles(table: Path, cfg: StudyConfig, count: int) -> list[int]:
     """Choose profiles for the single-profile protocol, spread evenly over all of them."""
     scenario = cfg.scenario
     profiles = leader_profiles(read_episodes(table), scenario.time_step).at_least(scenario.horizon)

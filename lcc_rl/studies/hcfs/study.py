@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import DictConfig
 
 from lcc_rl.commands.evaluation import evaluate_and_write
 from lcc_rl.commands.pipeline import known_settings, root_key
-from lcc_rl.config import load, plain
+from lcc_rl.config import load
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
@@ -22,10 +21,12 @@ from lcc_rl.evaluation.strategies import (
     driven_by,
     with_weights,
 )
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.precision import prepare_torch
+from lcc_rl.schemas import StudyConfig
 from lcc_rl.studies.hcfs.tables import LEARNED, per_run, rounded
 from lcc_rl.studies.runner import (
     EPISODES,
@@ -67,7 +68,7 @@ class Study(BaseStudy):
             for seed in range(self.seeds)
         ]
 
-    def evaluation(self, *own: str) -> DictConfig:
+    def evaluation(self, *own: str) -> StudyConfig:
         """Return the configuration of an evaluation of the hybrid."""
         shared = known_settings(list(self.overrides), "evaluate")
         more = () if any(root_key(item) == "leader" for item in self.overrides) else (WLTC,)
@@ -130,7 +131,7 @@ def keep(folder: Path, trainings: Sequence[Path]) -> None:
     write_parquet(rounded(pd.concat(found, ignore_index=True)), folder / TRAINING)
 
 
-def hybrid_strategies(cfg: DictConfig, learned: Strategy) -> list[Strategy]:
+def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
     """Build the DDPG parent and the hybrids that the study compares.
 
     ``hcfs``: as configured, with the tuned rule; ``hcfs untuned``: with the paper-like rule;
@@ -141,8 +142,8 @@ def hybrid_strategies(cfg: DictConfig, learned: Strategy) -> list[Strategy]:
         cfg: configuration of the evaluation of ``hcfs``.
         learned: the trained policy, driving alone.
     """
-    hybrid = plain(cfg.deployed)
-    gains = plain(load("evaluate", ["variant=cacc", f"gains={UNTUNED}"]).gains)
+    hybrid = cfg.deployed
+    gains = load("evaluate", ["variant=cacc", f"gains={UNTUNED}"]).gains
     changes: dict[str, dict[str, Any]] = {
         "hcfs": {},
         "hcfs untuned": {"rule": {**hybrid["rule"], **gains}},
@@ -150,7 +151,7 @@ def hybrid_strategies(cfg: DictConfig, learned: Strategy) -> list[Strategy]:
         "hcfs literal": {"jerk_bound": 10.0, "clamp": False, "safe_cap": False},
         "hcfs oracle": {"lookahead": "oracle"},
     }
-    alone = driven_by(cfg, cfg.scenario.controllers.automated)
+    alone = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
     return [
         replace(learned, name=LEARNED, cfg=alone),
         *(
@@ -161,7 +162,7 @@ def hybrid_strategies(cfg: DictConfig, learned: Strategy) -> list[Strategy]:
 
 
 def _evaluate(
-    strategies: Sequence[Strategy], cfg: DictConfig, inputs: Inputs, folder: Path, *trained: Path
+    strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path, *trained: Path
 ) -> None:
     """Evaluate into a folder, unless that is done."""
     if up_to_date(cfg, folder, trained):

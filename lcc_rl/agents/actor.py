@@ -1,0 +1,112 @@
+"""The learned policy: a deterministic network, and the noise that explores around it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.random import normal, stream_id
+from lcc_rl.io.memory import require_memory
+from lcc_rl.pieces.base import SEED, STEP
+
+# Bytes that a weight costs a training: it, its gradient, two moments of Adam, its target.
+WEIGHT = 5 * 4
+OBSERVATION, ACTION = (AUTOMATED, "observation"), (AUTOMATED, "action")
+
+
+def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:
+    """Build a ReLU network whose initial weights depend on ``seed`` alone.
+
+    Args:
+        inputs: entries read.
+        outputs: entries written.
+        hidden: sizes of the layers between; none for a linear map.
+        seed: seed of the weights.
+
+    Raises:
+        ConfigError: if the weights do not fit into memory.
+    """
+    weights = sum(a * b for a, b in pairwise([inputs, *hidden, outputs]))
+    require_memory({f"agent.hidden={list(hidden)}": WEIGHT * weights})
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return MLP(
+            in_features=inputs,
+            out_features=outputs,
+            num_cells=list(hidden),
+            activation_class=nn.ReLU,
+        )
+
+
+def make_actor(
+    observation_size: int, action_size: int, hidden: Sequence[int], seed: int
+) -> TensorDictModule:
+    """Build the policy network: ReLU layers and a tanh, so that actions lie in [−1, 1].
+
+    Reads ``"observation"`` ``[*batch, observation_size]``, writes ``"action"``
+    ``[*batch, action_size]``.
+    """
+    network = nn.Sequential(seeded_mlp(observation_size, action_size, hidden, seed), nn.Tanh())
+    return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
+
+
+def shared_policy(policy: TensorDictModule) -> TensorDictModule:
+    """Return a policy that drives every automated vehicle of a string by the same network.
+
+    Reads ``("automated", "observation")`` ``[*batch, A, n]`` and writes ``("automated",
+    "action")`` ``[*batch, A, 1]``; the weights are those of the policy given.
+
+    Args:
+        policy: a network that reads ``"observation"`` and writes ``"action"``.
+    """
+    return TensorDictModule(policy.module, in_keys=[OBSERVATION], out_keys=[ACTION])
+
+
+class GaussianExploration(TensorDictModuleBase):
+    """Adds N(0, sigma²) to actions and holds them within [−1, 1].
+
+    The noise is a function of the episode's seed and step, so exploration needs no random state.
+
+    Args:
+        sigma: standard deviation; change it with ``exploration.sigma.fill_(…)``.
+        key: the action, ``[*batch, …, n]``.
+    """
+
+    sigma: Tensor
+
+    def __init__(self, sigma: float, key: NestedKey = ACTION) -> None:
+        self.in_keys = [key, SEED, STEP]
+        self.out_keys = [key]
+        super().__init__()
+        self.key, self.stream = key, stream_id("exploration")
+        self.register_buffer("sigma", torch.tensor(float(sigma)))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the noisy action."""
+        action = tensordict.get(self.key)
+        noise = action_noise(action, tensordict, self.stream)
+        return tensordict.set(self.key, (action + self.sigma * noise).clamp(-1.0, 1.0))
+
+
+def action_noise(like: Tensor, tensordict: TensorDictBase, stream: int) -> Tensor:
+    """Draw N(0, 1) for every entry of an action by the seed and the step of its episode.
+
+    Args:
+        like: the action, ``[*batch, …, n]``.
+        tensordict: holds seed and step, ``[*batch, 1]``.
+        stream: the stream of the first entry; the others take those that follow.
+    """
+    seed, step = (tensordict.get(key) for key in (SEED, STEP))
+    event = like.shape[seed.ndim - 1 :]
+    seed, step = (x.view(*x.shape[:-1], *(1 for _ in event)) for x in (seed, step))
+    entries = torch.arange(math.prod(event), device=like.device).view(event)
+    return normal(seed, step, stream + entries)

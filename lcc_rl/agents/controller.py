@@ -1,0 +1,44 @@
+"""A controller as a policy: what a rule would command, as actions."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+
+from lcc_rl.agents.actor import ACTION
+from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.pieces.base import NEXT, root_key
+from lcc_rl.pieces.controllers import Controller
+
+
+class ControllerPolicy(TensorDictModuleBase):
+    """Drives by a controller where a policy is expected.
+
+    Writes ``("automated", "action")``, ``[*batch, A, 1]``: the command over the acceleration of
+    action 1, held within [−1, 1].
+
+    Args:
+        controller: a controller of the automated vehicles that remembers nothing.
+        max_acceleration: acceleration of action 1 in the environment [m/s²].
+
+    Raises:
+        ConfigError: if the controller keeps entries of its own from step to step.
+    """
+
+    def __init__(self, controller: Controller, max_acceleration: float = 3.0) -> None:
+        require_positive("policy", max_acceleration=max_acceleration)
+        if len(controller.targets) > 1 or any(key[0] == NEXT for key in controller.in_keys):
+            raise ConfigError(
+                f"{type(controller).__name__} remembers entries of its own, which only an "
+                "environment carries; let it drive by scenario.controllers.automated instead"
+            )
+        self.in_keys = [root_key(key) for key in controller.in_keys]
+        self.out_keys = [ACTION]
+        super().__init__()
+        self.controller, self.max_acceleration = controller, max_acceleration
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        command = self.controller.compute(*(tensordict.get(key) for key in self.in_keys))
+        return tensordict.set(ACTION, (command / self.max_acceleration).clamp(-1.0, 1.0))

@@ -1,0 +1,179 @@
+"""Policies that are rules with learned constants, alone or below a network that corrects them.
+
+Like a network they map the observation to the action, so that every agent that learns through the
+simulator, or by search, can train them, and what is stored is a policy like any other.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from lcc_rl.agents.actor import make_actor, seeded_mlp
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.functional.rules import idm_acc, linear_acc
+from lcc_rl.pieces.observation import Observation
+
+SEEN = ("self.speed", "self.gap", "self.relative_speed")
+
+
+class Rule(nn.Module, ABC):
+    """A rule whose constants are learned; their logarithms are, so that they stay positive.
+
+    Args:
+        observation: where the vehicle's own speed, gap and relative speed are found.
+        constants: constants at the start, by name; those left out have the class's values.
+        max_acceleration: acceleration of action 1 [m/s²].
+
+    Raises:
+        ConfigError: if a constant is unknown or not positive, or an entry is not observed.
+    """
+
+    START: ClassVar[Mapping[str, float]] = {}
+    scales: Tensor
+
+    def __init__(
+        self,
+        observation: Observation,
+        constants: Mapping[str, float] | None,
+        max_acceleration: float,
+    ) -> None:
+        super().__init__()
+        given = dict(constants or {})
+        for name in given:
+            if name not in self.START:
+                raise unknown_name("constant of the rule", name, self.START)
+        values = {**self.START, **given}
+        self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
+        self.max_acceleration = max_acceleration
+        self.columns = [observation.column(name) for name in SEEN]
+        self.register_buffer("scales", observation.constants[self.columns].clone(), False)
+
+    def constants(self) -> dict[str, float]:
+        """Return the constants by name."""
+        return dict(zip(self.START, self.logarithms.exp().tolist(), strict=True))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the action in [−1, 1], ``[*batch, 1]``, of the observation ``[*batch, n]``."""
+        speed, gap, relative_speed = (
+            observation[..., column : column + 1] / scale
+            for column, scale in zip(self.columns, self.scales, strict=True)
+        )
+        command = self.acceleration(speed, gap, relative_speed, *self.logarithms.exp())
+        return (command / self.max_acceleration).clamp(-1.0, 1.0)
+
+    @abstractmethod
+    def acceleration(
+        self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
+    ) -> Tensor:
+        """Return the acceleration [m/s²] for the constants in the order of ``START``."""
+
+
+class IDMRule(Rule):
+    """The Intelligent Driver Model with its five constants (A3–A4)."""
+
+    START: ClassVar[Mapping[str, float]] = {
+        "desired_speed": 25.0,
+        "time_gap": 1.2,
+        "acceleration": 1.0,
+        "deceleration": 1.5,
+        "min_gap": 2.0,
+    }
+
+    def acceleration(
+        self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
+    ) -> Tensor:
+        return idm_acc(speed, gap, relative_speed, *constants)
+
+
+class ACCRule(Rule):
+    """Linear adaptive cruise control, :func:`lcc_rl.functional.rules.linear_acc`."""
+
+    START: ClassVar[Mapping[str, float]] = {
+        "desired_speed": 25.0,
+        "time_gap": 1.5,
+        "min_gap": 2.0,
+        "gap_gain": 0.1,
+        "speed_gain": 0.5,
+    }
+
+    def acceleration(
+        self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
+    ) -> Tensor:
+        return linear_acc(speed, gap, relative_speed, *constants)
+
+
+class Residual(nn.Module):
+    """A rule whose constants are kept, plus a network that begins at zero.
+
+    Args:
+        rule: the rule.
+        observation_size: entries of the observation.
+        hidden: sizes of the network's ReLU layers.
+        seed: seed of its initial weights.
+    """
+
+    def __init__(self, rule: Rule, observation_size: int, hidden: Sequence[int], seed: int) -> None:
+        super().__init__()
+        self.rule = rule.requires_grad_(False)
+        self.network = seeded_mlp(observation_size, 1, hidden, seed)
+        last = [layer for layer in self.network if isinstance(layer, nn.Linear)][-1]
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the action in [−1, 1], ``[*batch, 1]``."""
+        correction = torch.tanh(self.network(observation))
+        return (self.rule(observation) + correction).clamp(-1.0, 1.0)
+
+
+RULES: dict[str, type[Rule]] = {"idm": IDMRule, "acc": ACCRule}
+NETWORK = "network"
+RESIDUAL = "residual_"
+
+
+def make_policy(
+    kind: str,
+    observation: Observation,
+    hidden: Sequence[int],
+    seed: int,
+    constants: Mapping[str, float] | None,
+    max_acceleration: float,
+) -> TensorDictModule:
+    """Build the policy of an agent.
+
+    Args:
+        kind: ``"network"``; a rule with learned constants, ``"idm"`` or ``"acc"``; or one below a
+            network, ``"residual_idm"`` or ``"residual_acc"``.
+        observation: what the policy sees.
+        hidden: sizes of the ReLU layers of a network.
+        seed: seed of its initial weights.
+        constants: constants of a rule at the start.
+        max_acceleration: acceleration of action 1 [m/s²].
+
+    Returns:
+        A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``
+        ``[*batch, 1]``.
+
+    Raises:
+        ConfigError: if the kind is unknown, or constants are given where there is no rule.
+    """
+    size = observation.event_shape[-1]
+    if kind == NETWORK:
+        if constants:
+            raise ConfigError("agent.constants belong to a rule: say agent.policy=idm or acc")
+        return make_actor(size, 1, hidden, seed)
+    name = kind.removeprefix(RESIDUAL)
+    if name not in RULES:
+        known = (NETWORK, *RULES, *(RESIDUAL + rule for rule in RULES))
+        raise unknown_name("agent.policy", kind, known)
+    module: nn.Module = RULES[name](observation, constants, max_acceleration)
+    if kind != name:
+        module = Residual(module, size, hidden, seed)  # type: ignore[arg-type]
+    return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])

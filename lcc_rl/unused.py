@@ -1,0 +1,92 @@
+"""Options that a configuration would ignore although their being ignored changes a result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
+from lcc_rl.nodes import TARGET, is_node
+
+NO_AGENT = ("agent=none", "agent=null")
+# Settings of an evaluation whose rows are episodes.
+OF_EPISODES = ("batch_size", "sample_episodes", "repeats", "shards", "shard", "compiled")
+
+
+def check_used(content: Mapping[str, Any], overrides: Sequence[str], sweep: bool = False) -> None:
+    """Refuse options that the configuration at hand would ignore.
+
+    Args:
+        content: a configuration as plain containers.
+        overrides: what was typed.
+        sweep: the runs of a sweep share what was typed, so what one of them learns by may be
+            given to another that learns nothing.
+
+    Raises:
+        ConfigError: naming the option and why it has no effect.
+    """
+    if "scenario" not in content:
+        return
+    reasons = dict(_of_traffic(content))
+    if not sweep:
+        reasons |= dict(_of_agent(content))
+    typed = {item: item.lstrip("+~").partition("=")[0].partition("@")[0] for item in overrides}
+    for item, key in typed.items():
+        for unused, reason in reasons.items():
+            if (key == unused or key.startswith(f"{unused}.")) and item not in NO_AGENT:
+                raise ConfigError(f"{item} has no effect: {reason}")
+
+
+def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield settings of data, drivers and evaluation without effect, and why."""
+    scenario, leader = content["scenario"], content.get("leader")
+    string = parse_string(scenario["string"], scenario["road"])
+    if scenario["road"] == RING:
+        for key in ("data", "split", "leader"):
+            yield key, "a ring road has no leader"
+    else:
+        for key in ("circumference", "initial_speed"):
+            yield f"scenario.{key}", "it belongs to scenario.road=ring"
+        if leader is not None and not _plays_data(leader):
+            # A pipeline calibrates drivers on the data.
+            for key in ("split",) if "calibration" in content else ("data", "split"):
+                reason = "the leader drives the records of leader=…; use leader=trajectories"
+                yield key, reason
+    if set(string.names) == {AUTOMATED} and not _is_human(scenario["controllers"].get(AUTOMATED)):
+        for key in ("drivers", "evaluation.drivers"):
+            yield key, f"there is no human driver in scenario.string={scenario['string']}"
+    for group in ("controllers", "start"):
+        for role in scenario[group]:
+            if role not in string.names:
+                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+    unused = {
+        "episodes": ("evaluation.full_length", "leader.cases", "leader.full_length"),
+        "vehicles": tuple(f"evaluation.{name}" for name in OF_EPISODES),
+    }
+    rows = content["evaluation"]["rows"]
+    for name in unused.get(rows, ()):
+        yield name, f"it is unused with evaluation.rows={rows}"
+
+
+def _of_agent(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield settings of learning without effect, and why."""
+    agent: Any = content.get("agent")
+    if not is_node(agent):
+        for key in ("agent", "training"):
+            yield key, f"variant {content['variant']} learns nothing"
+        return
+    if agent.get("policy") in ("idm", "acc"):
+        yield "agent.hidden", f"agent.policy={agent['policy']} has no layers"
+    if agent.get("bootstrap") is False:
+        for name in ("value_lr", "td_lambda", "value_every", "tau"):
+            yield f"agent.{name}", "agent.bootstrap=false learns no value"
+
+
+def _plays_data(leader: Any) -> bool:
+    """Whether leaders, or one source of a mixture of them, are those of ``data``."""
+    return is_node(leader) and ("source" in leader or any(map(_plays_data, leader.values())))
+
+
+def _is_human(node: Any) -> bool:
+    return is_node(node) and str(node[TARGET]).endswith((".IDM", ".Handover"))

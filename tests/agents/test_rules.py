@@ -1,0 +1,100 @@
+"""Rules whose constants are learned, and networks on top of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from commands import tiny
+from helpers import compose, make_agent
+
+from lcc_rl.agents.rules import make_policy
+from lcc_rl.commands import evaluation, training
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.idm import IDMConstants, idm_acceleration
+from lcc_rl.functional.rules import linear_acc
+from lcc_rl.pieces import Observation
+
+SCALES = {"ahead": {"speed": 0.1}, "self": {"speed": 0.1, "relative_speed": 0.5, "gap": 0.1}}
+
+
+def seen(speed: float, gap: float, relative: float) -> torch.Tensor:
+    return torch.tensor([[[0.1 * (speed + relative), 0.1 * speed, 0.5 * relative, 0.1 * gap]]])
+
+
+def policy(kind: str, **settings):
+    given = {"constants": None, "max_acceleration": 3.0} | settings
+    return make_policy(kind, Observation(scales=SCALES).bind(), (8, 8), 0, **given).module
+
+
+@pytest.mark.parametrize("state", [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)])
+def test_the_rules_are_those_of_the_equations(state) -> None:
+    speed, gap, relative = (torch.tensor(x) for x in state)
+    idm = idm_acceleration(speed, gap, -relative, 20.0, 1.1, IDMConstants(1.2, 1.7, 1.5))
+    constants = {"desired_speed": 20.0, "time_gap": 1.1, "acceleration": 1.2}
+    constants |= {"deceleration": 1.7, "min_gap": 1.5}
+    action = policy("idm", constants=constants, max_acceleration=4.0)(seen(*state))
+    assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
+    acc = linear_acc(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
+    assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
+
+
+def test_linear_acc_cruises_at_its_desired_speed() -> None:
+    assert linear_acc(torch.tensor(20.0), torch.tensor(500.0), 9.0, 20.0, 1.5, 2.0, 0.1, 0.5) == 0
+    following = linear_acc(torch.tensor(10.0), torch.tensor(17.0), 0.0, 25.0, 1.5, 2.0, 0.1, 0.5)
+    assert float(following) == 0.0
+
+
+@pytest.mark.parametrize("kind", ["idm", "acc"])
+def test_a_residual_begins_at_the_rule_and_leaves_it_alone(kind) -> None:
+    rule, residual = policy(kind), policy(f"residual_{kind}")
+    state = seen(8.0, 15.0, 0.5)
+    assert torch.equal(residual(state), rule(state))
+    residual(state).sum().backward()
+    graded = {name for name, entry in residual.named_parameters() if entry.grad is not None}
+    assert graded
+    assert all(name.startswith("network.") for name in graded)
+
+
+def test_constants_stay_positive() -> None:
+    rule = policy("acc")
+    with torch.no_grad():
+        rule.logarithms -= 50.0
+    assert all(value > 0.0 for value in rule.constants().values())
+    assert policy("acc", constants={"time_gap": 0.7}).constants()["time_gap"] == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize(
+    ("kind", "constants", "words"),
+    [
+        ("idn", None, "unknown agent.policy 'idn'.*Did you mean 'idm'"),
+        ("idm", {"timegap": 1.0}, "unknown constant of the rule 'timegap'.*'time_gap'"),
+        ("network", {"time_gap": 1.0}, "agent.constants belong to a rule"),
+    ],
+)
+def test_what_no_rule_has_is_refused(kind, constants, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        policy(kind, constants=constants)
+
+
+def test_a_rule_must_see_what_it_needs() -> None:
+    words = "a rule needs self.gap, which observation.scales does not name"
+    with pytest.raises(ConfigError, match=words):
+        make_policy("idm", Observation(scales={"self": {"speed": 0.1}}).bind(), (8,), 0, None, 3.0)
+
+
+def test_the_agent_learns_the_constants_alone() -> None:
+    agent = make_agent(compose("alcc", "agent=analytic", "agent.policy=idm"))
+    assert [tuple(entry.shape) for entry in agent.policy.parameters()] == [(5,)]
+
+
+@pytest.mark.slow
+def test_a_rule_is_trained_stored_and_evaluated_like_a_network(tmp_path) -> None:
+    words = ("agent=analytic", "agent.policy=residual_idm", "surrogates@agent=limits")
+    small = ("agent.hidden=[8]", "training.segment=20", "training.environments=4")
+    folder = tmp_path / "run"
+    cfg = tiny("train", *words, *small, "training.episodes=8", agent=False)
+    training.run(cfg, folder, quiet=True)
+    cfg = tiny("evaluate", f"policy={folder}", "+filter=cbf", agent=False)
+    rows = evaluation.run(cfg, tmp_path / "evaluated", quiet=True)
+    assert set(rows["strategy"]) >= {"idm", "alcc"}
+    assert rows.loc[rows["strategy"] == "alcc", "total_path_energy_kj"].notna().all()

@@ -1,0 +1,105 @@
+"""Strategies: tuned baselines, names, and policies that do not fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import compose
+from tensordict.nn import TensorDictModule
+
+from lcc_rl.agents.rules import ACCRule, IDMRule
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.fit import check_policy
+from lcc_rl.evaluation.strategies import (
+    BASELINES,
+    DIRECT,
+    TUNED,
+    Strategy,
+    baseline,
+    check_distinct,
+    named_apart,
+    rules,
+)
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.rules import idm_acc, linear_acc
+from lcc_rl.pieces import IDMACC, LinearACC
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_a_tuned_baseline_keeps_the_filter_and_has_constants_for_it(name) -> None:
+    free, filtered = (
+        baseline(compose("alcc", *words), name).cfg.scenario for words in ((), ("+filter=cbf",))
+    )
+    assert free.filters.get(AUTOMATED) is None
+    assert filtered.filters[AUTOMATED]["time_gap"] == 2.45
+    one, two = (scenario.controllers[AUTOMATED] for scenario in (free, filtered))
+    assert one["time_gap"] != two["time_gap"]
+    # A human driver has no filter.
+    human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
+    assert human.filters.get(AUTOMATED) is None
+
+
+def test_constants_tuned_behind_the_filter_need_it() -> None:
+    with pytest.raises(ConfigError, match="acc_filtered"):
+        baseline(compose("alcc"), "acc_filtered")
+
+
+@pytest.mark.parametrize(
+    ("piece", "rule", "law"), [(IDMACC, IDMRule, idm_acc), (LinearACC, ACCRule, linear_acc)]
+)
+def test_a_controller_commands_what_the_rule_of_an_agent_does(piece, rule, law) -> None:
+    generator = torch.Generator().manual_seed(0)
+    speed, gap = (20.0 * torch.rand(64, 1, 1, generator=generator) for _ in range(2))
+    relative_speed = torch.randn(64, 1, 1, generator=generator)
+    command = piece(**rule.START).command(speed, gap, relative_speed)
+    constants = rule.START.values()
+    assert torch.equal(command, law(speed, gap, relative_speed, *constants).clamp(-3.0, 3.0))
+    assert command.min() == -3.0
+
+
+def test_rules_have_names() -> None:
+    assert {DIRECT, *BASELINES, "follower_stopper", "pi_saturation", "acc", "mpc_far"} <= set(
+        rules()
+    )
+    assert not {"action", "hcfs"} & set(rules())
+
+
+def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
+    policy = TensorDictModule(torch.nn.Linear(1, 1), ["a"], ["b"])
+    ddpg, td3 = (
+        Strategy("alcc", compose("alcc", f"agent={name}"), policy, 0) for name in ("ddpg", "td3")
+    )
+    assert [one.name for one in named_apart([ddpg, replace(ddpg, seed=1)])] == ["alcc", "alcc"]
+    assert [one.name for one in named_apart([ddpg, td3])] == ["alcc ddpg", "alcc td3"]
+    other = replace(ddpg, cfg=compose("alcc", "agent.gamma=0.5"), source="runs/b/policy.pt")
+    named = named_apart([replace(ddpg, source="runs/a.pt"), other])
+    assert [one.name for one in named] == ["alcc a", "alcc b"]
+    with pytest.raises(ConfigError, match="two policies of variant alcc with training seed 0"):
+        check_distinct([ddpg, ddpg])
+
+
+@pytest.mark.parametrize(
+    ("variant", "words", "expected"),
+    [
+        ("reference", (), "was trained as variant reference"),
+        ("alcc", ("observation.scales.self.gap=0.2",), "scales.self.gap=0.2, got 0.1"),
+        ("alcc", ("+knowledge=memory",), "scenario.pieces.memory"),
+        ("alcc", ("scenario.time_step=0.2",), "scenario.time_step=0.2, got 0.1"),
+    ],
+)
+def test_a_policy_of_other_settings_is_refused(variant, words, expected) -> None:
+    cfg = compose("alcc")
+    cfg.policy = "p.pt"
+    check_policy(cfg, compose("alcc"))
+    with pytest.raises(ConfigError, match=expected):
+        check_policy(cfg, compose(variant, *words))
+
+
+def test_observed_entries_in_another_order_are_refused() -> None:
+    own, cfg = compose("alcc"), compose("alcc")
+    cfg.policy, scales = "p.pt", cfg.observation["scales"]
+    cfg.observation["scales"] = dict(reversed(scales.items()))
+    with pytest.raises(ConfigError, match="order of scales"):
+        check_policy(cfg, own)

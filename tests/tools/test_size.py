@@ -1,0 +1,57 @@
+"""How large the project is: lines counted by hand."""
+
+from __future__ import annotations
+
+import size
+
+MODULE = '''"""What the module contains."""
+
+# A comment.
+def check_gap(gap):
+    """Check a gap.
+
+    More.
+    """
+    if gap < 0:
+        raise ValueError(
+            "negative"
+        )
+
+
+def test_gap():
+    check_gap(1)
+    text = """
+    no docstring"""
+    return text  # the gap
+'''
+
+
+def test_lines_code_and_guards_of_a_module() -> None:
+    # The function check_gap, five lines without its docstring, and its call guard.
+    assert size.measured(MODULE) == {
+        "modules": 1,
+        "lines": 19,
+        "code": 10,
+        "guards": 6,
+        "tests": 1,
+    }
+
+
+def test_the_table_adds_lcc_rl_and_tools(monkeypatch, tmp_path) -> None:
+    for name in ("lcc_rl/a.py", "lcc_rl/b/c.py", "tools/d.py", "tests/e.py", "conf/f.yaml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(MODULE if name.endswith("py") else "a: 1\n")
+    names = [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")]
+    monkeypatch.setattr(size, "ROOT", tmp_path)
+    table = size.table(names, {"tests/e.py": 7})
+    assert table["lines"].to_dict() == {
+        "conf": 0,
+        "lcc_rl": 38,
+        "lcc_rl + tools": 57,
+        "lcc_rl/b": 19,
+        "tests": 19,
+        "tools": 19,
+    }
+    assert table.loc["tests", "cases"] == 7
+    assert table.loc["conf", "yaml"] == 1
+    assert table.loc["tools", "%"] == 60.0
