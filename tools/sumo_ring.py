@@ -26,7 +26,7 @@ from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.runs.cli import main_guard
-from lcc_rl.schemas import StudyConfig
+from lcc_rl.schemas import StudyConfig, as_plain
 
 HUMAN, FIRST = "human", "car0"
 LAST_S, CALM = 60.0, 0.5  # final speeds are of [s]; spread of the speeds without a wave [m/s]
@@ -193,7 +193,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parts = [simulate(cfg, driver, *fixed) for driver in (None, options.driver)]
     steps = pd.concat(parts, ignore_index=True)
     write_parquet(steps, options.folder / "steps.parquet")
-    figure = space_time(steps, [HUMAN, options.driver], cfg)
+    figure = space_time(steps, [HUMAN, options.driver], as_plain(cfg))
     assert figure is not None
     figure.axes[1].axvline(options.from_s, color="black", linestyle=":", linewidth=1.0)
     save(figure, options.folder / "space_time.png", dpi=100)
