@@ -1,5 +1,5 @@
 """``python -m lcc_rl`` is the console command ``lcc-rl``."""
 
-from lcc_rl.console import main
+from lcc_rl.cli.console import main
 
 main()

@@ -67,7 +67,7 @@ def run_command(module: str, *words: str, cwd: Path, check: bool = False) -> Don
     state is put back afterwards. An exception that a process would end on is raised.
 
     Args:
-        module: for example ``"lcc_rl.train"``.
+        module: for example ``"lcc_rl.cli.train"``.
         words: what is typed after the module.
         cwd: working directory of the command.
         check: whether another exit code than 0 is an error of the test.

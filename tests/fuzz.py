@@ -30,14 +30,14 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.checks import check_settings
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
+from lcc_rl.config.schemas import as_plain
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles, string_of
 from lcc_rl.errors import LccError
 from lcc_rl.io import memory
-from lcc_rl.nodes import build
 from lcc_rl.runs.interrupts import SIGNALS
-from lcc_rl.schemas import as_plain
 
 CONF = Path(lcc_rl.conf.__path__[0])
 # Limits of a case; a training or an evaluation may rightly take longer, and is ended sooner.

@@ -16,10 +16,10 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.config import load
+from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
-from lcc_rl.schemas import TrainConfig
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
 VARIANTS = ("alcc", "reference", "own_energy", "cbf", "idm", "direct", *PLATOON)

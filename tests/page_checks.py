@@ -18,7 +18,7 @@ from commands import process_state
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from pages import ROOT, Block, name_of
 
-from lcc_rl import console
+from lcc_rl.cli import console
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 
@@ -52,7 +52,7 @@ def check(words: Sequence[str], own: Path | None, fails: bool = False) -> None:
         assert set(re.findall(r"\w+", rest[-1].strip("'\""))) <= set(EXTRAS), rest
     elif program.endswith("python"):
         assert (ROOT / rest[0]).exists(), rest[0]
-        settings = parsed(rest[0], rest[1:])
+        settings = parsed(rest[0], rest[1:]) if rest[1:] else []
         typed = (word for word in settings if "=" in word)
         once("train", (*ALWAYS.get(rest[0], ()), *typed))
     elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:

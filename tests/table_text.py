@@ -59,3 +59,24 @@ def long_table(cars: int = 3, rows: int = 400, step: float = 0.1) -> pd.DataFram
             )
         )
     return pd.concat(parts, ignore_index=True)
+
+
+def pairs(episodes: int = 20, rows: int = 30) -> pd.DataFrame:
+    """An episode table in SI, at 20 m/s."""
+    number = np.repeat(np.arange(episodes), rows)
+    time = np.tile(np.arange(rows) / 10, episodes)
+    return pd.DataFrame(
+        {
+            "episode": number,
+            "recording": "a",
+            "follower_id": number + 100,
+            "leader_id": number + 200,
+            "time_s": time,
+            "follower_position_m": 20.0 * time,
+            "follower_speed_mps": 20.0,
+            "leader_position_m": 20.0 * time + 15.0,
+            "leader_speed_mps": 20.0,
+            "leader_length_m": 5.0,
+            "gap_m": 10.0,
+        }
+    )

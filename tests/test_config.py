@@ -12,10 +12,10 @@ import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import as_meant, identity, load
+from lcc_rl.config.nodes import TARGET, build, settings_at, with_defaults
+from lcc_rl.config.schemas import as_plain, as_text, parse_config
 from lcc_rl.envs import build_env
-from lcc_rl.nodes import TARGET, build, settings_at, with_defaults
 from lcc_rl.pieces import SafetyReward
-from lcc_rl.schemas import as_plain, as_text, parse_config
 from lcc_rl.settings import defaults
 
 CONF = Path(lcc_rl.conf.__file__).parent

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import lcc_rl
-from lcc_rl.console import COMMANDS, main
+from lcc_rl.cli.console import COMMANDS, main
 
 ROOT = Path(__file__).parents[1]
 
@@ -83,7 +83,7 @@ def test_a_wheel_runs_in_an_empty_folder(tmp_path) -> None:
     assert {re.sub("^conf/", "lcc_rl/conf/", name) for name in tracked} <= names
     program = (
         f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); "
-        "from lcc_rl.console import main; main()"
+        "from lcc_rl.cli.console import main; main()"
     )
     empty = tmp_path / "empty"
     empty.mkdir()

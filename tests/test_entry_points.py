@@ -161,7 +161,7 @@ def test_strings_of_followers_and_no_car_at_all(tmp_path) -> None:
 def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
     jobs_in_threads(monkeypatch)
     overrides = [*TINY, QUICK, "variants=[reference,alcc]"]
-    done = run_command("lcc_rl.pipeline", *overrides, f"hydra.run.dir={tmp_path}", cwd=tmp_path)
+    done = run_command("lcc_rl.cli.pipeline", *overrides, f"hydra.run.dir={tmp_path}", cwd=tmp_path)
     told = done.stdout.splitlines()
     assert len(told) <= 25, done.stdout
     assert told[-1] == f"page: {tmp_path / 'report.html'}"
@@ -184,7 +184,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
 
 def test_multirun_sweep_and_results_load(tmp_path) -> None:
     words = [*TINY, "variant=alcc,reference", "seed=0,1", "hydra.sweep.dir=sweep"]
-    run_command("lcc_rl.train", "-m", *words, cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.train", "-m", *words, cwd=tmp_path, check=True)
     frame = results.load(tmp_path / "sweep")
     assert frame.groupby(["variant", "seed"]).ngroups == 4
     assert frame["run"].nunique() == 4
@@ -198,18 +198,18 @@ def test_multirun_sweep_and_results_load(tmp_path) -> None:
 def test_sigkill_and_resume_equal_an_uninterrupted_run(tmp_path) -> None:
     longer = ("training.episodes=160", "variant=alcc")
     training.run(tiny("train", *longer), tmp_path / "whole", quiet=True)
-    with start("lcc_rl.train", *TINY, *longer, "hydra.run.dir=run", cwd=tmp_path) as process:
+    with start("lcc_rl.cli.train", *TINY, *longer, "hydra.run.dir=run", cwd=tmp_path) as process:
         wait_for(tmp_path / "run" / "checkpoint.pt", process)
         process.send_signal(signal.SIGKILL)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
-    run_command("lcc_rl.train", "resume=run", cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path, check=True)
     assert_same_tables(tmp_path / "whole", tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
     words = (*TINY, "training.episodes=80000", "hydra.run.dir=run")
-    with start("lcc_rl.train", *words, cwd=tmp_path) as process:
+    with start("lcc_rl.cli.train", *words, cwd=tmp_path) as process:
         wait_for(tmp_path / "run" / "checkpoint.pt", process)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
@@ -222,7 +222,7 @@ def test_sigint_exits_with_130_and_one_line(tmp_path) -> None:
 @pytest.mark.slow
 def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
     words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
-    with start("lcc_rl.pipeline", *words, cwd=tmp_path) as process:
+    with start("lcc_rl.cli.pipeline", *words, cwd=tmp_path) as process:
         wait_for(tmp_path / "job/alcc/checkpoint.pt", process)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process of the job
         _, errors = process.communicate(timeout=60)
@@ -230,7 +230,7 @@ def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
     assert "resume=" in errors
     assert not (tmp_path / "job/alcc/episodes.parquet").exists()
     jobs_in_threads(monkeypatch)
-    run_command("lcc_rl.pipeline", "resume=job", cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.pipeline", "resume=job", cwd=tmp_path, check=True)
     assert len(read_parquet(tmp_path / "job/alcc/training.parquet")) == 50
     assert (tmp_path / "job/evaluation/figures/overview.png").exists()
 
@@ -238,12 +238,12 @@ def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["lcc_rl.train", "variant=alccc"], "alccc"),
-        (["lcc_rl.train", "data=ngsim"], "data.path"),
-        (["lcc_rl.train", "data=ngsim", "data.path=nowhere.csv"], "nowhere.csv"),
-        (["lcc_rl.train", "resume=nowhere"], "nowhere"),
-        (["lcc_rl.pipeline", "variants=[]"], "variants is empty"),
-        (["lcc_rl.pipeline", "variant=idm"], "variant=idm has no effect on lcc-rl run"),
+        (["lcc_rl.cli.train", "variant=alccc"], "alccc"),
+        (["lcc_rl.cli.train", "data=ngsim"], "data.path"),
+        (["lcc_rl.cli.train", "data=ngsim", "data.path=nowhere.csv"], "nowhere.csv"),
+        (["lcc_rl.cli.train", "resume=nowhere"], "nowhere"),
+        (["lcc_rl.cli.pipeline", "variants=[]"], "variants is empty"),
+        (["lcc_rl.cli.pipeline", "variant=idm"], "variant=idm has no effect on lcc-rl run"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> None:

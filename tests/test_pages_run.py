@@ -17,7 +17,8 @@ from page_checks import ENTRIES, LAUNCH, one_run, settings_of
 from page_files import LEFT_OUT, write_named
 from pages import PAGES, ROOT, Block, blocks, commands, name_of
 
-from lcc_rl import console, learn
+from lcc_rl import learn
+from lcc_rl.cli import console
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 
@@ -152,7 +153,7 @@ class Reader:
             self.tool(name, rest)
             return
         rest += [] if error else self.shrunk(name, rest)
-        done = run_command("lcc_rl.console", name, *rest, cwd=self.folder)
+        done = run_command("lcc_rl.cli.console", name, *rest, cwd=self.folder)
         assert done.returncode == (2 if error else 0), done.stderr[-2000:]
         assert not error or error in done.stderr, done.stderr
 

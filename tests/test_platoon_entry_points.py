@@ -115,7 +115,7 @@ def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
 def test_sweep_as_typed(tmp_path) -> None:
     words = ["-m", "variant=cacc,ddpg,hcfs", "seed=range(2)", *TINY, "training.episodes=8"]
     words.append("hydra.sweep.dir=sweep")
-    done = run_command("lcc_rl.train", *words, cwd=tmp_path)
+    done = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     frame = results.load(tmp_path / "sweep")
     assert frame.groupby(["variant", "seed"]).ngroups == 6

@@ -34,14 +34,14 @@ def loaded(program: str, *words: str, cwd: Path) -> tuple[set[str], str, str]:
 
 
 def test_help_needs_no_torch(tmp_path) -> None:
-    names, out, _ = loaded(PROGRAM, "lcc_rl.train", "--help", cwd=tmp_path)
+    names, out, _ = loaded(PROGRAM, "lcc_rl.cli.train", "--help", cwd=tmp_path)
     assert not names.intersection((*HEAVY, *TABLES))
     assert "calibration: both, global, local" in out  # the choices of every group
 
 
 def test_status_needs_neither_torch_nor_pandas(tmp_path) -> None:
     write_parquet(pd.DataFrame({"x": [1.0]}), tmp_path / "run" / "episodes.parquet")
-    names, out, _ = loaded(PROGRAM, "lcc_rl.status", str(tmp_path), cwd=tmp_path)
+    names, out, _ = loaded(PROGRAM, "lcc_rl.cli.status", str(tmp_path), cwd=tmp_path)
     assert not names.intersection((*HEAVY, *TABLES))
     assert "1 finished" in out
 

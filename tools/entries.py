@@ -12,6 +12,7 @@ from equations import EQUATIONS, PAPERS
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import SingleAgent, build_env
 from lcc_rl.envs.clock import reset_options
@@ -23,7 +24,6 @@ from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces import Handover
 from lcc_rl.pieces.base import Key, as_key
 from lcc_rl.pieces.entries import ENTRIES, NAME, ROLE, entry_key
-from lcc_rl.schemas import StudyConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "entries.md"

@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 
 import pandas as pd
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.drivers.parameters import COLUMNS, IDM
 from lcc_rl.drivers.tables import load_drivers, models_of
 from lcc_rl.errors import DataError
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.runs.cli import main_guard
 
 # Attribute of a vType by parameter of the IDM; both are in m, s and m/s.
 ATTRIBUTES = {

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from lcc_rl.cli.entry import main_guard
+from lcc_rl.config.schemas import as_text
 from lcc_rl.io.tensors import write_torch
 from lcc_rl.results.policies import load_policy
-from lcc_rl.runs.cli import main_guard
-from lcc_rl.schemas import as_text
 
 LOCAL = ("data", "drivers", "leader", "split", "resume", "policy", "compare")
 FOLDER = Path(__file__).parents[1] / "lcc_rl" / "assets" / "pretrained"

@@ -16,12 +16,12 @@ import pandas as pd
 from leaderboard import task_scores
 from matplotlib.figure import Figure
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import require
 from lcc_rl.figures.drawing import legend_above, new_figure, save, style
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.runs.cli import main_guard
 
 SHARE, LEARNED = "penetration", "learned"
 REFERENCE, FIGURES = Path("outputs/reference/tasks"), Path("docs/figures")

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.runs.cli import main_guard
 from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
 from lcc_rl.studies.runner import EPISODES

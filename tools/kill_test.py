@@ -29,15 +29,15 @@ import pandas as pd
 import torch
 from matplotlib.image import imread
 
-from lcc_rl import evaluate, pipeline, train
+from lcc_rl.cli import evaluate, pipeline, train
 from lcc_rl.commands.pipeline import OVERRIDES
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.io.tensors import read_torch
-from lcc_rl.nodes import build
 from lcc_rl.results.runs import read_settings
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.states import LOCK, RESULTS, read_progress

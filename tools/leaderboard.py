@@ -19,8 +19,10 @@ import pandas as pd
 import torch
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.commands.tasks import task_of
+from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import string_of
@@ -33,8 +35,6 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces import Controller
 from lcc_rl.results.runs import load_config
 from lcc_rl.results.scores import LEAST, SHARE, Task, scores
-from lcc_rl.runs.cli import main_guard
-from lcc_rl.schemas import EvaluateConfig
 
 BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
 DECISIONS, WARM_UP = 200, 20

@@ -18,17 +18,17 @@ import leaderboard
 import pandas as pd
 from matplotlib.figure import Figure
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
+from lcc_rl.config.schemas import as_plain
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.figures.drawing import in_words, legend_above, new_figure, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.nodes import build
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.runs.cli import main_guard
-from lcc_rl.schemas import as_plain
 from lcc_rl.studies.hcfs import report as hcfs_report
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")

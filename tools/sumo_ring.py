@@ -17,7 +17,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import ConfigError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.space_time import space_time
@@ -25,8 +27,6 @@ from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.sumo import Bridge, load_sumo
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
-from lcc_rl.runs.cli import main_guard
-from lcc_rl.schemas import StudyConfig, as_plain
 
 HUMAN, FIRST = "human", "car0"
 LAST_S, CALM = 60.0, 0.5  # final speeds are of [s]; spread of the speeds without a wave [m/s]

@@ -12,16 +12,16 @@ from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.replay import Trainer
 from lcc_rl.agents.tuned import SearchLoop, Tuned
 from lcc_rl.config import identity
+from lcc_rl.config.nodes import TARGET, build, short_name
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import world_of
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.nodes import TARGET, build, short_name
 from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.schemas import StudyConfig
 
 
 def learns(cfg: StudyConfig) -> bool:

@@ -21,13 +21,13 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.checks import check_learner
 from lcc_rl.agents.vectors import denormals_flushed
+from lcc_rl.config.schemas import TrainingConfig
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.pieces.rewards import REWARD, TERMS
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.schemas import TrainingConfig
 
 # What the record of an iteration is made from.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))

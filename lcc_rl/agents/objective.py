@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.limits import Limits
+from lcc_rl.config.nodes import build
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_lost
-from lcc_rl.nodes import build
 from lcc_rl.pieces.base import Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World

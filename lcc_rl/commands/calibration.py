@@ -15,6 +15,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from lcc_rl.config import config_hash
+from lcc_rl.config.nodes import CALLED, build
+from lcc_rl.config.schemas import CalibrateConfig
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.fit import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
@@ -23,12 +25,10 @@ from lcc_rl.envs.inputs import build_source
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
-from lcc_rl.nodes import CALLED, build
 from lcc_rl.results.cells import MISSING
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import claim
-from lcc_rl.schemas import CalibrateConfig
 
 ERRORS = (
     *(("rmspe", "RMSPE [%]"), ("gap_rmse_m", "gap RMSE [m]")),

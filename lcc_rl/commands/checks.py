@@ -10,6 +10,8 @@ from tensordict import TensorDictBase
 
 from lcc_rl.agents.factory import build_agent, check_lengths, learns, make_trainer
 from lcc_rl.config import load
+from lcc_rl.config.nodes import CALLED, TARGET, build, find_target, settings_at
+from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.inputs import (
     build_drivers,
@@ -23,9 +25,7 @@ from lcc_rl.evaluation.episodes import any_leader, check_shard, plan_of
 from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
-from lcc_rl.nodes import CALLED, TARGET, build, find_target, settings_at
 from lcc_rl.runs.loggers import Silent
-from lcc_rl.schemas import StudyConfig, TrainConfig
 
 # What a sweeper may optimise: columns of the summary that need no other strategy beside them.
 OBJECTIVES = {

@@ -28,6 +28,7 @@ from rich.console import Console
 
 from lcc_rl.commands.pipeline import root_key
 from lcc_rl.config import load
+from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs, string_of
 from lcc_rl.errors import ConfigError, require
@@ -41,7 +42,6 @@ from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.schemas import EvaluateConfig
 from lcc_rl.studies.runner import check_overrides
 
 DRIVERS = 12

@@ -14,6 +14,7 @@ from lcc_rl.commands.checks import check_evaluation, check_installed, check_size
 from lcc_rl.commands.maps import write_responses
 from lcc_rl.commands.tasks import check_named, only_named, task_of
 from lcc_rl.config import identity, is_sweep
+from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
@@ -42,7 +43,6 @@ from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present, claim, forget
-from lcc_rl.schemas import EvaluateConfig, StudyConfig
 
 log = logging.getLogger("lcc_rl")
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.evaluation.responses import responses
 from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
-from lcc_rl.schemas import StudyConfig
 
 log = logging.getLogger("lcc_rl")
 

@@ -18,9 +18,12 @@ import pandas as pd
 from rich.console import Console
 
 from lcc_rl import results
+from lcc_rl.cli.entry import root_key
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_settings, check_sizes
 from lcc_rl.config import load, raw
+from lcc_rl.config.nodes import forget_places, with_defaults
+from lcc_rl.config.schemas import KINDS, CalibrateConfig, PipelineConfig, TrainConfig, as_plain
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import Interrupted, ResultsError, require
@@ -30,16 +33,13 @@ from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_json
-from lcc_rl.nodes import forget_places
 from lcc_rl.results.tables import show
 from lcc_rl.results.trust import check_targets
-from lcc_rl.runs.cli import root_key
 from lcc_rl.runs.console import tell
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
-from lcc_rl.schemas import KINDS, CalibrateConfig, PipelineConfig, TrainConfig, as_plain
 
 log = logging.getLogger("lcc_rl")
 
@@ -93,10 +93,8 @@ def _run(cfg: PipelineConfig, folder: Path, overrides: list[str]) -> Rows:
         temporary.write_text(json.dumps(overrides))
     drivers = calibrate_once(cfg, folder)
     for part in (*parts.values(), final):
-        part.data, part.drivers = (
-            _episodes(cfg, folder),
-            {"_target_": BOOTSTRAP, "path": str(drivers)},
-        )
+        part.data = with_defaults(_episodes(cfg, folder))
+        part.drivers = with_defaults({"_target_": BOOTSTRAP, "path": str(drivers)})
     tell(f"training {', '.join(cfg.variants)}, {cfg.jobs} at a time; details in */train.log")
     _train_all(parts, folder, cfg.jobs)
     final.compare = [

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.schemas import FORMATS
+from lcc_rl.config.schemas import FORMATS
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.alcc.settings import ABLATIONS, chooses_agent

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lcc_rl.agents.factory import learns
+from lcc_rl.config.nodes import TARGET, build
+from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.errors import unknown_name
 from lcc_rl.evaluation.strategies import rules
-from lcc_rl.nodes import TARGET, build
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.scores import Task
 from lcc_rl.results.units import check_unit
-from lcc_rl.schemas import EvaluateConfig, StudyConfig
 
 TASK = f"{Task.__module__}.{Task.__name__}"
 

@@ -13,6 +13,7 @@ from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
 from lcc_rl.commands.evaluation import EPISODES, IDENTITY, evaluate_and_write
 from lcc_rl.config import identity
+from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.cases import WINDOWS, check_cases
@@ -27,7 +28,6 @@ from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
-from lcc_rl.schemas import TrainConfig
 
 log = logging.getLogger("lcc_rl")
 

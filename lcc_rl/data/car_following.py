@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
@@ -21,6 +21,10 @@ from lcc_rl.errors import LARGEST, ConfigError, DataError
 from lcc_rl.settings import NonNegative, Number, Settings
 
 PASSENGER_CAR = 2
+COLUMNS = (
+    *("vehicle", "frame", "segment", "time_s", "position_m", "lane", "length_m", "vehicle_class"),
+    *("speed_mps", "preceding", "space_headway_m"),
+)
 Mask = NDArray[np.bool_]
 
 
@@ -56,8 +60,7 @@ class ExtractionReport:
         removed: candidates removed by each criterion, in the order of application.
         kept: episodes left.
         rows: samples in the episodes.
-        unseen: samples that name a preceding vehicle which has no row in that frame.
-        other_lane: samples that name a preceding vehicle on another lane, left out by ``split``.
+        left_out: samples left out, by reason.
         notes: further remarks, one a line.
     """
 
@@ -65,48 +68,22 @@ class ExtractionReport:
     removed: dict[str, int] = field(default_factory=dict)
     kept: int = 0
     rows: int = 0
-    unseen: int = 0
-    other_lane: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
 
     def lines(self) -> list[str]:
-        """The report as plain lines."""
-        minutes = self.rows * FRAME / 60
-        left_out = {
-            "name a preceding vehicle that is not seen in that frame": self.unseen,
-            "name a preceding vehicle on another lane": self.other_lane,
-        }
+        """Return the report as plain lines."""
+        minutes, left_out = self.rows * FRAME / 60, self.left_out.items()
         return [
             f"{self.candidates:,} candidates: stretches of one vehicle behind another",
-            *(f"left out {count:,} samples that {why}" for why, count in left_out.items() if count),
+            *(f"left out {count:,} samples that {why}" for why, count in left_out if count),
             *(f"removed {count:,}: {name}" for name, count in self.removed.items()),
             *self.notes,
             f"kept {self.kept:,} episodes: {self.rows:,} samples, {minutes:,.1f} min",
         ]
-
-
-@dataclass
-class _Pairs:
-    """Samples of followers whose leader has a row in the frame, grouped into candidates.
-
-    Args:
-        follower, leader: rows of the samples table, one entry per sample of a candidate.
-        starts, lengths: first entry and number of entries of each candidate.
-        gap: bumper-to-bumper gap of each entry [m].
-    """
-
-    follower: NDArray[np.int64]
-    leader: NDArray[np.int64]
-    starts: NDArray[np.intp]
-    lengths: NDArray[np.intp]
-    gap: NDArray[np.float32]
-
-    def always(self, holds: Mask) -> Mask:
-        """Candidates in which a condition holds throughout."""
-        return np.logical_and.reduceat(holds, self.starts)
 
 
 def extract(
@@ -127,117 +104,107 @@ def extract(
         DataError: if no vehicle follows another, or a criterion removes the last candidate; it
             names the criterion.
     """
-    samples = trajectories.samples
+    samples = {str(name): trajectories.samples[name].to_numpy() for name in COLUMNS}
+    recording = trajectories.samples["recording"].cat
     report = ExtractionReport()
-    pairs = _pairs(samples, criteria, report)
-    keep = np.ones(len(pairs.starts), dtype=bool)
-    for name, passes in _criteria(samples, pairs, criteria, report):
+    follower, leader = _pairs(samples, recording.codes.to_numpy(), criteria, report)
+    gap = samples["space_headway_m"][follower] - samples["length_m"][leader]
+    # A candidate begins after a row left out, or a change of segment, leader or lane.
+    cut = np.append(True, np.diff(follower) != 1)
+    for name in ("segment", "preceding", *(["lane"] if criteria.lane_changes == "split" else [])):
+        values = samples[name][follower]
+        cut[1:] |= values[1:] != values[:-1]
+    starts = np.flatnonzero(cut)
+    report.candidates = len(starts)
+    lengths = np.diff(np.append(starts, len(follower)))
+    keep = np.ones(len(starts), dtype=bool)
+    for name, passes in _criteria(samples, follower, leader, gap, starts, criteria, report):
         report.removed[name] = int((keep & ~passes).sum())
         keep &= passes
         if not keep.any():
             raise DataError(f"no episode is left after the criterion {name!r}:\n{report}")
-    episodes = _episodes(samples, pairs, keep)
-    report.kept, report.rows = int(keep.sum()), len(episodes)
-    return episodes, report
+    entry = np.flatnonzero(np.repeat(keep, lengths))
+    follower, leader = follower[entry], leader[entry]
+    report.kept, report.rows = int(keep.sum()), len(entry)
+    names = pd.Categorical.from_codes(recording.codes.to_numpy()[follower], recording.categories)
+    episodes = {
+        "episode": np.repeat(np.arange(report.kept, dtype=np.int32), lengths[keep]),
+        "recording": pd.Series(names).astype(str),
+        "follower_id": samples["vehicle"][follower],
+        "leader_id": samples["vehicle"][leader],
+        "time_s": samples["time_s"][follower],
+        "follower_position_m": samples["position_m"][follower],
+        "follower_speed_mps": samples["speed_mps"][follower],
+        "leader_position_m": samples["position_m"][leader],
+        "leader_speed_mps": samples["speed_mps"][leader],
+        "leader_length_m": samples["length_m"][leader],
+        "gap_m": gap[entry],
+    }
+    # The samples have the schema's types; a conversion would copy what may be millions of rows.
+    return pd.DataFrame(episodes, copy=False), report
 
 
-def _pairs(samples: pd.DataFrame, criteria: Criteria, report: ExtractionReport) -> _Pairs:
-    """All candidates."""
-    preceding = samples["preceding"].to_numpy()
-    ahead = find_leaders(
-        samples["recording"].cat.codes.to_numpy(),
-        samples["vehicle"].to_numpy(),
-        samples["frame"].to_numpy(),
-        preceding,
-    )
-    report.unseen = int(((preceding > 0) & (ahead < 0)).sum())
-    lane = samples["lane"].to_numpy()
-    seen = ahead >= 0
+def _pairs(
+    samples: dict[str, NDArray], recording: NDArray, criteria: Criteria, report: ExtractionReport
+) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Rows of followers whose leader has a row in the frame, and those rows of the leaders."""
+    preceding, lane = samples["preceding"], samples["lane"]
+    ahead = find_leaders(recording, samples["vehicle"], samples["frame"], preceding)
+    follows, seen = preceding > 0, ahead >= 0
+    unseen = int((follows & ~seen).sum())
+    report.left_out["name a preceding vehicle that is not seen in that frame"] = unseen
     if criteria.lane_changes == "split":
         same = lane[ahead] == lane
-        report.other_lane = int((seen & ~same).sum())
+        other = int((seen & ~same).sum())
+        report.left_out["name a preceding vehicle on another lane"] = other
         seen &= same
     follower = np.flatnonzero(seen)
     if len(follower) == 0:
         raise DataError(
-            f"no vehicle follows another in the same lane and frame: of {len(samples):,} samples "
-            f"{int((preceding > 0).sum()):,} name a preceding vehicle, and none of those is seen; "
+            f"no vehicle follows another in the same lane and frame: of {len(lane):,} samples "
+            f"{int(follows.sum()):,} name a preceding vehicle, and none of those is seen; "
             "expected a Preceding column that names vehicles in the file"
         )
-    leader = ahead[follower]
-    starts = _cuts(samples, follower, criteria)
-    report.candidates = len(starts)
-    length = samples["length_m"].to_numpy()[leader]
-    gap = samples["space_headway_m"].to_numpy()[follower] - length
-    return _Pairs(follower, leader, starts, np.diff(np.append(starts, len(follower))), gap)
-
-
-def _cuts(
-    samples: pd.DataFrame, follower: NDArray[np.int64], criteria: Criteria
-) -> NDArray[np.intp]:
-    """First entry of each candidate: a row left out, or a change of segment, leader or lane."""
-    cut = np.ones(len(follower), dtype=bool)
-    cut[1:] = np.diff(follower) != 1
-    names = ["segment", "preceding"] + (["lane"] if criteria.lane_changes == "split" else [])
-    for name in names:
-        values = samples[name].to_numpy()[follower]
-        cut[1:] |= values[1:] != values[:-1]
-    return np.flatnonzero(cut)
+    return follower, ahead[follower]
 
 
 def _criteria(
-    samples: pd.DataFrame, pairs: _Pairs, criteria: Criteria, report: ExtractionReport
+    samples: dict[str, NDArray],
+    follower: NDArray[np.intp],
+    leader: NDArray[np.int64],
+    gap: NDArray,
+    starts: NDArray[np.intp],
+    criteria: Criteria,
+    report: ExtractionReport,
 ) -> Iterator[tuple[str, Mask]]:
     """Name of each criterion and which candidates pass it, in the order of application."""
+    lengths = np.diff(np.append(starts, len(follower)))
+
+    def both(holds: Mask) -> Mask:
+        return always(holds[follower] & holds[leader])
+
+    def always(holds: Mask) -> Mask:
+        return np.logical_and.reduceat(holds, starts)
+
     if criteria.lane_changes == "reject":
-        lane = samples["lane"].to_numpy()
-        first = np.repeat(lane[pairs.follower[pairs.starts]], pairs.lengths)
-        one_lane = (lane[pairs.follower] == first) & (lane[pairs.leader] == first)
-        yield "lane_changes: reject", pairs.always(one_lane)
+        lane = samples["lane"]
+        first = np.repeat(lane[follower[starts]], lengths)
+        yield "lane_changes: reject", always((lane[follower] == first) & (lane[leader] == first))
     # Half a frame of slack: durations are sums of inexact tenths.
-    duration = (pairs.lengths - 1) * FRAME
+    duration = (lengths - 1) * FRAME
     shortest, longest = criteria.min_duration_s, criteria.max_duration_s
     yield f"min_duration_s: {shortest:g}", duration > shortest - FRAME / 2
     if longest is not None:
         yield f"max_duration_s: {longest:g}", duration < longest + FRAME / 2
-    if criteria.passenger_cars_only:
-        kind = samples["vehicle_class"].to_numpy()
-        if kind.any():
-            car = kind == PASSENGER_CAR
-            yield "passenger_cars_only", pairs.always(car[pairs.follower] & car[pairs.leader])
-        else:
-            report.notes.append(
-                "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
-                "there is nothing to filter on and every vehicle stays"
-            )
-    forward = samples["speed_mps"].to_numpy() >= 0
-    yield "speeds of at least 0", pairs.always(forward[pairs.follower] & forward[pairs.leader])
+    if criteria.passenger_cars_only and samples["vehicle_class"].any():
+        yield "passenger_cars_only", both(samples["vehicle_class"] == PASSENGER_CAR)
+    elif criteria.passenger_cars_only:
+        report.notes.append(
+            "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
+            "there is nothing to filter on and every vehicle stays"
+        )
+    yield "speeds of at least 0", both(samples["speed_mps"] >= 0)
     if criteria.min_gap_m is not None:
-        yield f"min_gap_m: {criteria.min_gap_m:g}", pairs.always(pairs.gap >= criteria.min_gap_m)
+        yield f"min_gap_m: {criteria.min_gap_m:g}", always(gap >= criteria.min_gap_m)
     if criteria.max_gap_m is not None:
-        yield f"max_gap_m: {criteria.max_gap_m:g}", pairs.always(pairs.gap <= criteria.max_gap_m)
-
-
-def _episodes(samples: pd.DataFrame, pairs: _Pairs, keep: Mask) -> pd.DataFrame:
-    """The episode table of the candidates that are left."""
-    entry = np.flatnonzero(np.repeat(keep, pairs.lengths))
-    follower, leader = pairs.follower[entry], pairs.leader[entry]
-    position, speed = samples["position_m"].to_numpy(), samples["speed_mps"].to_numpy()
-    vehicle, recording = samples["vehicle"].to_numpy(), samples["recording"].cat
-    number = np.arange(int(keep.sum()), dtype=np.int32)
-    names = pd.Categorical.from_codes(recording.codes.to_numpy()[follower], recording.categories)
-    columns: dict[str, Any] = {
-        "episode": np.repeat(number, pairs.lengths[keep]),
-        "recording": pd.Series(names).astype(str),
-        "follower_id": vehicle[follower],
-        "leader_id": vehicle[leader],
-        "time_s": samples["time_s"].to_numpy()[follower],
-        "follower_position_m": position[follower],
-        "follower_speed_mps": speed[follower],
-        "leader_position_m": position[leader],
-        "leader_speed_mps": speed[leader],
-        "leader_length_m": samples["length_m"].to_numpy()[leader],
-        "gap_m": pairs.gap[entry],
-    }
-    # The samples have the schema's types; a conversion would copy what may be millions of rows.
-    return pd.DataFrame(columns, copy=False)
+        yield f"max_gap_m: {criteria.max_gap_m:g}", always(gap <= criteria.max_gap_m)

@@ -26,12 +26,13 @@ from lcc_rl.data.profiles import (
 )
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
-from lcc_rl.data.tables import check_names, factors
+from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 WHOLE = "full length"  # a case that is a whole record, before the record's name
+Nodes = Mapping[str, Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -135,10 +136,10 @@ def stretch(
 class RecordLeaders(Settings):
     """Leaders that drive speed records or drive cycles from files."""
 
-    training: Mapping[str, Any]  # stretches by name, see Stretch
-    held_out: Mapping[str, Any]  # stretches that windows for evaluation are cut from
-    cases: Mapping[str, Any] = Field(default_factory=dict)  # ``case_1`` for "case 1", CaseSettings
-    full_length: Mapping[str, Any] | None = None  # stretches driven from end to end
+    training: Nodes  # stretches by name, see Stretch
+    held_out: Nodes  # stretches that windows for evaluation are cut from
+    cases: Nodes = Field(default_factory=dict)  # ``case_1`` for "case 1", see CaseSettings
+    full_length: Nodes | None = None  # stretches driven from end to end
     # Evaluation windows whose total speed change is below this are left out [m/s].
     least_variation: NonNegative = 2.0
     path: str | None = None  # of stretches that name none
@@ -156,47 +157,43 @@ class RecordLeaders(Settings):
             DataError: if a record cannot be used, naming the file.
             ConfigError: if an option is unknown or impossible, naming it.
         """
-        training = join(self._stretches("training", self.training, time_step))
-        held_out = join(self._stretches("held_out", self.held_out, time_step))
-        windows = varying(held_out.windows(horizon), self.least_variation)
-        report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"]
-        for group, profiles in (("training", training), ("held_out", held_out)):
-            for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True):
-                report.append(f"{group}: {name}, {length * time_step:g} s")
+        parts: dict[str, list[Profiles]] = {}
+        for group in ("training", "held_out"):
+            parts[group] = self._stretches(group, getattr(self, group), time_step)
+            if not parts[group]:
+                raise ConfigError(f"leader.{group} names no record")
+        windows = varying(join(parts["held_out"]).windows(horizon), self.least_variation)
+        report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
+            f"{group}: {part.names[0]}, {int(part.lengths[0]) * time_step:g} s"
+            for group, profiles in parts.items()
+            for part in profiles
+        ]
+        leaders = Leaders(join(parts["training"]), windows, report=tuple(report))
         if followers is None:
-            return Leaders(training, windows, report=tuple(report))
+            return leaders
+        cases = []
+        for name, node in self.cases.items():
+            x = self._parsed(CaseSettings, node, f"leader.cases.{name}")
+            end = x.start_s + horizon * time_step
+            profile = stretch(x.path, time_step, x.scale, x.start_s, end, self.plausible)
+            cases.append(Case(name.replace("_", " "), profile, x.followers))
         wholes = self.full_length or {}
-        whole = self._stretches("full_length", wholes, time_step) if wholes else []
-        return Leaders(
-            training,
-            windows,
-            tuple(self._case(name, node, time_step, horizon) for name, node in self.cases.items()),
-            tuple(
-                Case(f"{WHOLE} {name}", profile, followers)
-                for name, profile in zip(wholes, whole, strict=True)
-            ),
-            tuple(report),
+        whole = self._stretches("full_length", wholes, time_step)
+        full_length = (
+            Case(f"{WHOLE} {name}", profile, followers)
+            for name, profile in zip(wholes, whole, strict=True)
         )
+        return replace(leaders, cases=tuple(cases), full_length=tuple(full_length))
 
-    def _stretches(self, group: str, nodes: Mapping[str, Any], time_step: float) -> list[Profiles]:
-        if not nodes:
-            raise ConfigError(f"leader.{group} names no record")
+    def _stretches(self, group: str, nodes: Nodes, time_step: float) -> list[Profiles]:
         parts = []
         for name, node in nodes.items():
             x = self._parsed(Stretch, node, f"leader.{group}.{name}")
             parts.append(stretch(x.path, time_step, x.scale, x.from_s, x.to_s, self.plausible))
         return parts
 
-    def _case(self, name: str, node: Any, time_step: float, horizon: int) -> Case:
-        x = self._parsed(CaseSettings, node, f"leader.cases.{name}")
-        end = x.start_s + horizon * time_step
-        profile = stretch(x.path, time_step, x.scale, x.start_s, end, self.plausible)
-        return Case(name.replace("_", " "), profile, x.followers)
-
-    def _parsed(self, kind: type[Settings], node: Any, where: str) -> Any:
+    def _parsed(self, kind: type[Settings], node: Mapping[str, Any] | None, where: str) -> Any:
         """Settings of a stretch or case; it or ``self`` has a path."""
-        if not isinstance(node, Mapping | None):
-            raise ConfigError(f"{where} must be a mapping, got {node!r}")
         settings: Any = parse(kind, node or {}, where)
         settings.path = settings.path or self.path
         if not settings.path:
@@ -261,11 +258,11 @@ class DriveLeaders(Settings):
     plausible: Plausible | None = None  # None for the defaults
 
     def settled(self) -> None:
-        check_names(self.columns, FIELDS, "leader.columns")
-        factors(self.units, FIELDS, "leader.units")
+        self.columns = {**COLUMNS, **self.columns}
+        check_map(FIELDS, self.columns, self.units, "leader")
         if self.tuning and self.evaluation_share == 1:
             raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
-        if self.together and self.columns.get("drive", "") is None:
+        if self.together and self.columns["drive"] is None:
             raise ConfigError("leader.together divides drives by name; the table holds one record")
         try:
             re.compile(self.together or "")
@@ -274,34 +271,22 @@ class DriveLeaders(Settings):
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read everything; see :meth:`RecordLeaders.load`."""
-        columns = {**COLUMNS, **self.columns}
-        profiles, report = read_drives(self.path, columns, time_step, self.plausible, self.units)
-        divide = self._by_time if columns["drive"] is None else self._by_name
-        training, held_out = divide(profiles)
-        if self.tuning:
-            training, held_out = divide(training, again=True)
-        self._check_lengths(profiles, (training, held_out), horizon)
-        windows = varying(held_out.at_least(horizon).windows(horizon), self.least_variation)
-        if self.fastest is not None:
-            windows = slow(windows, self.fastest)
-        if len(training):
+        single = self.columns["drive"] is None
+        profiles, report = read_drives(
+            self.path, self.columns, time_step, self.plausible, self.units
+        )
+        divide = self._by_time if single else self._by_name
+        training, held_out = nothing(time_step), profiles
+        if self.evaluation_share < 1:
+            training, held_out = divide(profiles)
+            if self.tuning:
+                training, held_out = divide(training, again=True)
             training = training.at_least(horizon)
-        by = "at the end" if columns["drive"] is None else "by name"
+        windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
+        by = "at the end" if single else "by name"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
         return Leaders(training, windows, report=(*report, line))
-
-    def _check_lengths(self, all_: Profiles, parts: Sequence[Profiles], horizon: int) -> None:
-        """Check that both sides hold a record of an episode's length; say what can be done."""
-        whole, *sides = (int(x.lengths.max()) - 1 if len(x) else horizon for x in (all_, *parts))
-        if min(sides) >= horizon:
-            return
-        raise DataError(
-            f"{self.path}: shorter than the horizon: an episode needs {horizon} steps, the longest "
-            f"record has {whole}, its parts for training and evaluation {sides[0]} and {sides[1]}; "
-            f"lower scenario.horizon to at most {max(1, min(whole, *sides))}, give longer records, "
-            "or say leader.evaluation_share=1 to evaluate on all of it"
-        )
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; once more for tuning."""
@@ -310,8 +295,6 @@ class DriveLeaders(Settings):
         if again:  # what is left lies in share…1
             place = (place - share) / (1 - share)
         held = place < share
-        if held.all() and share == 1:
-            return nothing(profiles.time_step), profiles
         if held.all() or not held.any():
             side = "evaluation" if held.any() else "training"
             raise DataError(
@@ -321,11 +304,7 @@ class DriveLeaders(Settings):
         return profiles.select(np.flatnonzero(~held)), profiles.select(np.flatnonzero(held))
 
     def _family(self, name: str) -> str:
-        """Return the part of a name that says on which side its drive is.
-
-        Raises:
-            DataError: if the name has no such part.
-        """
+        """The part of a name that tells on which side its drive is."""
         if self.together is None:
             return name
         found = re.match(self.together, name)
@@ -335,8 +314,6 @@ class DriveLeaders(Settings):
 
     def _by_time(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide the one record, whose end is held out."""
-        if self.evaluation_share == 1:
-            return nothing(profiles.time_step), profiles
         record, name = profiles.record(0), profiles.names[0]
         cut = len(record) - round(self.evaluation_share * len(record))
         if not 1 < cut < len(record) - 1:
@@ -350,28 +327,28 @@ class DriveLeaders(Settings):
         return first, last
 
 
-def slow(profiles: Profiles, fastest: float) -> Profiles:
-    """Return the records whose mean speed is at most ``fastest`` [m/s]."""
-    kept = [i for i in range(len(profiles)) if float(profiles.record(i).mean()) <= fastest]
-    if not kept:
-        raise DataError(
-            f"no held-out window in which the leader's mean speed is at most {fastest:g} m/s; "
-            "raise leader.fastest or give another record"
-        )
-    return profiles.select(kept)
+def varying(profiles: Profiles, least: float, fastest: float | None = None) -> Profiles:
+    """Return the records whose speed changes by at least so much in total.
 
-
-def varying(profiles: Profiles, least_variation: float) -> Profiles:
-    """Return the records whose speed changes by at least so much in total [m/s].
+    Args:
+        profiles: the records.
+        least: sum of the changes of speed [m/s].
+        fastest: mean speed that a record must not exceed [m/s]; None for no limit.
 
     Raises:
         DataError: if there is none.
     """
-    variation = [float(profiles.record(i).diff().abs().sum()) for i in range(len(profiles))]
-    kept = [i for i, total in enumerate(variation) if total >= least_variation]
+    records = [profiles.record(index) for index in range(len(profiles))]
+    kept = [
+        index
+        for index, record in enumerate(records)
+        if float(record.diff().abs().sum()) >= least
+        and (fastest is None or float(record.mean()) <= fastest)
+    ]
     if not kept:
+        slow = "" if fastest is None else f" and whose mean is at most leader.fastest={fastest:g}"
         raise DataError(
-            f"no held-out window in which the leader's speed changes by {least_variation:g} m/s; "
+            f"no held-out window in which the leader's speed changes by {least:g} m/s{slow}; "
             "lower leader.least_variation or give another record"
         )
     return profiles.select(kept)

@@ -9,10 +9,11 @@ are kept, in compact types, so that the whole portal export fits in a few gigaby
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,7 @@ from lcc_rl.data.tables import (
     single_spaces,
 )
 from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
-from lcc_rl.errors import DataError, unknown_name
+from lcc_rl.errors import DataError
 
 HEADER = (
     "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,"
@@ -51,38 +52,32 @@ ALIASES = {
     "vehicleacceleration": "v_Acc",
     "laneidentification": "Lane_ID",
 }
-INT32, INT16, INT8, REAL = 2**31 - 1, 2**15 - 1, 2**7 - 1, 1e9
+INT16 = 2**15 - 1
 
 
-class Field(NamedTuple):
-    """A column of NGSIM files: what it is here, its type, and what it may hold."""
-
-    own: str
-    kind: type
-    column: Column
+def _column(name: str, least: float = -1e9, most: float = 1e9, **more: Any) -> Column:
+    return Column(name, least=least, most=most, **more)
 
 
-def _field(
-    name: str, own: str, kind: type, least: float = -REAL, most: float = REAL, **more: Any
-) -> Field:
-    whole = issubclass(kind, np.integer)
-    return Field(own, kind, Column(name, least=least, most=most, whole=whole, **more))
-
-
-FIELDS = [
-    _field("Vehicle_ID", "vehicle", np.int64, 1, LARGEST_ID),
-    _field("Frame_ID", "frame", np.int32, 0, INT32),
-    _field("Local_Y", "position_m", np.float32),
-    _field("Lane_ID", "lane", np.int16, -INT16, INT16),
-    _field("v_Length", "length_m", np.float32),
-    _field("v_Class", "vehicle_class", np.int8, -1, INT8, blank=True),
-    _field("v_Vel", "speed_mps", np.float32),
-    _field("v_Acc", "acceleration_mps2", np.float32),
-    _field("Preceding", "preceding", np.int64, -LARGEST_ID, LARGEST_ID, blank=True),
-    _field("Space_Headway", "space_headway_m", np.float32, blank=True, required=False),
-    _field("Global_Time", "clock", np.float64, -1e300, 1e300, blank=True, required=False),
-]
-KNOWN = [item.column.key for item in FIELDS] + ["Location"]
+# Columns of the files by what they are in the samples, with their types.
+FIELDS: dict[str, tuple[type[np.number], Column]] = {
+    "vehicle": (np.int64, _column("Vehicle_ID", 1, LARGEST_ID, whole=True)),
+    "frame": (np.int32, _column("Frame_ID", 0, 2**31 - 1, whole=True)),
+    "position_m": (np.float32, _column("Local_Y")),
+    "lane": (np.int16, _column("Lane_ID", -INT16, INT16, whole=True)),
+    "length_m": (np.float32, _column("v_Length")),
+    "vehicle_class": (np.int8, _column("v_Class", -1, 127, whole=True, blank=True)),
+    "speed_mps": (np.float32, _column("v_Vel")),
+    "acceleration_mps2": (np.float32, _column("v_Acc")),
+    "preceding": (
+        np.int64,
+        _column("Preceding", -LARGEST_ID, LARGEST_ID, whole=True, blank=True),
+    ),
+    "space_headway_m": (np.float32, _column("Space_Headway", blank=True, required=False)),
+    "clock": (np.float64, _column("Global_Time", -1e300, 1e300, blank=True, required=False)),
+}
+NAMES = {own: column.key for own, (_, column) in FIELDS.items()}
+KNOWN = [*NAMES.values(), "Location"]
 # What follows from a column that is all zero or blank.
 CONSEQUENCES = {
     "Global_Time": "recordings are told apart by file",
@@ -129,17 +124,12 @@ def read_ngsim(
     Raises:
         DataError: naming the file, the line and the column at fault, or if the vehicles are too
             short or long for these units.
-        ConfigError: if the units are unknown.
     """
-    paths = [path] if isinstance(path, (str, Path)) else list(path)
-    if not paths:
-        raise DataError("no NGSIM file was named; expected at least one path")
-    if units not in METRES:
-        raise unknown_name("setting of data.units", str(units), METRES)
+    paths = [path] if isinstance(path, (str, Path)) else path
     rows = _Rows(ReadReport(files=[str(name) for name in paths]), METRES[units])
     wanted = None if location is None else location.strip().lower()
-    for name in paths:
-        for block in _blocks(str(name)):
+    for name in rows.report.files:
+        for block in _blocks(name):
             rows.add(block, wanted)
     if not rows.chunks:
         found = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())
@@ -184,12 +174,8 @@ class _Block:
         """Names in the Location column (lower case, '' where blank) and each row's index of it."""
         if "Location" not in self.table.column_names:
             return [""], np.zeros(len(self), dtype=np.int64)
-        encoded = self.table["Location"].combine_chunks().dictionary_encode()
-        if isinstance(encoded, pa.ChunkedArray):
-            encoded = encoded.combine_chunks()
-        names = [str(name).strip().lower() for name in encoded.dictionary.to_pylist()]
-        codes = encoded.indices.fill_null(len(names)).to_numpy(zero_copy_only=False)
-        return [*names, ""], codes.astype(np.int64)
+        codes, names = pd.factorize(self.table["Location"].fill_null("").to_numpy())
+        return [str(name).strip().lower() for name in names], codes
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Keep only the rows where ``mask`` holds; messages still name lines of the file."""
@@ -211,25 +197,23 @@ class _Block:
 def _blocks(name: str) -> Iterator[_Block]:
     """Read a file in blocks of rows, in the order of the file."""
     layout: _Layout | None = None
-    first_line = 1
-    empty = True
+    line, empty = 1, True
     for raw in _line_chunks(name):
         lines = raw
         if layout is None:
-            lines = lines.removeprefix(b"\xef\xbb\xbf")
-            bare = lines.lstrip(b" \t\r\n")
+            bare = raw.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
             if not bare:
-                first_line += raw.count(b"\n")
+                line += raw.count(b"\n")
                 continue
-            first_line += lines[: len(lines) - len(bare)].count(b"\n")
+            line += raw.count(b"\n") - bare.count(b"\n")
             layout, lines = _detect(name, bare)
-            first_line += layout.header
+            line += layout.header
         if layout.separator == " ":
             lines = single_spaces(lines)
         if lines.strip(b"\r\n"):
             empty = False
-            yield _Block(name, lines, first_line, layout)
-        first_line += lines.count(b"\n")
+            yield _Block(name, lines, line, layout)
+        line += lines.count(b"\n")
     if empty:
         raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
 
@@ -272,7 +256,7 @@ def _detect(name: str, lines: bytes) -> tuple[_Layout, bytes]:
             raise DataError(f"{name}: the header has column {column!r} twice; expected it once")
         if column is not None:
             places[column] = place
-    missing = [f.column.key for f in FIELDS if f.column.required and f.column.key not in places]
+    missing = [c.key for _, c in FIELDS.values() if c.required and c.key not in places]
     if missing:
         raise lacking(name, missing, cells, "")
     return _Layout(len(cells), places, header=True, separator=separator), rest
@@ -304,8 +288,8 @@ class _Rows:
     metres: float
     chunks: list[Columns] = field(default_factory=list)
     groups: dict[Group, int] = field(default_factory=dict)
-    rows_of: dict[Group, int] = field(default_factory=dict)
-    locations: dict[str, int] = field(default_factory=dict)
+    rows_of: Counter[Group] = field(default_factory=Counter)
+    locations: Counter[str] = field(default_factory=Counter)
     filled: set[str] = field(default_factory=set)
     blank_classes: int = 0
 
@@ -314,8 +298,7 @@ class _Rows:
         self.report.rows_read += len(block)
         names, places = block.locations()
         for name, rows in zip(names, np.bincount(places, minlength=len(names)), strict=True):
-            if rows:
-                self.locations[name] = self.locations.get(name, 0) + int(rows)
+            self.locations[name] += int(rows)
         if wanted is not None:
             mask = np.array([name == wanted for name in names])[places]
             self.report.drop("other location", int((~mask).sum()))
@@ -324,34 +307,25 @@ class _Rows:
         if not len(block):
             return
         columns: Columns = {}
-        for own, kind, column in FIELDS:
+        for own, (kind, column) in FIELDS.items():
             values = block.values(column)
-            if column.key == "v_Class":
-                values = np.where(np.isnan(values), -1.0, values)
-                self.blank_classes += int((values < 0).sum())
-                values = np.maximum(values, 0.0)
+            if own == "vehicle_class":
+                self.blank_classes += int((~(values >= 0)).sum())
+                values = values.clip(min=0.0)
             if column.blank:
                 values = np.nan_to_num(values, nan=0.0)
             columns[own] = (values * self.metres if kind is np.float32 else values).astype(kind)
         preceding = columns["preceding"]
         preceding[(preceding < 0) | (preceding == columns["vehicle"])] = 0
-        self.filled |= {f.column.key for f in FIELDS if columns[f.own].any()}
-        group = self._groups(block.path, columns.pop("clock"), columns["frame"], names, places)
-        self.chunks.append({"group": group} | columns)
-
-    def _groups(
-        self, path: str, clock: NDArray, frame: NDArray, names: list[str], places: NDArray
-    ) -> NDArray[np.int32]:
-        """Index of each row's (file, location, time of frame 0)."""
-        distinct, which = np.unique(_frame_zero(clock, frame), return_inverse=True)
-        pairs, inverse = np.unique(which * len(names) + places, return_inverse=True)
-        codes = []
-        for pair, rows in zip(pairs, np.bincount(inverse), strict=True):
-            start, place = divmod(int(pair), len(names))
-            group = Group(path, names[place], int(distinct[start]))
-            codes.append(self.groups.setdefault(group, len(self.groups)))
-            self.rows_of[group] = self.rows_of.get(group, 0) + int(rows)
-        return np.array(codes, dtype=np.int32)[inverse]
+        self.filled |= {NAMES[own] for own, values in columns.items() if values.any()}
+        start = _frame_zero(columns.pop("clock"), columns["frame"])
+        codes, pairs = pd.factorize(start * len(names) + places)
+        groups = []
+        for pair, count in zip(pairs.tolist(), np.bincount(codes).tolist(), strict=True):
+            group = Group(block.path, names[pair % len(names)], pair // len(names))
+            self.rows_of[group] += count
+            groups.append(self.groups.setdefault(group, len(self.groups)))
+        self.chunks.append({"group": np.array(groups, dtype=np.int32)[codes]} | columns)
 
 
 def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray[np.int64]:

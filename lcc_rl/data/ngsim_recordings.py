@@ -20,8 +20,9 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import NamedTuple
+
+from lcc_rl.data.tables import stem
 
 JITTER = 5_000  # ms; recordings of one site start at least 11,700 clock units apart
 SPREAD = 300_000  # ms; periods last 15 min, and a float32 clock is off by up to 66 s
@@ -42,7 +43,7 @@ class Group(NamedTuple):
     start: int
 
 
-def name_recordings(rows: dict[Group, int]) -> tuple[dict[Group, str], list[str]]:
+def name_recordings(rows: Counter[Group]) -> tuple[dict[Group, str], list[str]]:
     """Name the recording of every group.
 
     Args:
@@ -52,32 +53,24 @@ def name_recordings(rows: dict[Group, int]) -> tuple[dict[Group, str], list[str]
         The name of each group, such as ``i-80@2005-04-13T22:58:55Z`` (UTC, the most frequent time
         of frame 0) or, without a usable clock, ``<file stem>#1``; and notes for the report.
     """
-    steady = _steady(rows)
+    by_place: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    by_location: dict[str, list[Group]] = defaultdict(list)
+    for group in rows:
+        if group.start > 0:
+            by_place[group[:2]].append(group)
+    for (_, location), groups in by_place.items():
+        for cluster in _clusters(groups):
+            if cluster[-1].start - cluster[0].start <= SPREAD:
+                by_location[location] += cluster
     named: dict[Group, str] = {}
-    for location in sorted({group.location for group in steady}):
-        here = [group for group in steady if group.location == location]
-        for cluster in _clusters(here):
+    for location, groups in by_location.items():
+        for cluster in _clusters(groups):
             counts: Counter[int] = Counter()
             for group in cluster:
                 counts[group.start] += rows[group]
             start = min(counts, key=lambda start: (-counts[start], start))
             named.update(dict.fromkeys(cluster, _time_name(location, start)))
     return named, _name_by_file(named, rows)
-
-
-def _steady(rows: dict[Group, int]) -> list[Group]:
-    """Groups whose clock is usable, judged file by file."""
-    places: dict[tuple[str, str], list[Group]] = defaultdict(list)
-    for group in rows:
-        if group.start > 0:
-            places[group.file, group.location].append(group)
-    return [
-        group
-        for groups in places.values()
-        for cluster in _clusters(groups)
-        if cluster[-1].start - cluster[0].start <= SPREAD
-        for group in cluster
-    ]
 
 
 def _clusters(groups: Iterable[Group]) -> list[list[Group]]:
@@ -97,19 +90,19 @@ def _time_name(location: str, start: int) -> str:
     return f"{location}@{time}" if location else time
 
 
-def _name_by_file(named: dict[Group, str], rows: dict[Group, int]) -> list[str]:
+def _name_by_file(named: dict[Group, str], rows: Counter[Group]) -> list[str]:
     """Name the groups whose clock is unusable, in place; returns notes."""
     recordings: dict[tuple[str, str], set[str]] = defaultdict(set)
     for group, name in named.items():
-        recordings[group.file, group.location].add(name)
+        recordings[group[:2]].add(name)
     unclocked: Counter[tuple[str, str]] = Counter()
     own: dict[tuple[str, str], str] = {}
     for group in sorted(rows.keys() - named.keys()):
-        place = (group.file, group.location)
+        place = group[:2]
         unclocked[place] += rows[group]
         if place not in own:
             alone = len(recordings[place]) == 1
-            own[place] = next(iter(recordings[place])) if alone else _file_name(place[0], own)
+            own[place] = min(recordings[place]) if alone else _file_name(place[0], own)
         named[group] = own[place]
     return [
         f"Global_Time does not tell the recording of {count:,} rows of {file}"
@@ -120,9 +113,7 @@ def _name_by_file(named: dict[Group, str], rows: dict[Group, int]) -> list[str]:
 
 def _file_name(file: str, own: dict[tuple[str, str], str]) -> str:
     """``<stem>#k`` with the smallest k that is free."""
-    stem = Path(file).name.removesuffix(".gz")
-    stem = stem.rpartition(".")[0] or stem
     number = 1
-    while f"{stem}#{number}" in own.values():
+    while (name := f"{stem(file)}#{number}") in own.values():
         number += 1
-    return f"{stem}#{number}"
+    return name

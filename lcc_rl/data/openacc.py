@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
-from lcc_rl.data.table_source import Rows, labels, to_trajectories
+from lcc_rl.data.table_source import labels, to_trajectories
 from lcc_rl.data.tables import Column, TableFile
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
@@ -41,41 +42,39 @@ class OpenAccSource(Settings):
         """
         files = find_files(self.path)
         report = ReadReport(files=files)
-        parts = [_cars(TableFile(name), number, report) for number, name in enumerate(files)]
-        columns = [dict(part.columns()) for part in parts]
-        rows = Rows(**{key: np.concatenate([x[key] for x in columns]) for key in columns[0]})
-        trajectories = to_trajectories(rows, labels(files), report)
+        cars = [_cars(TableFile(name), number, report) for number, name in enumerate(files)]
+        trajectories = to_trajectories(pd.concat(cars), labels(files), report)
         return episodes_of(trajectories, self.criteria, self.plausible)
 
 
-def _cars(table: TableFile, recording: int, report: ReadReport) -> Rows:
-    """All cars of a file, one below the other."""
+def _cars(table: TableFile, recording: int, report: ReadReport) -> pd.DataFrame:
+    """All cars of a file, one below the other; see :func:`to_trajectories`."""
     count = sum(f"Speed{car}" in table.header for car in range(1, len(table.header) + 1))
-    speeds = [Column(f"Speed{n}", "speed", least=0.0, blank=True) for n in range(1, count + 1)]
-    gaps = [Column(f"IVS{n}", "length", least=0.0, blank=True) for n in range(1, count)]
     if count < 2:
         raise DataError(f"{table.path}: lacks Speed1 and Speed2; expected a native OpenACC file")
+    speeds = [Column(f"Speed{n}", "speed", least=0.0, blank=True) for n in range(1, count + 1)]
+    gaps = [Column(f"IVS{n}", "length", least=0.0, blank=True) for n in range(1, count)]
     columns = [Column("Time", "time"), *speeds, *gaps]
     read = table.read(columns, {column.key: column.key for column in columns})
-    time = read["Time"]
-    speed = np.stack([read[column.key] for column in speeds])
-    gap = np.stack([np.full(len(time), np.nan), *(read[column.key] for column in gaps)])
-    seen = ~np.isnan(speed)
-    leader = np.broadcast_to(np.arange(count)[:, None], speed.shape)
-    unknown = int((np.isnan(gap[1:]) & seen[1:]).sum())
-    report.rows_read += speed.size
+    rows = len(read["Time"])
+    cars = pd.DataFrame(
+        {
+            "recording": recording,
+            "vehicle": np.repeat(np.arange(1, count + 1), rows),
+            "time": np.tile(read["Time"], count),
+            "speed": np.concatenate([read[column.key] for column in speeds]),
+            "row": np.tile(np.arange(rows), count),
+            "gap": np.concatenate([np.full(rows, np.nan), *(read[c.key] for c in gaps)]),
+        }
+    )
+    cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
+    seen = cars.speed.notna()
+    unknown = int((cars.gap.isna() & seen & (cars.vehicle > 1)).sum())
+    report.rows_read += len(cars)
     report.drop("blank speed", int((~seen).sum()))
     report.notes += table.notes
     order = table.preamble.get("Vehicle_order", "").strip(", ").replace(",", ", ")
     report.notes.append(f"{table.path}: {count} cars{': ' if order else ''}{order}")
     if unknown:
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow nobody")
-    return Rows(
-        recording=np.full(int(seen.sum()), recording),
-        vehicle=(leader + 1)[seen],
-        time=np.broadcast_to(time, speed.shape)[seen],
-        speed=speed[seen],
-        row=np.broadcast_to(np.arange(len(time)), speed.shape)[seen],
-        leader=np.where(np.isnan(gap), 0, leader)[seen],
-        gap=gap[seen],
-    )
+    return cars[seen]

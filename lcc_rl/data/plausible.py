@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -18,25 +18,10 @@ SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,windo
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
-Floats = NDArray[np.float64]
-
-
-class Fault(NamedTuple):
-    """Samples outside one threshold.
-
-    Args:
-        column: of the table.
-        words: what was found, with a place for the number.
-        values: that number, ``[rows]``.
-        setting: the threshold's name.
-        wrong: which samples are outside, ``[rows]``.
-    """
-
-    column: str
-    words: str
-    values: Floats
-    setting: str
-    wrong: NDArray[np.bool_]
+Mask = NDArray[np.bool_]
+# Column, words with a place for the number found, these numbers, the threshold's name and which
+# samples are outside of it; both are ``[rows]``.
+Fault = tuple[str, str, NDArray[np.float64], str, Mask]
 
 
 class Plausible(Settings):
@@ -85,15 +70,15 @@ class Plausible(Settings):
         first = np.isin(np.arange(len(table)), starts)
         lengths = np.diff([*starts, len(table)])
         keep, lines, told = np.ones(len(starts), dtype=bool), [], ""
-        for fault in self.faults(table, first):
-            bad = np.logical_or.reduceat(fault.wrong, starts) & keep
+        for column, words, values, name, wrong in self._faults(table, first):
+            bad = np.logical_or.reduceat(wrong, starts) & keep
             if not bad.any():
                 continue
-            row = int(np.argmax(fault.wrong & np.repeat(bad, lengths)))
-            limit = f"{setting}.{fault.setting}={getattr(self, fault.setting):g}"
-            said = f"{place(row, fault.column)} {fault.words.format(fault.values[row])}, {limit}"
+            row = int(np.argmax(wrong & np.repeat(bad, lengths)))
+            limit = f"{setting}.{name}={getattr(self, name):g}"
+            said = f"{place(row, column)} {words.format(values[row])}, {limit}"
             lines.append(f"left out {int(bad.sum()):,} implausible record(s), the first: {said}")
-            more = remedy if fault.setting == "max_acceleration" else ""
+            more = remedy if name == "max_acceleration" else ""
             told = told or f"{said}; mend the file{more}, or raise that threshold"
             keep &= ~bad
         if not keep.any() or np.mean(~keep) > self.max_share:
@@ -112,30 +97,29 @@ class Plausible(Settings):
             )
         return kept, lines
 
-    def faults(self, table: pd.DataFrame, first: NDArray[np.bool_]) -> Iterator[Fault]:
-        """Yield what is outside of the thresholds; ``first`` marks the first row of each record."""
+    def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Fault]:
+        """What may be outside of a threshold; ``first`` marks the first row of each record."""
         time = table["time_s"].to_numpy(np.float64)
         step = np.diff(time, prepend=time[0])
         step[first] = 0.0
         late = step > self.max_step
-        yield Fault("time_s", "is {:g} s after the sample before it", step, "max_step", late)
+        yield "time_s", "is {:g} s after the sample before it", step, "max_step", late
         for name in map(str, table.columns):
-            if not (name.endswith(("speed_mps", "length_m")) or name == "gap_m"):
+            if not name.endswith(("speed_mps", "length_m", "gap_m")):
                 continue
             values = table[name].to_numpy(np.float64)
             if name.endswith("speed_mps"):
-                fast = values > self.max_speed
                 words = "holds {:g} m/s (is it km/h or ft/s?)"
-                yield Fault(name, words, values, "max_speed", fast)
+                yield name, words, values, "max_speed", values > self.max_speed
                 rate = np.diff(values, prepend=values[0]) / np.where(step > 0, step, np.inf)
                 rough = np.abs(rate) > self.max_acceleration
-                yield Fault(name, "changes by {:g} m/s²", rate, "max_acceleration", rough)
+                yield name, "changes by {:g} m/s²", rate, "max_acceleration", rough
             elif name == "gap_m":
-                yield Fault(name, "holds {:g} m", values, "max_gap", values > self.max_gap)
+                yield name, "holds {:g} m", values, "max_gap", values > self.max_gap
             else:
                 short = (values != 0) & (values < self.min_length)
-                yield Fault(name, "holds {:g} m", values, "min_length", short)
-                yield Fault(name, "holds {:g} m", values, "max_length", values > self.max_length)
+                yield name, "holds {:g} m", values, "min_length", short
+                yield name, "holds {:g} m", values, "max_length", values > self.max_length
 
 
 def pair_place(episodes: pd.DataFrame) -> Callable[[int, str], str]:

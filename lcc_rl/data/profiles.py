@@ -123,11 +123,15 @@ class Profiles:
         return self.select(long)
 
     def _too_short(self, horizon: int) -> str:
-        longest = int(self.lengths.max()) - 1 if len(self) else 0
+        if not len(self):
+            return NONE_LEFT
+        longest = int(self.lengths.argmax())
+        steps = int(self.lengths[longest]) - 1
         return (
-            f"profile shorter than the horizon: the longest of {len(self)} speed profiles has "
-            f"{longest} steps ({longest * self.time_step:g} s), an episode needs {horizon} "
-            f"({horizon * self.time_step:g} s); lower scenario.horizon or give longer data"
+            f"profile shorter than the horizon: the longest of {len(self)} speed profiles, "
+            f"{self.names[longest]}, has {steps} steps ({steps * self.time_step:g} s), an episode "
+            f"needs {horizon} ({horizon * self.time_step:g} s); lower scenario.horizon or give "
+            "longer data"
         )
 
 

@@ -39,14 +39,11 @@ class LoadedEpisodes:
 
 
 class NgsimSource(Settings):
-    """Episodes extracted from NGSIM files of any published layout.
-
-    ``smoothing`` is applied to the trajectories, see :mod:`lcc_rl.data.smoothing`.
-    """
+    """Episodes extracted from NGSIM files of any published layout."""
 
     path: str | Path | Sequence[str]  # a file, several, or a pattern such as data/*.csv.gz
     location: str | None = None  # keep only i-80, us-101 … of a file that has several
-    smoothing: Callable | None = None
+    smoothing: Callable | None = None  # of the trajectories, see lcc_rl.data.smoothing
     criteria: Criteria | None = None  # None for the defaults
     units: Literal["feet", "metres"] = "feet"
     plausible: Plausible | None = None  # None for the defaults
@@ -96,6 +93,11 @@ def episodes_of(
 ) -> LoadedEpisodes:
     """Extract episodes; positions that no file gives are derived from speeds and gaps.
 
+    Args:
+        trajectories: samples and report.
+        criteria, plausible: None for the defaults.
+        remedy: what a user may do about implausible accelerations.
+
     Raises:
         DataError: naming the files, if there is none, or too many are implausible.
     """
@@ -119,9 +121,9 @@ def _plausible(
     lines: list[str],
     remedy: str = "",
 ) -> LoadedEpisodes:
-    """Leave out implausible episodes, and say so; see :meth:`Plausible.select`."""
-    place = pair_place(episodes)
-    kept, said = (limits or Plausible()).select(episodes, source, place, remedy=remedy)
+    kept, said = (limits or Plausible()).select(
+        episodes, source, pair_place(episodes), remedy=remedy
+    )
     return LoadedEpisodes(kept, [*lines, *said])
 
 
@@ -131,18 +133,18 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
     """
-    entries = [path] if isinstance(path, (str, Path)) else list(path)
     files: list[str] = []
-    for entry in entries:
+    for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(Path(entry).expanduser())
+        found = [name]
         if has_magic(name) and not Path(name).exists():
             found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())
             if not found:
                 raise DataError(f"{name}: no file matches this pattern")
-            files += found
-        else:
-            files.append(name)
-    twice = sorted({name for name in files if files.count(name) > 1})
+        files += found
+    if not files:
+        raise DataError("no file is named; expected at least one path")
+    twice = [name for name in files if files.count(name) > 1]
     if twice:
         raise DataError(f"{twice[0]}: is named twice; expected every file once")
     return files

@@ -12,12 +12,11 @@ import lcc_rl.assets
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import find_files
-from lcc_rl.data.tables import Column, TableFile, factors, stem
+from lcc_rl.data.tables import Column, TableFile, stem
 from lcc_rl.errors import DataError
 
 CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
 TIME, SPEED = "time_s", "speed_mps"
-LEADER = "leader.plausible"  # where a configuration has the thresholds of speed records
 # What a table of drives has, and how the columns are called by default.
 FIELDS = (
     Column("drive", "text", required=False),
@@ -60,11 +59,7 @@ def read_speed_record(
         raise DataError(
             f"{path}: no such file, and no shipped cycle ({', '.join(shipped_cycles())})"
         )
-    table = TableFile(file)
-    samples = _samples(table, {**COLUMNS, "drive": None}, {}, FIELDS)
-    late = samples[TIME].diff().le(0).to_numpy()
-    table.refuse(late, "time", "does not follow the row before it in time")
-    _select(samples, table, plausible)
+    samples, _ = _read(TableFile(file), {**COLUMNS, "drive": None}, plausible, {}, even=False)
     return samples[TIME].to_numpy(), samples[SPEED].to_numpy()
 
 
@@ -93,100 +88,76 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    parts, report = [], []
-    for name in files:
-        part, lines = _read(TableFile(name), columns, plausible, factors(units or {}, FIELDS))
-        parts.append(part)
-        report += lines
-    table = pd.concat(parts, ignore_index=True) if len(parts) > 1 else parts[0]
+    read = [_read(TableFile(name), columns, plausible, units or {}) for name in files]
+    table = pd.concat([samples for samples, _ in read], keys=files, names=["file"]).reset_index(0)
     own = table.groupby("name")["file"].nunique()
     if (own > 1).any():
         raise DataError(f"{path}: drive {own.idxmax()!r} is in several files; expected one")
-    groups = list(table.groupby("name", sort=True))
-    records = [
-        resample(part[TIME].to_numpy(), part[SPEED].to_numpy(), time_step) for _, part in groups
-    ]
-    labels = [str(name) for name, _ in groups]
-    drives = [str(part["drive"].iloc[0]) for _, part in groups]
-    return from_records(records, labels, drives, time_step), report
-
-
-def _samples(
-    table: TableFile,
-    columns: Mapping[str, str | None],
-    scale: Mapping[str, float],
-    fields: Sequence[Column],
-) -> pd.DataFrame:
-    """Name, drive, time, speed and row of every sample of a file."""
-    if table.preamble:
-        own = {TIME: "Time", SPEED: "Speed1"}
-        columns = {key: own.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
-    read = table.read(fields, columns, scale, "leader.columns")
-    count = len(read["time"])
-    if count < 2:
-        raise DataError(f"{table.path}: holds {count} samples, at least 2 are needed")
-    drive = read.get("drive", np.full(count, stem(table.path)))
-    motion = {TIME: read["time"], SPEED: read["speed"]}
-    return pd.DataFrame({"name": drive, "row": np.arange(count), **motion, "drive": drive}).assign(
-        episode=0
-    )
-
-
-def _select(
-    samples: pd.DataFrame, table: TableFile, plausible: Plausible | None
-) -> tuple[pd.DataFrame, list[str]]:
-    """The plausible samples, and lines on what was left out."""
-    names, row = samples["name"], samples["row"].to_numpy()
-
-    def place(number: int, column: str) -> str:
-        own = {TIME: table.names["time"], SPEED: table.names["speed"]}.get(column, column)
-        return f"data row {row[number] + 1} ({names.iloc[number]}), column {own!r}"
-
-    return (plausible or Plausible()).select(samples, str(table.path), place, LEADER)
+    records = table.groupby("name", sort=True)
+    speeds = [resample(x[TIME].to_numpy(), x[SPEED].to_numpy(), time_step) for _, x in records]
+    names, drives = map(str, records.groups), map(str, records["drive"].first())
+    profiles = from_records(speeds, [*names], [*drives], time_step)
+    return profiles, [line for _, lines in read for line in lines]
 
 
 def _read(
     table: TableFile,
     columns: Mapping[str, str | None],
     plausible: Plausible | None,
-    scale: Mapping[str, float],
+    units: Mapping[str, str],
+    even: bool = True,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Name, drive, time and speed of the plausible samples of one file, and the report."""
-    divided = bool(table.preamble) and columns["drive"] is not None
-    samples = _samples(table, columns, scale, NATIVE if divided else FIELDS)
+    fields: Sequence[Column] = FIELDS
+    if table.preamble:
+        fields = FIELDS if columns["drive"] is None else NATIVE
+        native = {TIME: "Time", SPEED: "Speed1"}
+        columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
+    read = table.read(fields, columns, units, "leader.columns")
+    samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"]})
+    samples["drive"] = samples["name"] = read.get("drive", stem(table.path))
+    samples["row"] = samples.index
     said: list[str] = []
     if samples[SPEED].isna().any():
         samples, said = _without_blanks(samples, table)
+    if samples.empty:
+        raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
     samples = samples.sort_values("name", kind="stable", ignore_index=True)
     samples["episode"] = samples["name"].ne(samples["name"].shift()).cumsum()
     step = samples.groupby("episode")[TIME].diff()
     usual = step.groupby(samples["episode"]).transform("median")
     for wrong, words in (
         (step <= 0, "does not follow the time before it in its record"),
-        (usual.isna(), "is the only sample of its record"),
-        ((step - usual).abs() > UNEVEN * usual, "is not evenly spaced in its record"),
+        (usual.isna(), "is the only sample of its record; expected at least 2"),
+        (even & ((step - usual).abs() > UNEVEN * usual), "is not evenly spaced in its record"),
     ):
-        rows = samples["row"][wrong]
-        table.refuse(np.isin(np.arange(rows.max() + 1 if len(rows) else 0), rows), "time", words)
-    kept, lines = _select(samples, table, plausible)
+        if wrong.any():
+            raise table.fault(int(samples["row"][wrong].min()), "time", words)
+
+    def place(number: int, column: str) -> str:
+        own = {TIME: table.names["time"], SPEED: table.names["speed"]}[column]
+        sample = samples.iloc[number]
+        return f"data row {sample['row'] + 1} ({sample['name']}), column {own!r}"
+
+    kept, lines = (plausible or Plausible()).select(
+        samples, str(table.path), place, "leader.plausible"
+    )
     line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
-    return kept.assign(file=str(table.path)), [line, *table.notes, *said, *lines]
+    return kept, [line, *table.notes, *said, *lines]
 
 
 def _without_blanks(samples: pd.DataFrame, table: TableFile) -> tuple[pd.DataFrame, list[str]]:
     """Leave out blank cells, which divide the record: its parts are named after their start."""
-    blank = samples[SPEED].isna()
-    part = blank.cumsum()[~blank]
-    rows = samples[~blank]
-    size = part.map(part.value_counts())
-    starts = rows.groupby(part)[TIME].transform("min")
-    named_parts = [f"{name}+{start:g}s" for name, start in zip(rows["name"], starts, strict=True)]
-    kept = rows.assign(name=named_parts)[(size > 1).to_numpy()]
+    part = samples[SPEED].isna().cumsum()
+    rows = samples.dropna(subset=SPEED)
+    rows = rows[part[rows.index].duplicated(keep=False)]
     speed = table.names["speed"]
-    if kept.empty:
+    if rows.empty:
         raise DataError(f"{table.path}: column {speed!r} has no two samples in a row")
+    starts = rows.groupby(part)[TIME].transform("min").map("+{:g}s".format)
+    kept = rows.assign(name=rows["name"] + starts)
     line = (
         f"left out {len(samples) - len(kept):,} rows with a blank {speed} or alone between such, "
         f"which divide the record into {kept['name'].nunique()} parts"

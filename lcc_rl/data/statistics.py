@@ -12,10 +12,10 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import DataError
 from lcc_rl.functional.power import motor_power
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+QUANTILES = {"q05": 0.05, "q25": 0.25, "q50": 0.5, "q75": 0.75, "q95": 0.95}
 WINDOW_S = 30.0
 UNITS = {"speed": "m/s", "acceleration": "m/s²", "energy": "kJ"}
 # Compared beside the quantiles; the mean of acceleration is close to zero.
@@ -35,13 +35,11 @@ def motion(episodes: pd.DataFrame, role: str = "leader") -> dict[str, NDArray[np
         ``speed`` [m/s], ``acceleration`` [m/s²] and ``energy`` [kJ], each a flat array.
 
     Raises:
-        ConfigError: if the role is neither of the two.
-        DataError: if a column is missing or there is no episode of two samples.
+        DataError: if there is no episode of two samples.
     """
-    if role not in ROLES:
-        raise ConfigError(f"role must be one of {', '.join(ROLES)}, got {role!r}")
-    frame = _ordered(episodes, f"{role}_speed_mps")
-    episode, time, speed = (frame[name].to_numpy() for name in frame.columns)
+    frame = episodes.rename(columns={"event": "episode"}).sort_values(["episode", "time_s"])
+    episode = frame["episode"].to_numpy()
+    time, speed = (frame[x].to_numpy(np.float64) for x in ("time_s", f"{role}_speed_mps"))
     same = episode[1:] == episode[:-1]
     if not same.any():
         raise DataError("episode table: no episode has two samples")
@@ -52,19 +50,15 @@ def motion(episodes: pd.DataFrame, role: str = "leader") -> dict[str, NDArray[np
 
 
 def leader_statistics(episodes: pd.DataFrame, role: str = "leader") -> pd.DataFrame:
-    """Summarise the motion of all leaders.
+    """Summarise the motion of all leaders or followers.
 
     Args:
-        episodes: see :func:`motion`.
-        role: whose motion, ``leader`` or ``follower``.
+        episodes, role: see :func:`motion`.
 
     Returns:
         One row per quantity (index ``speed`` [m/s], ``acceleration`` [m/s²], ``energy`` [kJ]);
         columns count, mean, std and the quantiles q05, q25, q50, q75, q95; NaN where an episode
         set has no window of 30 s.
-
-    Raises:
-        ConfigError, DataError: see :func:`motion`.
     """
     rows = {name: _summary(values) for name, values in motion(episodes, role).items()}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("quantity")
@@ -86,26 +80,13 @@ def compare_statistics(reference: pd.DataFrame, other: pd.DataFrame) -> pd.DataF
     rows = []
     for quantity, unit in UNITS.items():
         first, second = (table.loc[quantity].to_dict() for table in (reference, other))
-        for statistic in (LEVEL[quantity], *map(_label, QUANTILES)):
+        for statistic in (LEVEL[quantity], *QUANTILES):
             one, two = first[statistic], second[statistic]
             scale = one if statistic == LEVEL[quantity] else first["q95"] - first["q05"]
             deviation = (two - one) / scale if scale else np.nan
             rows.append((quantity, statistic, unit, one, two, deviation))
     columns = ["quantity", "statistic", "unit", "reference", "other", "deviation"]
     return pd.DataFrame(rows, columns=columns)
-
-
-def _ordered(episodes: pd.DataFrame, speed: str) -> pd.DataFrame:
-    """Columns episode, time_s and the speed, episode by episode along time."""
-    frame = episodes
-    if "episode" not in frame.columns:
-        frame = frame.rename(columns={"event": "episode"})
-    names = ["episode", "time_s", speed]
-    missing = [name for name in names if name not in frame.columns]
-    if missing:
-        raise DataError(f"episode table: missing column(s) {', '.join(missing)}")
-    frame = frame[names].sort_values(names[:2], kind="stable", ignore_index=True)
-    return frame.astype({"time_s": np.float64, speed: np.float64})
 
 
 def _window_energy(
@@ -121,13 +102,7 @@ def _window_energy(
 
 
 def _summary(values: NDArray[np.float64]) -> dict[str, float]:
-    """Count, mean, standard deviation and quantiles."""
     if not len(values):
-        return {"count": 0, **dict.fromkeys(("mean", "std", *map(_label, QUANTILES)), np.nan)}
-    quantiles = zip(map(_label, QUANTILES), np.quantile(values, QUANTILES), strict=True)
+        return {"count": 0, **dict.fromkeys(("mean", "std", *QUANTILES), np.nan)}
+    quantiles = zip(QUANTILES, np.quantile(values, [*QUANTILES.values()]), strict=True)
     return {"count": len(values), "mean": values.mean(), "std": values.std(), **dict(quantiles)}
-
-
-def _label(quantile: float) -> str:
-    """Column name of a quantile."""
-    return f"q{100 * quantile:02.0f}"

@@ -1,7 +1,7 @@
 """Tables of measurements in files, CSV or parquet: opened, parsed and checked in one place.
 
 Each reader lists its columns as :class:`Column`, and :meth:`TableFile.read` checks every cell of
-them: numbers that are finite, in SI and within the range of their quantity.
+them: numbers are finite, in SI and within the range of their quantity.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import gzip
 import os
 import re
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -40,17 +40,20 @@ THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
-# Units by quantity, and their size in SI.
+# Units by quantity, and their size in SI; the first is the SI unit.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
     "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
 }
+Cells = Any  # a pyarrow array, chunked or not
+Names = Mapping[str, str | None]
+Fault = Callable[[int, str], DataError]  # the error for a row and words
 
 
 @dataclass(frozen=True)
 class Column:
-    """What a column of a table has to hold.
+    """Column of a table.
 
     Args:
         key: its name in the program.
@@ -69,49 +72,49 @@ class Column:
     blank: bool = False
     required: bool = True
 
+    @property
+    def expected(self) -> str:
+        """Words for messages."""
+        unit = f" {next(iter(UNITS[self.quantity]))}" if self.quantity in UNITS else ""
+        kind = "a whole number" if self.whole else "a number"
+        return f"{kind} from {self.least:g} to {self.most:g}{unit}"
 
-def factors(
-    units: Mapping[str, str], columns: Iterable[Column], option: str = "units"
-) -> dict[str, float]:
-    """Return the factor to SI of every column that has a unit.
+
+def check_map(columns: Iterable[Column], names: Names, units: Mapping[str, str], at: str) -> None:
+    """Check what a configuration says of the columns of a file.
 
     Args:
-        units: the unit by the column's key; SI for those that are not named.
         columns: those that there may be.
-        option: where the configuration has the units, for messages.
+        names: what the file calls them, by key.
+        units: their units by key; SI for those that are not named.
+        at: the node of the configuration, ``data`` or ``leader``.
 
     Raises:
-        ConfigError: if a key or a unit is unknown.
-    """
-    sizes = {column.key: UNITS[column.quantity] for column in columns if column.quantity in UNITS}
-    for key, unit in units.items():
-        if key not in sizes:
-            raise unknown_name(f"key of {option}", str(key), sizes)
-        if unit not in sizes[key]:
-            raise unknown_name(f"unit in {option}.{key}:", str(unit), sizes[key])
-    return {key: known[units[key]] if key in units else 1.0 for key, known in sizes.items()}
-
-
-def check_names(names: Mapping[str, Any], columns: Iterable[Column], option: str) -> None:
-    """Check what a configuration says that columns are called in a file.
-
-    Raises:
-        ConfigError: naming a key that is unknown, or a required column without name.
+        ConfigError: naming a key or unit that is unknown, a required column without name, or a
+            column that is named twice.
     """
     known = {column.key: column for column in columns}
+    measured = {key: UNITS[c.quantity] for key, c in known.items() if c.quantity in UNITS}
     for key, name in names.items():
         if key not in known:
-            raise unknown_name(f"key of {option}", str(key), known)
+            raise unknown_name(f"key of {at}.columns", str(key), known)
         if not (isinstance(name, str) or (name is None and not known[key].required)):
-            raise ConfigError(f"{option}.{key} must name a column, got {name!r}")
+            raise ConfigError(f"{at}.columns.{key} must name a column, got {name!r}")
+        if name is not None and [*names.values()].count(name) > 1:
+            raise ConfigError(f"{at}.columns names the column {name!r} twice")
+    for key, unit in units.items():
+        if key not in measured:
+            raise unknown_name(f"key of {at}.units", str(key), measured)
+        if unit not in measured[key]:
+            raise unknown_name(f"unit in {at}.units.{key}:", str(unit), measured[key])
 
 
 class TableFile:
-    """A table in a file; its columns are read when asked.
+    """Table in a file; its columns are read when asked.
 
-    Of text, the separator is the one that divides the header and the row after it alike: comma,
-    semicolon, tab, bar or spaces. Where it is the semicolon, numbers may have a decimal comma. The
-    lines before the header of a native OpenACC file are kept in ``preamble``.
+    The separator of text is the one that divides the header and the row after it alike: comma,
+    semicolon, tab, bar or spaces. With semicolons, numbers may have a decimal comma. ``preamble``
+    keeps the lines before the header of a native OpenACC file.
 
     Args:
         path: a .csv file or the like, gzipped or not, or a .parquet file.
@@ -125,8 +128,6 @@ class TableFile:
         self.path = Path(path).expanduser()
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
-        self.decimal_comma = False
-        self.cells: dict[str, pa.ChunkedArray] = {}
         if not self.path.is_file():
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
         self.parquet = self.path.suffix in PARQUET
@@ -135,13 +136,13 @@ class TableFile:
             with _readable(self.path):
                 self.header = [*pq.read_schema(self.path).names]
         else:
-            self._open_text(unpacked(self.path))
+            self._open_text()
 
     def read(
         self,
         columns: Iterable[Column],
-        names: Mapping[str, str | None],
-        scale: Mapping[str, float] | None = None,
+        names: Names,
+        units: Mapping[str, str] | None = None,
         option: str = "",
     ) -> dict[str, NDArray]:
         """Read columns and check every cell.
@@ -149,61 +150,50 @@ class TableFile:
         Args:
             columns: those wanted.
             names: what they are called in the file, by key; None for one that there is not.
-            scale: factors to SI by key.
+            units: their units by key; SI for those that are not named.
             option: where the configuration has the names, for messages.
+
+        Returns:
+            The columns by key, in SI.
 
         Raises:
             DataError: if a column is missing, or naming the row and column of a cell at fault.
-            ConfigError: if two columns have one name.
         """
-        named = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
-        self._check_header(list(named.values()), option)
-        read = self._parquet_cells if self.parquet else self._text_cells
-        cells = read(list(dict.fromkeys(named.values())))
-        self.cells = {key: cells[name] for key, name in named.items()}
-        self.names = named
-        return {
-            c.key: checked(
-                self.cells[c.key],
-                c,
-                lambda row, words, c=c: self.fault(row, c.key, words),
-                (scale or {}).get(c.key, 1.0),
-                self.decimal_comma,
-            )
-            for c in columns
-            if c.key in named
-        }
+        self.names = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
+        missing = [name for name in self.names.values() if name not in self.header]
+        if missing:
+            raise lacking(str(self.path), missing, self.header, option)
+        for name in self.names.values():
+            if self.header.count(name) > 1:
+                raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
+        cells = (self._parquet_cells if self.parquet else self._text_cells)([*self.names.values()])
+        read = {}
+        for column in columns:
+            if column.key in self.names:
+                unit = (units or {}).get(column.key)
+                scale = UNITS[column.quantity][unit] if unit else 1.0
+
+                def fault(row: int, words: str, key: str = column.key) -> DataError:
+                    return self.fault(row, key, words)
+
+                read[column.key] = checked(cells[self.names[column.key]], column, fault, scale)
+        return read
 
     def fault(self, row: int, key: str, words: str) -> DataError:
         """Return the error about a cell."""
-        return DataError(
-            f"{self.path}: data row {row + 1}, column {self.names.get(key, key)!r} {words}"
-        )
+        name = self.names.get(key, key)
+        return DataError(f"{self.path}: data row {row + 1}, column {name!r} {words}")
 
-    def refuse(self, wrong: NDArray[np.bool_], key: str, words: str) -> None:
-        """Raise a DataError that names the first row at fault, if there is one."""
-        if np.any(wrong):
-            raise self.fault(int(np.argmax(wrong)), key, words)
-
-    def _check_header(self, wanted: list[str], option: str) -> None:
-        twice = [name for name in wanted if wanted.count(name) > 1]
-        if twice:
-            raise ConfigError(f"{option} names the column {twice[0]!r} twice")
-        missing = [name for name in wanted if name not in self.header]
-        if missing:
-            raise lacking(str(self.path), missing, self.header, option)
-        for name in wanted:
-            if self.header.count(name) > 1:
-                raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
-
-    def _parquet_cells(self, names: list[str]) -> dict[str, pa.ChunkedArray]:
+    def _parquet_cells(self, names: list[str]) -> Mapping[str, pa.ChunkedArray]:
         with _readable(self.path):
             table = pq.read_table(self.path, columns=names)
             table.validate(full=True)  # damaged text would fail only when used
         return {name: table[name] for name in names}
 
-    def _open_text(self, content: bytes) -> None:
-        content = content.removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
+    def _open_text(self) -> None:
+        require_memory({f"reading {self.path}": TEXT_TAKES * unpacked_size(self.path)})
+        with reading(self.path) as file:
+            content = file.read().removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
         if not is_text(content):
             raise DataError(f"{self.path}: is not text; expected a table in UTF-8")
         self.preamble, content = _preamble(content)
@@ -214,21 +204,19 @@ class TableFile:
         self.header = [name.strip() for name in cells_of(first, self.separator)]
         if not self.header:
             raise DataError(f"{self.path}: not a readable table: empty, or names no columns")
-        self.decimal_comma = self.separator == ";" and b"," in self.rows and b"." not in self.rows
         if self.separator != ",":
             words = f"columns are separated by {SEPARATORS[self.separator]}"
             self.notes.append(f"{self.path}: {words}")
-        if self.decimal_comma:
+        if self.separator == ";" and b"," in self.rows and b"." not in self.rows:
+            self.rows = self.rows.replace(b",", b".")
             self.notes.append(f"{self.path}: numbers have a decimal comma")
 
-    def _text_cells(self, names: list[str]) -> dict[str, pa.ChunkedArray]:
+    def _text_cells(self, names: list[str]) -> Mapping[str, pa.ChunkedArray]:
         if not self.rows.strip():
             return {name: pa.chunked_array([], pa.string()) for name in names}
-        places = {name: str(self.header.index(name)) for name in names}
-        table = parse_text(
-            self.rows, len(self.header), self.separator, [*places.values()], str(self.path)
-        )
-        return {name: table[place] for name, place in places.items()}
+        places = {str(self.header.index(name)): name for name in names}
+        table = parse_text(self.rows, len(self.header), self.separator, [*places], str(self.path))
+        return {name: table[place] for place, name in places.items()}
 
 
 def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
@@ -236,7 +224,7 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
     folded = {name.lower(): name for name in header}
     near = get_close_matches(missing[0].lower(), folded, n=1)
     hint = f" (is it {folded[near[0]]!r}?)" if near else ""
-    how = f"; say which is which by {option}={{…}}" if option else ""
+    how = f"; name the columns by {option}={{…}}" if option else ""
     shown = ", ".join(header)[:400]
     return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{how}")
 
@@ -244,21 +232,14 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
 # -- cells -----------------------------------------------------------------------------------------
 
 
-def checked(
-    cells: pa.ChunkedArray | pa.Array,
-    column: Column,
-    fault: Any,
-    scale: float = 1.0,
-    decimal_comma: bool = False,
-) -> NDArray:
+def checked(cells: Cells, column: Column, fault: Fault, scale: float = 1.0) -> NDArray:
     """Return the values of a column, checked.
 
     Args:
         cells: as they were read.
         column: what they have to be.
-        fault: returns the error for a row and words.
+        fault: makes the error.
         scale: factor to SI.
-        decimal_comma: whether numbers are written with one.
 
     Raises:
         DataError: for the first cell at fault.
@@ -269,29 +250,30 @@ def checked(
         if not column.blank and (found == "").any():
             raise fault(int(np.argmax(found == "")), "is blank")
         return found
-    values = numbers_of(cells, fault, decimal_comma) * scale
-    wrong = np.isinf(values) if column.blank else ~np.isfinite(values)
-    wrong |= (values < column.least) | (values > column.most)
+    values = numbers_of(cells, fault)
+    if scale != 1.0:
+        values = values * scale
+    least, most = (values.min(), values.max()) if len(values) else (column.least, column.most)
+    inside = column.least <= least and most <= column.most  # false for NaN
+    if inside and not (column.whole and (values != np.rint(values)).any()):
+        return values
+    wrong = ~((values >= column.least) & (values <= column.most))
     if column.whole:
-        wrong |= (values != np.rint(values)) & ~np.isnan(values)
+        wrong |= values != np.rint(values)
+    if column.blank:
+        wrong &= ~np.isnan(values)
     if wrong.any():
         row = int(np.argmax(wrong))
-        kind = "a whole number" if column.whole else "a number"
-        unit = {"time": " s", "speed": " m/s", "length": " m"}.get(column.quantity, "")
-        expected = f"{kind} from {column.least:g} to {column.most:g}{unit}"
-        raise fault(row, f"holds {shown(cells[row])}; expected {expected}")
+        raise fault(row, f"holds {_shown(cells[row])}; expected {column.expected}")
     return values
 
 
-def shown(cell: pa.Scalar) -> str:
-    """Return a cell for a message."""
+def _shown(cell: pa.Scalar) -> str:
     value = cell.as_py()
     return "nothing" if value is None else repr(value)[:40]
 
 
-def numbers_of(
-    cells: pa.ChunkedArray | pa.Array, fault: Any, decimal_comma: bool = False
-) -> NDArray[np.float64]:
+def numbers_of(cells: Cells, fault: Fault) -> NDArray[np.float64]:
     """Return cells as numbers, NaN for blank ones; numbers may have thousands separators.
 
     Raises:
@@ -299,10 +281,7 @@ def numbers_of(
     """
     if pa.types.is_dictionary(cells.type):
         cells = pc.cast(cells, cells.type.value_type)
-    text = pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type)
-    if text:
-        if decimal_comma:
-            cells = pc.replace_substring(cells, ",", ".")
+    if pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type):
         with suppress(pa.ArrowInvalid):
             return np.asarray(pc.cast(cells, pa.float64()), dtype=np.float64)
         cells = pc.utf8_trim_whitespace(cells)
@@ -313,7 +292,7 @@ def numbers_of(
         sound = np.asarray(pc.fill_null(pc.match_substring_regex(cells, NUMBER), True))
         if not sound.all():
             row = int(np.argmin(sound))
-            raise fault(row, f"holds {shown(cells[row])}; expected a number")
+            raise fault(row, f"holds {_shown(cells[row])}; expected a number")
     elif not any(kind(cells.type) for kind in NUMERIC):
         raise fault(0, f"is of type {cells.type}; expected numbers")
     return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)
@@ -379,7 +358,7 @@ def parse_text(
 
 
 @contextmanager
-def _readable(path: Path) -> Any:
+def _readable(path: Path) -> Iterator[None]:
     """Turn what a damaged parquet file raises, errors of many kinds, into a DataError."""
     try:
         yield
@@ -387,21 +366,20 @@ def _readable(path: Path) -> Any:
         raise DataError(f"{path}: not a readable table: {error}") from error
 
 
-def opened(name: str | Path) -> IO[bytes]:
-    """Open a file, decompressed where its first bytes are those of gzip."""
+@contextmanager
+def reading(name: str | Path) -> Iterator[IO[bytes]]:
+    """Open a plain or gzipped file, told by its first bytes.
+
+    Raises:
+        DataError: if it cannot be read or is damaged.
+    """
     if Path(name).exists() and not Path(name).is_file():  # a pipe would be waited for
         raise DataError(f"{name}: cannot be read: a folder, pipe or device; expected a file")
-    with open(name, "rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    return gzip.open(name, "rb") if packed else open(name, "rb")  # type: ignore[return-value]
-
-
-@contextmanager
-def reading(name: str | Path) -> Any:
-    """Turn errors of reading a plain or gzipped file into a DataError."""
     try:
-        with opened(name) as file:
-            yield file
+        with open(name, "rb") as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            yield gzip.GzipFile(fileobj=file) if packed else file  # type: ignore[misc]
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
     except OSError as error:
@@ -409,8 +387,8 @@ def reading(name: str | Path) -> Any:
 
 
 def unpacked_size(name: str | Path) -> int:
-    """Return the bytes of a file, of a compressed one those of its content; 0 for none."""
-    if not Path(name).is_file():  # a pipe would be waited for; who reads it says so
+    """Return the bytes of a file, or of the content of a compressed one; 0 for none."""
+    if not Path(name).is_file():  # a pipe would be waited for; who reads it raises the error
         return 0
     with suppress(OSError), open(name, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
@@ -423,18 +401,6 @@ def unpacked_size(name: str | Path) -> int:
     return 0
 
 
-def unpacked(path: Path) -> bytes:
-    """Return the content of a plain or gzipped file.
-
-    Raises:
-        DataError: if it cannot be read or is damaged.
-        ConfigError: if it does not fit into memory.
-    """
-    require_memory({f"reading {path}": TEXT_TAKES * unpacked_size(path)})
-    with reading(path) as file:
-        return bytes(file.read())
-
-
 def is_text(content: bytes) -> bool:
     """Return whether bytes are UTF-8 text."""
     try:
@@ -444,14 +410,14 @@ def is_text(content: bytes) -> bool:
 
 
 def single_spaces(lines: bytes) -> bytes:
-    """Lines with one space between columns and none around the row."""
+    """Return lines with one space between columns and none around the row."""
     lines = re.sub(rb" {2,}", b" ", lines.replace(b"\t", b" "))
     lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n").replace(b"\n ", b"\n")
     return lines.strip(b" ")
 
 
 def cells_of(line: bytes, separator: str) -> list[str]:
-    """Cells of a line; none of one that cannot be divided, as with a stray line end in it."""
+    """Return the cells of a line; none if it cannot be divided, as with a stray line end in it."""
     with suppress(csv.Error):
         return next(csv.reader([line.decode().rstrip("\r\n")], delimiter=separator), [])
     return []

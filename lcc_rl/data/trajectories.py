@@ -49,7 +49,7 @@ class ReadReport:
         return "\n".join(self.lines())
 
     def drop(self, reason: str, count: int) -> None:
-        """Count dropped rows."""
+        """Count dropped rows by reason."""
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 

@@ -3,48 +3,41 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Annotated
 
+from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import require_in, require_positive
+from lcc_rl.settings import Settings
 
-STEEPEST = 0.3  # [rad]
+Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # of the road [rad]
 
 
-class EnergyModel(ABC):
+class EnergyModel(Settings, ABC):
     """Base of all energy models: power [W] that a vehicle draws from its battery or tank.
 
-    A model of your own is a class with :meth:`power`; what a trip takes net of what the last speed
-    stores follows from ``mass`` and ``efficiency``.
+    A model of your own is a class with ``mass`` and :meth:`power`. What a trip takes net of what
+    the last speed stores follows from ``mass`` and ``efficiency``.
 
-    Args:
-        mass: of the vehicle, rotating parts included [kg].
+    Attributes:
+        mass: of the vehicle and those in it [kg].
+        rotating_mass: factor of the mass that is accelerated.
         efficiency: share of what is drawn that becomes kinetic energy; what the speed of the
             vehicle stores counts as kinetic energy over efficiency.
-        grade: of the road [rad].
-        heating_value: of the fuel [J/g]; None for a vehicle without fuel.
+        heating_value: of the fuel [J/g]; 0 for a vehicle without fuel.
         density: of the fuel [kg/L].
-
-    Raises:
-        ConfigError: if a setting is out of range.
     """
 
-    def __init__(
-        self,
-        mass: float,
-        efficiency: float = 1.0,
-        grade: float = 0.0,
-        heating_value: float | None = None,
-        density: float | None = None,
-    ) -> None:
-        require_positive("energy", mass=mass)
-        require_in("energy", "(0, 1]", efficiency=efficiency)
-        require_in("energy", f"[{-STEEPEST}, {STEEPEST}]", grade=grade)
-        for name, value in (("heating_value", heating_value), ("density", density)):
-            if value is not None:
-                require_positive("energy", **{name: value})
-        self.mass, self.efficiency, self.grade = mass, efficiency, grade
-        self.heating_value, self.density = heating_value, density
+    mass = 1500.0
+    rotating_mass = 1.0
+    efficiency = 1.0
+    heating_value = 0.0
+    density = 0.0
+
+    @property
+    def inertia(self) -> float:
+        """The mass that is accelerated, rotating parts included [kg]."""
+        return self.mass * self.rotating_mass
 
     @abstractmethod
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
@@ -61,12 +54,12 @@ class EnergyModel(ABC):
 
     def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the power that a path takes [W]: without what the motion stores; smooth."""
-        stored = self.mass / self.efficiency * speed * acceleration
+        stored = self.inertia / self.efficiency * speed * acceleration
         return self.smooth_power(speed, acceleration) - stored
 
     def stored_energy(self, speed: Tensor) -> Tensor:
         """Return what a speed is worth: kinetic energy over efficiency [J], same shape."""
-        return 0.5 * self.mass / self.efficiency * speed * speed
+        return 0.5 * self.inertia / self.efficiency * speed * speed
 
     def acceleration_loss(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
         """Return what accelerating loses for good [W]; None where the model has no such part."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.energy.base import EnergyModel
-from lcc_rl.errors import require_in, require_positive
+from lcc_rl.energy.base import EnergyModel, Grade
+from lcc_rl.settings import NonNegative, Positive
 
 GRAVITY, AIR = 9.81, 1.2  # [m/s²], [kg/m³]
 
@@ -21,51 +23,30 @@ class ElectricCar(EnergyModel):
     2016 Nissan Leaf of 30 kWh in the vehicle files of FASTSim (NREL), a driver and passenger on
     board; the efficiency is the product of motor (0.9 at partial load), gear (0.98) and one way
     through the battery (0.985).
-
-    Args:
-        mass: of the car and those in it [kg].
-        rotating_mass: factor of the mass that is accelerated.
-        drag: drag coefficient.
-        area: frontal area [m²].
-        rolling: rolling resistance coefficient.
-        efficiency: of the drivetrain, in either direction.
-        auxiliary: power of everything that does not drive [W].
-        regeneration_limit: largest braking power at the wheels that the motor takes [W].
-        fade_speed: below this speed recuperation fades, in proportion to it [m/s].
-        grade: of the road [rad].
-
-    Raises:
-        ConfigError: if a setting is out of range.
     """
 
-    def __init__(
-        self,
-        mass: float = 1636.0,
-        rotating_mass: float = 1.03,
-        drag: float = 0.315,
-        area: float = 2.755,
-        rolling: float = 0.008,
-        efficiency: float = 0.87,
-        auxiliary: float = 250.0,
-        regeneration_limit: float = 50000.0,
-        fade_speed: float = 5.0,
-        grade: float = 0.0,
-    ) -> None:
-        require_in("energy", "[100, 100000]", mass=mass)  # kilograms, not tonnes
-        require_positive("energy", drag=drag, area=area, rotating_mass=rotating_mass)
-        require_in("energy", "[0, inf)", rolling=rolling, auxiliary=auxiliary)
-        require_in("energy", "[0, inf)", regeneration_limit=regeneration_limit)
-        require_positive("energy", fade_speed=fade_speed)
-        super().__init__(mass * rotating_mass, efficiency, grade)
-        self.drag = 0.5 * AIR * drag * area
-        slope = rolling * math.cos(grade) + math.sin(grade)
-        self.resistance = mass * GRAVITY * slope  # [N]
-        self.auxiliary, self.limit, self.fade_speed = auxiliary, regeneration_limit, fade_speed
+    # Of the car and those in it [kg].
+    mass: Annotated[float, Field(ge=100.0, le=100_000.0)] = 1636.0
+    rotating_mass: Positive = 1.03  # factor of the mass that is accelerated
+    drag: Positive = 0.315  # drag coefficient
+    area: Positive = 2.755  # frontal area [m²]
+    rolling: NonNegative = 0.008  # rolling resistance coefficient
+    efficiency: Annotated[float, Field(gt=0.0, le=1.0)] = 0.87  # of the drivetrain, either way
+    auxiliary: NonNegative = 250.0  # power of everything that does not drive [W]
+    regeneration_limit: NonNegative = 50_000.0  # braking power that the motor takes [W]
+    fade_speed: Positive = 5.0  # below it recuperation fades in proportion to it [m/s]
+    grade: Grade = 0.0  # of the road [rad]
+
+    def settled(self) -> None:
+        self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
+        slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
+        self.rolling_force = self.mass * GRAVITY * slope  # [N]
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the power drawn from the battery [W], negative where it is charged."""
-        force = self.mass * acceleration + self.resistance + self.drag * speed.square()
+        force = self.inertia * acceleration + self.rolling_force + self.resistance * speed.square()
         wheels = force * speed
-        taken = (-wheels).clamp(0.0, self.limit) * (speed / self.fade_speed).clamp(max=1.0)
+        fading = (speed / self.fade_speed).clamp(max=1.0)
+        taken = (-wheels).clamp(0.0, self.regeneration_limit) * fading
         driving = wheels.clamp(min=0.0) / self.efficiency
         return driving - taken * self.efficiency + self.auxiliary

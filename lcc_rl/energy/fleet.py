@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lcc_rl.config.nodes import build
 from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.motor import PaperMotor
-from lcc_rl.errors import ConfigError, require_in, unknown_name
-from lcc_rl.nodes import build
+from lcc_rl.errors import ConfigError, unknown_name
 
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
@@ -55,10 +55,9 @@ class Fleet:
         for name in shares:
             if name not in self.names:
                 raise unknown_name(f"class of {where}", name, self.names)
-        require_in(where, "[0, inf)", **dict(shares))
         total = sum(shares.values())
-        if not total > 0.0:
-            raise ConfigError(f"{where}: at least one share must be above 0")
+        if not total > 0.0 or min(shares.values()) < 0.0:
+            raise ConfigError(f"{where}: shares must not be negative, and one must be above 0")
         return [shares.get(name, 0.0) / total for name in self.names]
 
     def power(self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None) -> Tensor:

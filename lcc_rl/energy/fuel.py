@@ -9,8 +9,9 @@ from importlib.resources import files
 import torch
 from torch import Tensor
 
-from lcc_rl.energy.base import EnergyModel
-from lcc_rl.errors import require_positive, unknown_name
+from lcc_rl.energy.base import EnergyModel, Grade
+from lcc_rl.errors import unknown_name
+from lcc_rl.settings import Positive
 
 FUEL = "circles_fuel.csv"
 GASOLINE, DIESEL = 0.745, 0.832  # [kg/L]
@@ -38,30 +39,24 @@ class CirclesFuel(EnergyModel):
     Below a deceleration that grows with speed the engine gets no fuel: a jump, exact in
     :meth:`power` and bridged over a ``width`` in :meth:`smooth_power`. An acceleration beyond
     what the vehicle can do counts as the largest that it can (:meth:`infeasible` tells where).
-
-    Args:
-        vehicle: Compact, midBase, midSUV, Pickup, Class4PND or Class8Tractor.
-        grade: of the road [rad].
-        width: range over which the cut of the fuel is bridged [m/s²].
-
-    Raises:
-        ConfigError: if the vehicle is unknown or a setting is out of range.
     """
 
-    def __init__(self, vehicle: str = "midBase", grade: float = 0.0, width: float = 0.1) -> None:
-        if vehicle not in coefficients():
-            raise unknown_name("vehicle (energy.vehicle)", vehicle, coefficients())
-        require_positive("energy", width=width)
-        self.own = coefficients()[vehicle]
-        self.heat = self.own["gs2kW"] * KILOWATT  # [J/g]
-        truck = vehicle in TRUCKS
-        density = DIESEL if truck else GASOLINE
-        super().__init__(self.own["mass_kg"], KINETIC / self.heat, grade, self.heat, density)
-        self.vehicle, self.truck, self.width = vehicle, truck, width
+    vehicle: str = "midBase"  # Compact, midBase, midSUV, Pickup, Class4PND or Class8Tractor
+    grade: Grade = 0.0  # of the road [rad]
+    width: Positive = 0.1  # range over which the cut of the fuel is bridged [m/s²]
+
+    def settled(self) -> None:
+        if self.vehicle not in coefficients():
+            raise unknown_name("vehicle (energy.vehicle)", self.vehicle, coefficients())
+        self.own = coefficients()[self.vehicle]
+        self.heating_value = self.own["gs2kW"] * KILOWATT
+        self.truck = self.vehicle in TRUCKS
+        self.density = DIESEL if self.truck else GASOLINE
+        self.mass, self.efficiency = self.own["mass_kg"], KINETIC / self.heating_value
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the heat of the fuel burnt [W]."""
-        return self.fuel(speed, acceleration) * self.heat
+        return self.fuel(speed, acceleration) * self.heating_value
 
     def smooth_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the same with the fuel cut bridged and without the state of idling."""
@@ -70,7 +65,7 @@ class CirclesFuel(EnergyModel):
         if not self.truck:
             weaker = (self._cut(speed) - acceleration) / self.width
             rate = rate * (1.0 - weaker.sigmoid() * (speed > self.own["vc"]))
-        return rate * self.heat
+        return rate * self.heating_value
 
     def fuel(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the fuel rate [g/s], same shape; arguments as of :meth:`power`."""

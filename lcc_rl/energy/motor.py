@@ -14,8 +14,8 @@ class PaperMotor(EnergyModel):
     Steady power, what the motion stores and what accelerating loses add up to A2 exactly.
     """
 
-    def __init__(self) -> None:
-        super().__init__(PAPER_VEHICLE.rotating_mass * PAPER_VEHICLE.mass)
+    mass = PAPER_VEHICLE.mass
+    rotating_mass = PAPER_VEHICLE.rotating_mass
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the motor's power [W] (A2)."""

@@ -11,6 +11,8 @@ from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
+from lcc_rl.config.nodes import CALLED, build
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import build_energy
 from lcc_rl.envs.checks import check_pieces
@@ -22,7 +24,6 @@ from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.io.memory import require_memory
-from lcc_rl.nodes import CALLED, build
 from lcc_rl.pieces import (
     Action,
     CBFFilter,
@@ -37,7 +38,6 @@ from lcc_rl.pieces import (
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.pieces.world import World
-from lcc_rl.schemas import StudyConfig
 from lcc_rl.settings import parse
 
 MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with

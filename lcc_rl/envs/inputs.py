@@ -13,14 +13,14 @@ from typing import Any, cast
 import torch
 
 from lcc_rl.config import is_sweep
+from lcc_rl.config.nodes import CALLED, build
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.pattern import RING, VehicleString, parse_string
-from lcc_rl.nodes import CALLED, build
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.schemas import StudyConfig
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import build_pieces
@@ -18,7 +19,6 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
 from lcc_rl.results.savings import SOURCE
-from lcc_rl.schemas import StudyConfig
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")

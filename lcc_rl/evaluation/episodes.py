@@ -12,6 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs, string_of
@@ -34,7 +35,6 @@ from lcc_rl.evaluation.rows import (
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.tables import FASTER
-from lcc_rl.schemas import StudyConfig
 
 # Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
 WORTH_COMPILING = 20_000_000

@@ -7,10 +7,10 @@ from typing import Any
 
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.runs import differing, flatten
-from lcc_rl.schemas import AUTO, StudyConfig
 
 FIRST = "module.0.0.weight"  # of a policy's network
 

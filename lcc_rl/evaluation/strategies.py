@@ -20,14 +20,14 @@ from typing import Any
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load
+from lcc_rl.config.nodes import TARGET, short_name
+from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.nodes import TARGET, short_name
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.schemas import AUTO, StudyConfig
 
 log = logging.getLogger("lcc_rl")
 

@@ -9,13 +9,13 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.savings import UNTRAINED
 from lcc_rl.results.tables import PATH, ROWS, summary
-from lcc_rl.schemas import StudyConfig
 
 TITLE = "lcc_rl: data → drivers → policies → results"
 WHO = {

@@ -14,13 +14,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.strategies import DIRECT, FILTERED, baseline_controller, rules
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
-from lcc_rl.nodes import build
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World
@@ -95,7 +95,7 @@ class Driver:
         pieces: list[StepTransform] = []
         if isinstance(name, Mapping) or name in known_rules():
             node = name if isinstance(name, Mapping) else baseline_controller(str(name))
-            pieces.append(self._build(Controller, node))
+            pieces.append(self._build(Controller, node, AUTOMATED))
         elif Path(name).exists() or Path(name).parts[:1] == (PRETRAINED,):
             pieces += self._policy(name, trust)
         else:
@@ -115,11 +115,11 @@ class Driver:
             )
         memory = cfg.scenario.pieces.get("memory")
         wanted = any(column.startswith("memory.") for column in self.module.names)
-        return [self._build(ObservationMemory, memory)] if wanted else []
+        return [self._build(ObservationMemory, memory, "memory")] if wanted else []
 
-    def _build(self, kind: type[StepTransform], node: Any) -> Any:
+    def _build(self, kind: type[StepTransform], node: Any, name: str) -> Any:
         world = World(STRING, self.time_step, population=bootstrap())
-        return build(node, self.name, kind, world=world)
+        return build(node, self.name, kind, world=world, name=name)
 
     def _check(self) -> None:
         for key in self.reads():

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
+from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.trust import trusted
-from lcc_rl.schemas import StudyConfig, as_text
 
 PRETRAINED = "pretrained"
 # Variants that build on the policy of another one.

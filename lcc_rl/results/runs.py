@@ -11,12 +11,12 @@ from typing import Any, Literal, overload
 import pandas as pd
 from pyarrow.dataset import Dataset
 
+from lcc_rl.config.schemas import BaseConfig, as_plain, as_text
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, as_dataset, parquet_metadata, read_parquet
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
-from lcc_rl.schemas import BaseConfig, as_plain, as_text
 
 log = logging.getLogger("lcc_rl")
 

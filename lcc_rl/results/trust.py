@@ -6,9 +6,9 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lcc_rl.config.nodes import TARGET, find_target, forget_places, settings_at
+from lcc_rl.config.schemas import parse_config
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.nodes import TARGET, find_target, forget_places, settings_at
-from lcc_rl.schemas import parse_config
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"

@@ -26,11 +26,9 @@ def per_distance(kj_per_km: float, unit: str, energy: Fleet) -> float:
     if unit in ELECTRIC:
         return kj_per_km * ELECTRIC[unit]
     model = energy.models[0]
-    assert model.heating_value is not None
     grams = kj_per_km * 1e3 / model.heating_value
     if unit == "g/km":
         return grams
-    assert model.density is not None
     litres = grams / model.density / 10.0  # g/km over g/L, times 100 km
     return litres if unit == "L/100km" else MPG / litres
 

@@ -6,8 +6,8 @@ import logging
 
 import torch
 
+from lcc_rl.config.schemas import BaseConfig
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.schemas import BaseConfig
 
 log = logging.getLogger("lcc_rl")
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.config import NOT_IDENTITY, identity, load
+from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import read_json
@@ -24,7 +25,6 @@ from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
 from lcc_rl.runs.sweeps import key_of
-from lcc_rl.schemas import StudyConfig, as_plain
 
 log = logging.getLogger("lcc_rl")
 
@@ -52,7 +52,7 @@ class Run:
 
     def command(self) -> list[str]:
         """Return the command that starts the training, or resumes it from its checkpoint."""
-        words = [sys.executable, "-m", "lcc_rl.train"]
+        words = [sys.executable, "-m", "lcc_rl.cli.train"]
         if (self.folder / "checkpoint.pt").exists():
             return [*words, f"resume={quoted(self.folder)}"]
         return [*words, *self.overrides, f"hydra.run.dir={quoted(self.folder)}"]

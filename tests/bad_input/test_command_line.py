@@ -12,7 +12,7 @@ import pytest
 from commands import NO_AGENT, run_command
 from test_foreign_files import content
 
-from lcc_rl.runs.cli import flags_first
+from lcc_rl.cli.entry import flags_first
 from lcc_rl.runs.output import Unbroken
 from lcc_rl.runs.states import inspect_run
 
@@ -21,7 +21,7 @@ from lcc_rl.runs.states import inspect_run
 def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     words = (*NO_AGENT, "variant=idm", "hydra.run.dir=run")
-    run_command("lcc_rl.train", *words, cwd=folder, check=True)
+    run_command("lcc_rl.cli.train", *words, cwd=folder, check=True)
     return folder / "run"
 
 
@@ -47,7 +47,7 @@ def test_flags_may_stand_anywhere(typed, sorted_words) -> None:
 def test_an_unknown_flag_is_one_line(tmp_path, entry) -> None:
     # argparse would take --experiment for an abbreviation of a flag of Hydra's own
     flag = "--experiment" if entry == "train" else "--seed"
-    done = run_command(f"lcc_rl.{entry}", "variant=idm", flag, "3", cwd=tmp_path)
+    done = run_command(f"lcc_rl.cli.{entry}", "variant=idm", flag, "3", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith(f"lcc_rl: error: unknown flag {flag}: settings are written key=")
     assert done.stderr.count("\n") == 1
@@ -71,7 +71,7 @@ def test_a_refused_command_leaves_a_finished_run_as_it_was(finished, tmp_path, w
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
     before = content(folder)
     assert {".hydra/overrides.yaml", "episodes.parquet"} <= before.keys()
-    done = run_command("lcc_rl.train", *words, cwd=tmp_path)
+    done = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert content(folder) == before
 
@@ -81,7 +81,7 @@ def test_a_finished_run_of_other_settings_is_refused_and_left(finished, tmp_path
     path = folder / "config.yaml"
     path.write_text(path.read_text().replace("seed: 0", "seed: 1", 1))
     before = content(folder)
-    done = run_command("lcc_rl.train", "resume=run", cwd=tmp_path)
+    done = run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path)
     assert "episodes.parquet belongs to another configuration" in done.stderr
     assert done.returncode == 2
     assert content(folder) == before
@@ -90,15 +90,15 @@ def test_a_finished_run_of_other_settings_is_refused_and_left(finished, tmp_path
 def test_a_refused_command_does_not_make_a_stopped_run_a_failed_one(finished, tmp_path) -> None:
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
     (folder / "episodes.parquet").unlink()
-    run_command("lcc_rl.train", "resume=run", "seed=3", cwd=tmp_path)
+    run_command("lcc_rl.cli.train", "resume=run", "seed=3", cwd=tmp_path)
     assert inspect_run(folder).state == "stopped"
 
 
 def test_a_failed_start_is_recorded_and_forgotten_once_it_works(tmp_path) -> None:
     words = (*NO_AGENT, "variant=idm", "hydra.run.dir=run")
-    run_command("lcc_rl.train", *words, "evaluation.drivers=0", cwd=tmp_path)
+    run_command("lcc_rl.cli.train", *words, "evaluation.drivers=0", cwd=tmp_path)
     assert inspect_run(tmp_path / "run").state == "failed"
-    run_command("lcc_rl.train", *words, cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.train", *words, cwd=tmp_path, check=True)
     assert inspect_run(tmp_path / "run").state == "finished"
 
 
@@ -127,9 +127,11 @@ def test_what_nobody_reads_is_dropped() -> None:
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        ("lcc_rl.status", ("runs",)),
+        ("lcc_rl.cli.status", ("runs",)),
         pytest.param(
-            "lcc_rl.train", (*NO_AGENT, "variant=idm", "hydra.run.dir=new"), marks=pytest.mark.slow
+            "lcc_rl.cli.train",
+            (*NO_AGENT, "variant=idm", "hydra.run.dir=new"),
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -144,5 +146,5 @@ def test_a_closed_pipe_ends_nothing_and_says_nothing(finished, tmp_path, module,
         errors = child.stderr.read().decode()
         assert child.wait(timeout=300) == 0, errors
     assert errors == ""
-    if module == "lcc_rl.train":
+    if module == "lcc_rl.cli.train":
         assert inspect_run(tmp_path / "new").state == "finished"

@@ -14,12 +14,12 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.results.runs import check_folder
 from lcc_rl.runs.states import inspect_run
 
-RULE = ("lcc_rl.train", *NO_AGENT, "variant=idm")
+RULE = ("lcc_rl.cli.train", *NO_AGENT, "variant=idm")
 OTHERS = [
     (*RULE, "seed=1"),
-    ("lcc_rl.evaluate", *NO_AGENT, "variant=idm"),
-    ("lcc_rl.calibrate", *DATA, QUICK),
-    ("lcc_rl.pipeline", *NO_AGENT, "variants=[idm]"),
+    ("lcc_rl.cli.evaluate", *NO_AGENT, "variant=idm"),
+    ("lcc_rl.cli.calibrate", *DATA, QUICK),
+    ("lcc_rl.cli.pipeline", *NO_AGENT, "variants=[idm]"),
 ]
 
 
@@ -95,7 +95,7 @@ def test_links_in_a_resumed_folder_are_not_followed(finished, tmp_path, name) ->
     (folder / name).parent.mkdir(exist_ok=True)
     (folder / name).unlink(missing_ok=True)
     (folder / name).symlink_to(mine)
-    done = run_command("lcc_rl.train", "resume=run", cwd=tmp_path)
+    done = run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path)
     assert done.returncode == 2
     assert f"run/{name}: a link" in done.stderr
     assert mine.read_text() == "mine"

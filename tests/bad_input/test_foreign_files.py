@@ -105,9 +105,9 @@ def test_places_of_loggers_are_left_out(run) -> None:
 
 def test_a_resumed_run_may_be_given_a_logger_and_nothing_else(run) -> None:
     words = (f"resume={run}", "logger=rows", "logger.kind=typo")
-    done = run_command("lcc_rl.train", *words, cwd=run.parent)
+    done = run_command("lcc_rl.cli.train", *words, cwd=run.parent)
     assert "logger.kind must be one of" in done.stderr
-    done = run_command("lcc_rl.train", f"resume={run}", "seed=3", cwd=run.parent)
+    done = run_command("lcc_rl.cli.train", f"resume={run}", "seed=3", cwd=run.parent)
     assert "seed=3" in done.stderr
 
 
@@ -276,7 +276,7 @@ def test_pipes_are_not_waited_for(tmp_path) -> None:
 def test_progress_that_is_none(run, text) -> None:
     for name in ("progress.json", "sweep.json"):
         (run / name).write_text(text)
-    run_command("lcc_rl.status", str(run.parent), cwd=run.parent, check=True)
+    run_command("lcc_rl.cli.status", str(run.parent), cwd=run.parent, check=True)
     assert inspect_run(run).total == 0
 
 

@@ -103,10 +103,10 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "a.parquet": lambda path: write_parquet(pd.DataFrame({"x": noise()}), path),
     "a.png": figure,
     "error.txt": text,
-    "report.html": page,
     "config.yaml": lambda path: save_config(
         load("train", ["trust=[" + "x," * 9_000 + "x]"]), path.parent
     ),
+    "report.html": page,
 }
 
 
@@ -157,7 +157,9 @@ def test_a_training_stopped_by_a_full_disk_resumes_as_if_it_never_was(
 def test_a_command_on_a_disk_without_space_ends_in_one_line(tmp_path, size) -> None:
     disk = tmp_path / "disk"
     with small_disk(disk, size):
-        done = run_command("lcc_rl.train", *TRAIN, f"hydra.run.dir={disk / 'run'}", cwd=tmp_path)
+        done = run_command(
+            "lcc_rl.cli.train", *TRAIN, f"hydra.run.dir={disk / 'run'}", cwd=tmp_path
+        )
         assert not list(disk.rglob("*.tmp"))
     lines = [line for line in done.stderr.splitlines() if "[INFO]" not in line]
     assert done.returncode == 2
@@ -180,7 +182,7 @@ def test_a_command_on_a_disk_without_space_ends_in_one_line(tmp_path, size) -> N
 )
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, entry, place, words) -> None:
     (tmp_path / "file").write_text("kept")
-    module, target = f"lcc_rl.{entry}", f"hydra.run.dir={place}"
+    module, target = f"lcc_rl.cli.{entry}", f"hydra.run.dir={place}"
     done = run_command(module, *COMMANDS[entry], target, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
@@ -191,7 +193,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, entry, place, words)
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_without_permission_is_one_line(tmp_path) -> None:
     tmp_path.chmod(0o500)
-    done = run_command("lcc_rl.train", *TRAIN, cwd=tmp_path)
+    done = run_command("lcc_rl.cli.train", *TRAIN, cwd=tmp_path)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert "Permission denied" in done.stderr
 
@@ -222,7 +224,7 @@ def test_the_second_process_in_a_folder_says_so_and_touches_nothing(
     with claim(folder):
         before = sorted(folder.rglob("*"))
         target = f"hydra.run.dir={folder}"
-        done = run_command(f"lcc_rl.{entry}", *COMMANDS[entry], target, cwd=tmp_path)
+        done = run_command(f"lcc_rl.cli.{entry}", *COMMANDS[entry], target, cwd=tmp_path)
         assert sorted(folder.rglob("*")) == before
     assert done.returncode == 2
     assert done.stderr == f"lcc_rl: error: {folder}: another process is working on this run\n"
@@ -243,7 +245,7 @@ def test_a_folder_is_held_while_a_command_works_and_free_afterwards(
 
     monkeypatch.setattr(module, "save_config", observed)
     target = f"hydra.run.dir={tmp_path / 'run'}"
-    run_command(f"lcc_rl.{entry}", *COMMANDS[entry], target, cwd=tmp_path, check=True)
+    run_command(f"lcc_rl.cli.{entry}", *COMMANDS[entry], target, cwd=tmp_path, check=True)
     assert held == [True]
     assert not is_claimed(tmp_path / "run")
 
@@ -252,9 +254,9 @@ def test_a_folder_is_held_while_a_command_works_and_free_afterwards(
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_process_that_is_ended_leaves_a_folder_that_can_be_resumed(tmp_path, kind) -> None:
     words = (*TRAIN, "training.episodes=80000", f"hydra.run.dir={tmp_path / 'run'}")
-    with start("lcc_rl.train", *words, cwd=tmp_path) as child:
+    with start("lcc_rl.cli.train", *words, cwd=tmp_path) as child:
         wait_for(tmp_path / "run" / "checkpoint.pt", child)
-        second = run_command("lcc_rl.train", f"resume={tmp_path / 'run'}", cwd=tmp_path)
+        second = run_command("lcc_rl.cli.train", f"resume={tmp_path / 'run'}", cwd=tmp_path)
         assert child.poll() is None
         child.send_signal(kind)
         _, errors = child.communicate(timeout=60)

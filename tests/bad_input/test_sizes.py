@@ -47,7 +47,7 @@ def test_a_stream_that_is_larger_than_memory(tmp_path, entry, run, size) -> None
 
 def test_a_pipeline_splits_the_data_before_it_calibrates(tmp_path) -> None:
     words = ("experiment=smoke", *DATA, "data.recordings=1", "hydra.run.dir=job")
-    done = run_command("lcc_rl.pipeline", *words, cwd=tmp_path)
+    done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert "by recording: only" in done.stderr
     assert "say split.by=vehicle" in done.stderr

@@ -60,24 +60,6 @@ def test_exponential_average_against_a_hand_computed_value(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("smoothing", EVERY, ids=str)
-def test_noise_shrinks_and_speeds_agree_with_positions(
-    tmp_path: Path, smoothing: Smoothing
-) -> None:
-    time = 0.1 * np.arange(600)
-    true = 30 * time + 20 * np.sin(0.3 * time)
-    noise = np.random.default_rng(3).normal(0, 0.3, 600)
-    raw = drive(tmp_path, np.round(true + noise, 3))
-    samples = smoothing(raw).samples
-    left = samples["position_m"] / FOOT - true[samples["frame"]]
-    assert left.std() < 0.8 * 0.3
-    implied = np.gradient(samples["position_m"].to_numpy(dtype=float), 0.1)
-    rough = np.abs(implied - samples["speed_mps"])[2:-2]
-    assert rough.mean() < 0.5
-    assert (samples["speed_mps"] >= 0).all()
-    assert raw.samples["speed_mps"].eq(0).all()  # the given trajectories stay as they are
-
-
-@pytest.mark.parametrize("smoothing", EVERY, ids=str)
 def test_stretches_do_not_mix(tmp_path: Path, smoothing: Smoothing) -> None:
     rows = [cells(7, k, Local_Y=10.0 * k) for k in range(50)]
     far = [cells(7, k, Local_Y=10.0 * k + 5000) for k in range(51, 100)]
@@ -168,15 +150,6 @@ def test_ripple_at_standstill_becomes_zero_and_is_counted(tmp_path: Path) -> Non
     assert "36 speeds below zero became zero" in str(smoothed.report)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SavitzkyGolay(window_s=0.3, order=3), "window_s must be at least 0.4"),
-        (lambda: SavitzkyGolay(window_s=float("nan")), "window_s"),
-        (lambda: SavitzkyGolay(order=1), "order"),
-        (lambda: ExponentialAverage(width_s=0.0), "width_s"),
-    ],
-)
-def test_impossible_settings(make: object, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        make()  # type: ignore[operator]
+def test_a_window_must_hold_the_polynomial() -> None:
+    with pytest.raises(ConfigError, match=r"window_s must be at least 0\.4"):
+        SavitzkyGolay(window_s=0.3, order=3)

@@ -12,6 +12,7 @@ from helpers import slow_but
 from rich.console import Console
 
 import lcc_rl.conf
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.commands import calibration
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
@@ -20,7 +21,6 @@ from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.pieces import CalibratedDrivers
 from lcc_rl.pieces.world import World
-from lcc_rl.runs.cli import main_guard
 from lcc_rl.runs.precision import prepare_torch
 
 CONF = Path(str(lcc_rl.conf.__file__)).parent
@@ -146,7 +146,7 @@ def test_device_and_threads_are_prepared():
 @pytest.fixture
 def command(source):
     """Function that runs the command in the folder of the episode file."""
-    return partial(run_command, "lcc_rl.calibrate", cwd=source)
+    return partial(run_command, "lcc_rl.cli.calibrate", cwd=source)
 
 
 def test_command_writes_into_the_run_folder(source, command):

@@ -9,13 +9,11 @@ import torch
 from helpers import TERMS, VARIANTS, compose, make_agent, single_env, small_env, string
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs.transforms import RewardSum
 
 from lcc_rl.agents.actor import GaussianExploration, shared_policy
 from lcc_rl.agents.replay import LEARNED_FROM
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import Step, pieces_of
-from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, as_key
 
 KEYS = (*LEARNED_FROM, ("next", *TERMS), ("vehicles", "gap"))
@@ -137,19 +135,6 @@ def test_holds_what_is_asked_for() -> None:
 
 def first(env, **settings):
     return next(iter(StringCollector(env, policy(), keys=KEYS, **settings)))
-
-
-@pytest.mark.parametrize("frames", [0, 3, -2])
-def test_frames_are_whole_steps_of_all_episodes(frames) -> None:
-    with pytest.raises(ConfigError, match="must be a multiple of the 2 episodes"):
-        first(small_env("alcc", 2), frames_per_batch=frames)
-
-
-def test_a_transform_that_it_would_not_apply_is_refused() -> None:
-    key = ("automated", "reward")
-    env = small_env("alcc", 2).append_transform(RewardSum([key], [("automated", "episode_reward")]))
-    with pytest.raises(ConfigError, match="RewardSum, which StringCollector does not apply"):
-        first(env, frames_per_batch=2)
 
 
 def test_without_a_compiler_one_line_and_the_plain_step(monkeypatch, caplog) -> None:

@@ -27,7 +27,6 @@ from torchrl.envs.utils import step_mdp
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.envs import build_env, load_inputs
-from lcc_rl.envs.clock import Clock
 from lcc_rl.envs.step import Step, closure, entries, pieces_of
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import equilibrium_gap
@@ -47,15 +46,6 @@ def play(env, actions):
 @pytest.mark.parametrize("batch_size", [(), 3])
 def test_specs(variant, batch_size) -> None:
     check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
-
-
-@pytest.mark.parametrize(
-    ("size", "words"),
-    [(0, "one episode, got 0"), (-1, "got -1"), (2.5, "whole numbers, got 2.5"), ("8", "got '8'")],
-)
-def test_no_batch_of_episodes_is_refused(size, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        small_env("alcc", size)
 
 
 @pytest.mark.parametrize("count", [1, 4])
@@ -136,18 +126,6 @@ def test_one_profile_for_every_episode() -> None:
     assert td["leader", "start"].unique().numel() > 1
     with pytest.raises(ConfigError, match=r"profile must lie in 0…3"):
         small_env("alcc", 1, ["scenario.pieces.leader.profile=4"])
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "words"),
-    [
-        (("leader", "profile"), torch.tensor([[99]]), "leader.profile must lie in 0…3"),
-        (("human", "driver"), torch.tensor([[[100000]]]), "human.driver must lie in"),
-    ],
-)
-def test_unknown_ids_are_refused(key, value, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        small_env("alcc", 1).reset(TensorDict({key: value}, [1]))
 
 
 def test_same_seed_same_episodes_and_other_seed_others() -> None:
@@ -295,20 +273,6 @@ def test_profile_shorter_than_the_horizon() -> None:
     cfg = compose("alcc", "scenario.horizon=1000")
     with pytest.raises(DataError, match="shorter than the horizon"):
         build_env(cfg, wavy_profiles(), POPULATION, 2)
-
-
-def test_clock_refuses_an_empty_horizon() -> None:
-    with pytest.raises(ConfigError, match="horizon"):
-        Clock(0)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_agrees_with_cpu() -> None:
-    cfg = compose("alcc")
-    zero = torch.zeros(20, 8, 1, 1)
-    cpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8), zero)[-1]
-    gpu = play(build_env(cfg, wavy_profiles(), POPULATION, 8, device="cuda"), zero.cuda())[-1]
-    torch.testing.assert_close(cpu["vehicles", "speed"], gpu["vehicles", "speed"].cpu())
 
 
 def test_the_runs_of_a_sweep_share_the_data_while_its_files_stay_the_same(

@@ -14,6 +14,7 @@ from helpers import ACTION, POPULATION, compose, network, slow_but, wavy_profile
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation
+from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
 from lcc_rl.evaluation.blocks import BLOCKS, Store
@@ -22,7 +23,6 @@ from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.tables import summary
-from lcc_rl.schemas import EvaluateConfig
 
 PROFILES = wavy_profiles().windows(100)
 INPUTS = Inputs(PROFILES, PROFILES, POPULATION)
@@ -164,7 +164,7 @@ def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog)
     words = [*WORDS, BLOCK, "experiment=smoke", "data.platoons=2", "data.recordings=2"]
     words += ["data.duration_s=[32,40]", "scenario.horizon=40", "sweep=parts"]
     words += ["evaluation.shards=4", "evaluation.shard=range(4)"]
-    run_command("lcc_rl.evaluate", "-m", *words, cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.evaluate", "-m", *words, cwd=tmp_path, check=True)
     root, order = tmp_path / "outputs/evaluate/parts", ["profile_id", "driver_id", "strategy"]
     rows, own = results.load(root, strict=True), read_parquet(whole / "episodes.parquet")
     one, two = (x[own.columns].sort_values(order, ignore_index=True) for x in (rows, own))
@@ -178,7 +178,7 @@ def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog)
     with pytest.raises(ResultsError, match="1 of 4 shards"):
         results.load(root, strict=True)
     # The same command plays what is missing and nothing else.
-    run_command("lcc_rl.evaluate", "-m", *words, cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.evaluate", "-m", *words, cwd=tmp_path, check=True)
     again = {path: path.stat().st_mtime_ns for path in root.glob("*/episodes.parquet")}
     assert {path for path in again if again[path] == written.get(path)} == set(written) - {gone}
     assert len(results.load(root, strict=True)) == len(own)
@@ -249,7 +249,7 @@ def test_a_compiled_step_names_what_is_not_a_number() -> None:
 
     policy.in_keys = [*good.in_keys, ("episode", "step")]
     player = Player(env, policy, [("vehicles", "gap")], "strategy x", compiled=True)
-    words = "strategy x: automated.action, written by the policy, is nan at step 6 of episode 0"
+    words = "strategy x: automated.action is nan at step 6 of episode 0"
     ids = torch.arange(4)
     with pytest.raises(Diverged, match=words):
         player.play(reset_options(env, ids, ids, 1, 249))

@@ -138,19 +138,6 @@ def test_stability_limit_agrees_with_the_eigenvalues() -> None:
     assert seen == {True, False}
 
 
-@pytest.mark.parametrize(
-    ("gains", "words"),
-    [
-        (Gains(-0.1, 0.5, 0.0, 0.5), "kx = k1 [+] k3 = -0.1 must be positive"),
-        (Gains(5.0, 0.1, 5.0, 0.1), r"must exceed T·kx/2 = 1"),
-        (Gains(0.1, 1.0, 0.1, 1.5), "must be below 2"),
-    ],
-)
-def test_unstable_gains_are_refused_with_the_condition(gains, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        gains.check_stable(T)
-
-
 def test_named_gains_are_stable_and_as_described() -> None:
     damping = {}
     for name, gains in NAMED.items():

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.gipps import GippsConstants, gipps_acceleration
 from lcc_rl.functional.idm import simulate_follower
 from lcc_rl.functional.laws import LAWS
@@ -145,15 +144,3 @@ def test_gradients_are_finite_everywhere(model) -> None:
     assert speed.grad.isfinite().all()
     assert gap.grad is not None
     assert gap.grad.isfinite().all()
-
-
-@EACH
-def test_constants_must_be_positive(model) -> None:
-    for name in LAWS[model].shared:
-        with pytest.raises(ConfigError, match=name):
-            LAWS[model].constants(**{name: 0.0})
-
-
-def test_what_varies_is_shared_by_its_mean() -> None:
-    own = GippsConstants().with_(deceleration=torch.tensor([2.0, 4.0]))
-    assert own.shared() == GippsConstants(deceleration=3.0)

@@ -1,9 +1,7 @@
 """The Intelligent Driver Model: formula, equilibrium and behaviour."""
 
-import pytest
 import torch
 
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import (
     IDMConstants,
     equilibrium_gap,
@@ -81,9 +79,3 @@ def test_noise_scales_the_executed_acceleration() -> None:
         leader, t(9.0), t(30.0), t(20.0), t(1.2), KNOWN, 0.1, noise=lambda step: t(0.05)
     )[2]
     torch.testing.assert_close(noisy[0], quiet[0] * 1.05)
-
-
-@pytest.mark.parametrize("name", ["acceleration", "min_gap", "exponent", "braking_limit"])
-def test_constants_must_be_positive(name: str) -> None:
-    with pytest.raises(ConfigError, match=name):
-        IDMConstants(**{name: 0.0})

@@ -92,32 +92,6 @@ def test_penetration_is_rounded_to_whole_vehicles(size, penetration, count) -> N
     assert string.drawn == (0 < count < size)
 
 
-@pytest.mark.parametrize(
-    ("pattern", "words"),
-    [
-        ({"size": 0, "penetration": 0.1}, "size must be a whole number"),
-        ({"size": 2.5, "penetration": 0.1}, "size must be a whole number"),
-        ({"size": True, "penetration": 0.1}, "size must be a whole number"),
-        ({"size": 20_000, "penetration": 0.1}, "1…10000"),
-        ({"size": 5, "penetration": 1.2}, "penetration must lie in"),
-        ({"size": 5, "penetration": -0.1}, "penetration must lie in"),
-        ({"size": 5, "penetration": "half"}, "penetration must lie in"),
-        ({"size": 5}, "must be a pattern such as"),
-        ({"size": 5, "penetration": 0.1, "seed": 1}, "must be a pattern such as"),
-        (7, "must be a pattern such as"),
-        (None, "must be a pattern such as"),
-    ],
-)
-def test_what_is_no_string(pattern, words) -> None:
-    with pytest.raises(ConfigError, match=re.escape(words)):
-        parse_string(pattern)
-
-
-def test_only_two_roads() -> None:
-    with pytest.raises(ConfigError, match="road must be 'open' or 'ring', got 'circle'"):
-        parse_string("human", "circle")
-
-
 # A pattern as a tree: a role, or a sequence of trees; each with how often.
 names = st.sampled_from([A, H, "cacc", "x_1"])
 trees = st.recursive(

@@ -139,17 +139,6 @@ def test_with_nobody_behind_a_policy_believes_in_one_at_its_own_speed_and_gap(tm
     assert (seen.speed_behind, seen.gap_behind) == (seen.speed, seen.gap) == (10.0, 15.0)
 
 
-def test_who_only_watches_remembers_and_sets_nothing(tmp_path) -> None:
-    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
-    bridge = Bridge("follower_stopper", "own")
-    for _ in range(3):
-        bridge.command(execute=False)
-        libsumo.simulationStep()
-    history = bridge.driven["own"]["automated", "speed_history"].flatten()
-    assert (history > 0.0).sum() == 3
-    assert libsumo.vehicle.getSpeedMode("own") == 31
-
-
 def test_a_command_is_executed_beyond_what_sumo_thinks_safe(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
     hard = {"_target_": "lcc_rl.pieces.ConstantAcceleration", "acceleration": 3.0}
@@ -194,7 +183,6 @@ def test_a_policy_keeps_a_wave_from_growing(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("driver", "step", "expected"),
     [
-        ("pretrained/nobody", STEP, "no pretrained policy"),
         ("follow_stopper", STEP, "Did you mean 'follower_stopper'"),
         ("pretrained/ring-22", 0.5, "--step-length 0.1"),
         ({"_target_": "lcc_rl.pieces.CACC"}, STEP, "vehicles.gap_error, which is not measured"),

@@ -5,9 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import ACTION, small_env
-from torchrl.envs import check_env_specs
 
-from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.pieces import CBFFilter, Corrected, Correction
 from lcc_rl.pieces.rewards import TERMS
@@ -50,17 +48,6 @@ def test_a_shortest_time_gap_is_kept_where_braking_suffices() -> None:
     assert (without["time_gap"] < 1.0).double().mean() > 0.2
     assert (held["time_gap"][50:] < 1.19).double().mean() < 0.01
     assert held["time_gap"][50:].median() < 1.6  # it is a limit, not a longer gap
-
-
-@pytest.mark.parametrize("seconds", [0.0, -1.0, 2.5])
-def test_a_shortest_time_gap_lies_below_the_longest(seconds) -> None:
-    with pytest.raises(ConfigError, match="shortest_time_gap"):
-        CBFFilter(time_gap=2.45, shortest_time_gap=seconds)
-
-
-@pytest.mark.parametrize("variant", ["alcc", "reference", "idm"])
-def test_specs(variant) -> None:
-    check_env_specs(small_env(variant, 2, ["+filter=cbf"]))
 
 
 def test_every_automated_vehicle_of_a_string_is_filtered() -> None:

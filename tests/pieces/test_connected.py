@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 import torch
-from helpers import ACTION, POPULATION, REWARD, composed, network, string, wavy_profiles
+from helpers import POPULATION, composed, network, string, wavy_profiles
 from platoons import (
     A_MAX,
     ACTORS,
@@ -26,7 +24,6 @@ from platoons import (
     windows,
 )
 from tensordict import TensorDict
-from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
 from lcc_rl.agents.controller import ControllerPolicy
@@ -34,9 +31,8 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import reset_options
-from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.cacc import Gains
-from lcc_rl.pieces import CACC, HCFS, Communication, DeadBeat, parse_string
+from lcc_rl.pieces import CACC, HCFS, Communication, parse_string
 from lcc_rl.pieces.world import World
 
 # -- dead-beat -------------------------------------------------------------------------------------
@@ -104,11 +100,6 @@ def test_cacc_closes_its_gaps() -> None:
         end = env.rollout(400, tensordict=td, auto_reset=False)[:, -1]["next", "vehicles"]
     torch.testing.assert_close(end["gap"], torch.full((4, 6, 1), 5.0), atol=0.06, rtol=0)
     assert end["leader_speed_error"].abs().max() < 1e-3
-
-
-def test_unstable_gains_are_refused_by_the_controller() -> None:
-    with pytest.raises(ConfigError, match=r"kv = k2 \+ k4 = 2\.6 must be below 2"):
-        CACC(k2=1.3).bind(World(time_step=T))
 
 
 @pytest.mark.parametrize(
@@ -292,13 +283,6 @@ def test_switching_state_is_carried_by_the_tensordict() -> None:
     assert torch.equal(begun["hybrid", "switches"][1], data["next", "hybrid", "switches"][1, -1])
 
 
-def test_keeps_no_state_of_its_own() -> None:
-    tested = hcfs("random")
-    one, two = (play(ramps(), tested) for _ in range(2))
-    for name, value in one.items():
-        assert torch.equal(value, two[name]), name
-
-
 def test_any_two_controllers_make_a_hybrid() -> None:
     gains = composed("variant=cacc", "gains=paper_like").gains
     world = World(parse_string("automated*6"), T)
@@ -314,26 +298,6 @@ def test_the_hybrid_of_good_parents_is_about_as_good_as_the_better() -> None:
     good = Driver(("variant=ddpg",), Actor("good"))
     parents = [play(profiles, p)["reward"].sum() for p in (cacc(), good)]
     assert hybrid >= 1.1 * max(parents)  # rewards are negative: 10 %
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("deployed.lookahead=future", "'causal', 'hold' or 'oracle'"),
-        ("deployed.braking=9", "braking must be at most max_acceleration"),
-        ("deployed.mass=3", "unknown setting of deployed .* 'mass'"),
-        ("gains.k2=1.9", "unstable"),
-    ],
-)
-def test_impossible_controllers(override, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        build_env(deployed(composed("variant=hcfs", override)), ramps(), POPULATION, 1)
-
-
-def test_a_controller_that_remembers_is_no_policy() -> None:
-    world = World(parse_string("automated*2"), T)
-    with pytest.raises(ConfigError, match="HCFS remembers entries of its own"):
-        ControllerPolicy(HCFS(rule=CACC()).bind(world))
 
 
 def test_the_hybrid_brakes_where_what_it_measures_is_no_number() -> None:
@@ -359,38 +323,6 @@ def test_the_hybrid_brakes_where_what_it_measures_is_no_number() -> None:
 
 
 # -- any number of vehicles ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("vehicles", [1, 8, 100])
-@pytest.mark.parametrize("batch", [1, 512])
-def test_any_number_of_vehicles_and_any_batch(vehicles, batch) -> None:
-    profiles = repeated(ramps().select([1]), batch)
-    tested = Driver(("variant=hcfs",), network(composed("variant=hcfs")))
-    env = env_of(profiles, tested, vehicles, horizon=5)
-    td = env.rollout(5, tested.policy, break_when_any_done=False)
-    assert td[ACTION].shape == (batch, 5, vehicles, 1)
-    assert td["next", *REWARD].shape == (batch, 5, vehicles, 1)
-    assert torch.isfinite(td["next", *REWARD]).all()
-
-
-@pytest.mark.parametrize("vehicles", [1, 5])
-def test_specs(vehicles) -> None:
-    check_env_specs(env_of(ramps(), hcfs(), vehicles), break_when_any_done="both")
-
-
-def test_many_vehicles_cost_little_each() -> None:
-    spent = {}
-    for vehicles, batch in ((8, 1), (100, 512)):
-        tested = hcfs("good", "path")
-        env = env_of(repeated(ramps().select([1]), batch), tested, vehicles)
-        td, each = env.reset(), []
-        with torch.no_grad():
-            for _ in range(8):
-                begun = time.perf_counter()
-                td = step_mdp(env.step(tested.policy(td)))
-                each.append(time.perf_counter() - begun)
-        spent[vehicles] = min(each) / (vehicles * batch)
-    assert spent[100] <= spent[8] / 20
 
 
 # -- human drivers in between ----------------------------------------------------------------------
@@ -458,16 +390,6 @@ def test_cacc_in_a_mixed_string_obeys_the_law_by_hand() -> None:
     wanted = (change / T).clamp(-3.0, 3.0)
     found = data["next", "vehicles", "command"][..., 4, 0]
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
-
-
-def test_on_a_ring_a_chain_needs_a_leader() -> None:
-    with pytest.raises(ConfigError, match="a chain would have no leader"):
-        Communication().bind(World(parse_string("automated*3", "ring")))
-
-
-def test_no_oracle_behind_a_human_driver() -> None:
-    with pytest.raises(ConfigError, match="oracle knows the recorded leader only"):
-        DeadBeat(lookahead="oracle").bind(World(MIXED, T))
 
 
 # -- the headway and the safe cap ------------------------------------------------------------------

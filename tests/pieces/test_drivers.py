@@ -13,8 +13,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.functional.ovm import OVMConstants
-from lcc_rl.pieces import IDM, OVM, CalibratedDrivers
+from lcc_rl.pieces import CalibratedDrivers
 from lcc_rl.pieces.world import World
 
 MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
@@ -148,39 +147,6 @@ def test_calibrated_idm_drivers_are_those_of_the_idm() -> None:
     assert data["next", "vehicles", "speed"].isfinite().all()
     with pytest.raises(ConfigError, match=r"differ by driver.*=calibrated"):
         rolled(human("human"), population=bootstrap(mode="global"))
-
-
-@EACH
-def test_a_model_refuses_drivers_of_another_population(model) -> None:
-    with pytest.raises(ConfigError, match=r"fvdm, gipps, idm, ovm.*=calibrated"):
-        rolled(human(MODELS[model]), population=MIXED)
-    one = [f"scenario.controllers.human.{name}=20" for name in ("desired_speed", "time_gap")]
-    assert rolled(human(MODELS[model], *one), population=MIXED, steps=2).shape == (4, 2)
-
-
-@pytest.mark.parametrize(
-    ("controller", "override", "words"),
-    [
-        ("ovm", "scenario.controllers.human.parameters.sensitivity=0", "sensitivity"),
-        ("ovm", "+scenario.controllers.human.parameters.deceleration=1", "deceleration"),
-        ("gipps", "scenario.controllers.human.delay=-1", "delay"),
-        ("gipps", "scenario.controllers.human.delay=0.5", "delay"),
-        ("fvdm", "scenario.controllers.human.noise=1", "noise"),
-        ("fvdm", "scenario.controllers.human.time_gap=1", "belong together"),
-        ("calibrated", "scenario.controllers.human.wiener=-1", "wiener"),
-        ("calibrated", "+scenario.controllers.human.time_gap=1", "time_gap"),
-    ],
-)
-def test_bad_settings_end_in_one_clear_error(controller, override, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        rolled(human(controller, override))
-
-
-def test_parameters_of_another_model_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"parameters: expected IDMConstants, got OVMConstants"):
-        IDM(parameters=OVMConstants()).bind(World(population=POPULATION))
-    with pytest.raises(ConfigError, match=r"parameters: expected OVMConstants, got IDMConstants"):
-        OVM().bind(World(population=POPULATION))
 
 
 def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:

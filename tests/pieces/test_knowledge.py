@@ -8,8 +8,7 @@ import pytest
 import torch
 from helpers import ACTION, OBSERVATION, compose, network, small_env, steady, wavy_profiles
 
-from lcc_rl.errors import ConfigError
-from lcc_rl.pieces import LeaderPreview, Observation, ObservationMemory
+from lcc_rl.pieces import LeaderPreview
 from lcc_rl.pieces.world import World
 
 FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1")
@@ -116,33 +115,3 @@ def test_every_vehicle_of_a_string_remembers_what_it_saw() -> None:
     past, speed = data["memory", "entries"][0, ..., 0], data["vehicles", "speed"][0, ..., 0]
     assert torch.equal(past[5:, 1], speed[:-5, 1])
     assert torch.equal(past[5:, 0], data["leader", "speed"][0, :-5, 0])
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: LeaderPreview(horizons=[]), "horizons"),
-        (
-            lambda: ObservationMemory(seconds=[0.05]).bind(),
-            r"memory\.seconds must be at least a step of 0\.1 s, got 0\.05",
-        ),
-        (lambda: ObservationMemory(sources=[]), "sources"),
-        (
-            lambda: Observation(
-                scales={"self": {"gap": 1}}, relative_to={"ahead": "self.gap"}
-            ).bind(),
-            "to.ahead",
-        ),
-        (
-            lambda: Observation(
-                scales={"memory": {"entries": 1}},
-                widths={"memory": 3},
-                relative_to={"memory": ["self.gap", "self.speed"]},
-            ).bind(),
-            "2 entries do not divide its 3",
-        ),
-    ],
-)
-def test_impossible_settings(make, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        make()

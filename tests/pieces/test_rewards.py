@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import (
     CollisionPenalty,
     EfficiencyReward,
@@ -124,16 +123,5 @@ def test_who_pays_for_a_collision(hit, behind, pays) -> None:
     torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))
 
 
-def test_what_is_unknown_is_refused() -> None:
-    with pytest.raises(ConfigError, match="of must be 'self', 'behind' or 'string', got 'all'"):
-        EnergyReward(of="all")
-
-
 def test_sum() -> None:
     torch.testing.assert_close(TotalReward(terms=["a", "b"]).compute(t(1.0), t(-3.0)), t(-2.0))
-
-
-@pytest.mark.parametrize("settings", [{"margin": -1.0}, {"floor": 5.0}, {"weight": math.nan}])
-def test_impossible_settings(settings) -> None:
-    with pytest.raises(ConfigError):
-        SafetyReward(**settings)

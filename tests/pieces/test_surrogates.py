@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import SafetyReward, SmoothEfficiency, Smoothness, SmoothSafety
 
 
@@ -46,9 +45,3 @@ def test_efficiency_begins_at_its_threshold_and_leads_back() -> None:
 
 def test_smoothness_is_the_square_of_the_jerk() -> None:
     assert Smoothness(weight=0.5).bind().compute(torch.tensor([[2.0]])).item() == -2.0
-
-
-@pytest.mark.parametrize("setting", ["threshold", "width", "speed_floor"])
-def test_settings_must_be_positive(setting) -> None:
-    with pytest.raises(ConfigError, match=setting):
-        SmoothEfficiency(**{setting: 0.0})

@@ -11,10 +11,10 @@ import torch
 from helpers import composed, string
 from torch import Tensor
 
+from lcc_rl.config.nodes import build
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.nodes import build
 
 DRIVERS = (
     "drivers=fixed",

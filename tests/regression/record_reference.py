@@ -29,13 +29,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from lcc_rl import evaluate, train
 from lcc_rl.agents.actor import ConstantPolicy
+from lcc_rl.cli import evaluate, train
 from lcc_rl.config import load
+from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs.factory import build_agent, build_env, build_policy
 from lcc_rl.results.files import read_parquet
 from lcc_rl.results.policies import load_policy
-from lcc_rl.schemas import TrainConfig
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
 SHARED = "<shared>"  # stands for the folder of the real data in what is written

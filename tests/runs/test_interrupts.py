@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
+from lcc_rl.cli.entry import sweep
 from lcc_rl.errors import Interrupted
-from lcc_rl.runs.cli import sweep
 from lcc_rl.runs.interrupts import INTERRUPTED, interruptible, is_command, stop_signal
 
 IMPORTS = "import sys; sys.argv = ['-m']; import lcc_rl; print('on', flush=True); input()"

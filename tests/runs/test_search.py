@@ -115,8 +115,10 @@ def test_a_search_from_the_command_line_and_its_resumption(tmp_path) -> None:
     words = [*words, "~hydra.sweeper.params", "+hydra.sweeper.params={}"]
     words = [*words, "agent.gamma=interval(0.8,0.99)", "objective=total_path_energy_kj"]
     words = [*words, "hydra.sweeper.directions=[minimize]"]
-    run_command("lcc_rl.train", *words, "hydra.sweeper.n_trials=1", cwd=tmp_path, check=True)
-    done = run_command("lcc_rl.train", *words, "hydra.sweeper.n_trials=2", cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.train", *words, "hydra.sweeper.n_trials=1", cwd=tmp_path, check=True)
+    done = run_command(
+        "lcc_rl.cli.train", *words, "hydra.sweeper.n_trials=2", cwd=tmp_path, check=True
+    )
     folder = tmp_path / "outputs" / "train" / "search"
     best = yaml.safe_load((folder / "optimization_results.yaml").read_text())["best"]
     assert len(list(folder.glob("*/episodes.parquet"))) == 2

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console, Group
 
+from lcc_rl.cli.status import main, watch
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.runs.overview import counts, draw, headline, live, remaining
 from lcc_rl.runs.states import (
@@ -25,7 +26,6 @@ from lcc_rl.runs.states import (
     survey,
     working,
 )
-from lcc_rl.status import main, watch
 
 
 def test_a_claimed_folder_is_refused_to_others_and_free_afterwards(tmp_path) -> None:

@@ -17,11 +17,12 @@ from omegaconf import OmegaConf
 
 from lcc_rl import results
 from lcc_rl.agents.replay import Trainer
+from lcc_rl.cli import entry
 from lcc_rl.commands import training
 from lcc_rl.config import identity, load
+from lcc_rl.config.schemas import as_plain
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.runs import cli
 from lcc_rl.runs.states import ERROR, Busy, claim
 from lcc_rl.runs.sweeps import (
     Plan,
@@ -34,7 +35,6 @@ from lcc_rl.runs.sweeps import (
     run_name,
     sweep_name,
 )
-from lcc_rl.schemas import as_plain
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -133,7 +133,7 @@ def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) ->
         raise ValueError("No trials are completed yet.")
 
     with pytest.raises(LccError, match="1 of 1 runs failed"):
-        cli.sweep(command)
+        entry.sweep(command)
     assert SweepCallback.folder is None
 
 
@@ -192,7 +192,7 @@ SWEEP = ("experiment=smoke", "variant=idm", *DATA, HORIZON, "sweep=mine")
 
 
 def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path) -> None:
-    words = ["lcc_rl.train", "-m", *SWEEP, "scenario.controllers.automated.time_gap=1.2,-1"]
+    words = ["lcc_rl.cli.train", "-m", *SWEEP, "scenario.controllers.automated.time_gap=1.2,-1"]
     first = run_command(*words, cwd=tmp_path)
     assert first.returncode == 2, first.stderr
     assert "1 of 2 runs failed" in first.stderr
@@ -209,7 +209,7 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
 def on_terminal(cwd: Path, *words: str) -> str:
     """Do a sweep on a terminal and return what that showed."""
     ours, its = pty.openpty()
-    typed = [sys.executable, "-m", "lcc_rl.train", "-m", *words]
+    typed = [sys.executable, "-m", "lcc_rl.cli.train", "-m", *words]
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
     child = subprocess.Popen(typed, cwd=cwd, stdin=its, stdout=its, stderr=its, env=env)
     os.close(its)
@@ -247,7 +247,7 @@ def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher) -> None:
     words = ["-m", *small, "training.episodes=24", "variant=alcc,reference", "seed=0"]
     for name in ("basic", f"lcc_{launcher}"):
         where = [f"hydra/launcher={name}", f"hydra.sweep.dir={tmp_path / name}"]
-        subprocess.run([sys.executable, "-m", "lcc_rl.train", *words, *where], check=True)
+        subprocess.run([sys.executable, "-m", "lcc_rl.cli.train", *words, *where], check=True)
     for table in ("training", "episodes", "steps"):
         serial, other = (
             results.load(tmp_path / name, table) for name in ("basic", f"lcc_{launcher}")

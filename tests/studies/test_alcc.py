@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from lcc_rl.config.schemas import as_plain
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.schemas import as_plain
 from lcc_rl.studies.alcc import report, study
 from lcc_rl.studies.alcc.settings import PRECISE, followers_change, followers_study
 
@@ -24,8 +24,8 @@ def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> No
         assert cfg == main or cfg not in seen
         seen.append(cfg)
     quick = study.Study(tmp_path, "quickstart", 1)
-    change = study.ABLATIONS["recipe_paper_alcc"]
-    assert as_plain(quick.runs(tmp_path, change)[0].compose()) == main
+    found = quick.runs(tmp_path, study.ABLATIONS["recipe_paper_alcc"])[0].compose()
+    assert as_plain(found) == main
     single = study.Change(("split.profile=5",), recipes=("single_profile",))
     cfg = own.runs(tmp_path, single)[0].compose()
     assert (cfg.split["profile"], cfg.scenario.pieces["leader"]["start"]) == (5, "first")

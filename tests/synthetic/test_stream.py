@@ -13,6 +13,7 @@ import torch
 from helpers import MIXED, slow_but
 
 from lcc_rl.config import load
+from lcc_rl.config.nodes import build
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.statistics import compare_statistics, leader_statistics
@@ -21,7 +22,6 @@ from lcc_rl.drivers.population import bootstrap, fixed
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.io.files import read_parquet
-from lcc_rl.nodes import build
 from lcc_rl.synthetic.lane import Stream, draw_drivers
 from lcc_rl.synthetic.stop_and_go import StopAndGo, jumps, stratified_normal
 from lcc_rl.synthetic.stream import StreamSource, truth_path

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.commands import reproduce as tool
-from lcc_rl.runs.cli import main_guard
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from torchrl.envs.utils import step_mdp
 
 from benchmarks.harness import agree, stream
 from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.estimation import Belief, predict_and_update
@@ -26,7 +27,6 @@ from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.pieces.rewards import TOUCH
-from lcc_rl.schemas import StudyConfig
 
 State = dict[str, Tensor]
 Played = tuple[State, State, Tensor]  # the next state, what was written, the next observation

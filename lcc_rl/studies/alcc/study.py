@@ -12,10 +12,10 @@ import numpy as np
 from lcc_rl.commands import evaluation
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, root_key
 from lcc_rl.config import load
+from lcc_rl.config.schemas import PipelineConfig, StudyConfig
 from lcc_rl.data.episodes import read_episodes
 from lcc_rl.data.profiles import leader_profiles
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.schemas import PipelineConfig, StudyConfig
 from lcc_rl.studies.alcc.settings import (
     ABLATIONS,
     CONTROL,
@@ -93,7 +93,8 @@ def calibrate(study: Study) -> None:
 def _calibration(study: Study) -> PipelineConfig:
     skipped = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
     own = [item for item in study.overrides if root_key(item) not in skipped]
-    return load("pipeline", ["calibration=both", *own])
+    cfg: PipelineConfig = load("pipeline", ["calibration=both", *own])
+    return cfg
 
 
 def _main(study: Study, wanted: StudyConfig) -> list[Outcome]:

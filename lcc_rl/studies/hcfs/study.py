@@ -13,6 +13,7 @@ import pandas as pd
 from lcc_rl.commands.evaluation import evaluate_and_write
 from lcc_rl.commands.pipeline import known_settings, root_key
 from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
@@ -26,7 +27,6 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.schemas import StudyConfig
 from lcc_rl.studies.hcfs.tables import LEARNED, per_run, rounded
 from lcc_rl.studies.runner import (
     EPISODES,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from lcc_rl.config.nodes import TARGET, is_node
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
-from lcc_rl.nodes import TARGET, is_node
 
 NO_AGENT = ("agent=none", "agent=null")
 # Settings of an evaluation whose rows are episodes.

@@ -21,6 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.runs.interrupts import (
     BAD_INPUT,
@@ -32,7 +33,6 @@ from lcc_rl.runs.interrupts import (
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
-from lcc_rl.schemas import StudyConfig
 
 # OSError: a folder cannot be made, a disk is full, a file cannot be read.
 INPUT_ERRORS = (LccError, *HYDRA_ERRORS, OSError)

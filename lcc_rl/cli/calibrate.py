@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lcc_rl.runs.cli import entry_point, run_folder
-from lcc_rl.schemas import CalibrateConfig
+from lcc_rl.cli.entry import entry_point, run_folder
+from lcc_rl.config.schemas import CalibrateConfig
 
 
 @entry_point("calibrate", "lcc_rl.commands.calibration")

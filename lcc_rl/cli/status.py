@@ -9,8 +9,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from lcc_rl.cli.entry import main_guard
 from lcc_rl.errors import ConfigError
-from lcc_rl.runs.cli import main_guard
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.overview import counts, draw, headline, live, note, progress

@@ -19,11 +19,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from lcc_rl.config.nodes import TARGET, find_target, forget_places, settings_of, with_defaults
+from lcc_rl.config.schemas import KINDS, as_plain, parse_config
+from lcc_rl.config.unused import check_used
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
-from lcc_rl.nodes import TARGET, find_target, forget_places, settings_of, with_defaults
-from lcc_rl.schemas import KINDS, as_plain, parse_config
-from lcc_rl.unused import check_used
 
 CONF = "lcc_rl.conf"
 # Settings that do not change any row of a result.
@@ -74,7 +74,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
         overrides: what one would type after the command.
 
     Returns:
-        The typed tree, see :mod:`lcc_rl.schemas`.
+        The typed tree, see :mod:`lcc_rl.config.schemas`.
 
     Raises:
         ConfigError: if an override is unknown, of the wrong type or out of range.

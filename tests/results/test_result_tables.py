@@ -215,7 +215,7 @@ def test_units() -> None:
     assert per_distance(360.0, "Wh/km", as_fleet(ElectricCar())) == pytest.approx(100.0)
 
 
-MIXED = Fleet({"a": CirclesFuel(), "b": CirclesFuel("Class8Tractor")})
+MIXED = Fleet({"a": CirclesFuel(), "b": CirclesFuel(vehicle="Class8Tractor")})
 
 
 @pytest.mark.parametrize(

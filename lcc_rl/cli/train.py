@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 
+from lcc_rl.cli.entry import entry_point, resumed_folder
 from lcc_rl.config import is_sweep
-from lcc_rl.runs.cli import entry_point, resumed_folder
-from lcc_rl.schemas import TrainConfig
+from lcc_rl.config.schemas import TrainConfig
 
 log = logging.getLogger("lcc_rl")
 

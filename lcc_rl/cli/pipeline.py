@@ -6,11 +6,11 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 
+from lcc_rl.cli.entry import entry_point, root_key, run_folder
 from lcc_rl.config import load
+from lcc_rl.config.schemas import PipelineConfig
 from lcc_rl.errors import ConfigError
-from lcc_rl.runs.cli import entry_point, root_key, run_folder
 from lcc_rl.runs.console import headlines, tell
-from lcc_rl.schemas import PipelineConfig
 from lcc_rl.version import __version__
 
 

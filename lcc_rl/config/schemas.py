@@ -1,7 +1,7 @@
 """The typed tree of a configuration: its sections, with the types and ranges of their settings.
 
 Values stand in conf/. Nodes with a ``_target_`` (pieces, agents, data …) stay mappings until they
-are built; :mod:`lcc_rl.nodes` checks them and completes their defaults.
+are built; :mod:`lcc_rl.config.nodes` checks them and completes their defaults.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field
 
+from lcc_rl.config.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.errors import LAST_SEED, ConfigError
-from lcc_rl.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
 
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command

@@ -12,13 +12,13 @@ from lcc_rl.version import __version__
 # Name, module and what it does. Each module has a main: of the first four, which Hydra reads,
 # without arguments.
 HYDRA = {
-    "run": ("lcc_rl.pipeline", "the main job: data, drivers, policies, results, one page"),
-    "train": ("lcc_rl.train", "train a variant and evaluate it; -m for a sweep"),
-    "evaluate": ("lcc_rl.evaluate", "compare policies, controllers and baselines"),
-    "calibrate": ("lcc_rl.calibrate", "fit driver models to trajectories"),
+    "run": ("lcc_rl.cli.pipeline", "the main job: data, drivers, policies, results, one page"),
+    "train": ("lcc_rl.cli.train", "train a variant and evaluate it; -m for a sweep"),
+    "evaluate": ("lcc_rl.cli.evaluate", "compare policies, controllers and baselines"),
+    "calibrate": ("lcc_rl.cli.calibrate", "fit driver models to trajectories"),
 }
 TOOLS = {
-    "status": ("lcc_rl.status", "what runs are running, waiting, finished, failed"),
+    "status": ("lcc_rl.cli.status", "what runs are running, waiting, finished, failed"),
     "animate": ("lcc_rl.commands.animate", "an episode as a moving picture: page, GIF, MP4"),
     "reproduce": ("lcc_rl.commands.reproduce", "a paper's study, to one page"),
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
@@ -74,7 +74,7 @@ def _run(name: str, words: list[str]) -> None:
     elif name == "status":
         module.main(words)
     else:
-        from lcc_rl.runs.cli import main_guard
+        from lcc_rl.cli.entry import main_guard
 
         with interrupts.interruptible():
             sys.exit(main_guard(module.main)(words))

@@ -1,0 +1,1 @@
+"""The commands: what is typed, and the exit codes and messages of what goes wrong."""

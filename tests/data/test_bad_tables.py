@@ -1,0 +1,161 @@
+"""Tables that no reader accepts: each gives one line naming the file, the place and the reason."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from ngsim_text import OFFICIAL, cells, csv_text, native_text, pair, portal_text
+from table_text import long_table, openacc_text, pairs
+
+from lcc_rl.data.leaders import RecordLeaders
+from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.openacc import OpenAccSource
+from lcc_rl.data.sources import EpisodesSource, NgsimSource
+from lcc_rl.data.speed_records import COLUMNS, read_drives, read_speed_record
+from lcc_rl.data.table_source import TableSource
+from lcc_rl.errors import DataError
+
+BY_GAP = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
+STRETCH = {"a": {"to_s": 9.0}}
+READERS: dict[str, Callable[[str], object]] = {
+    "ngsim": lambda path: read_ngsim(path),
+    "source": lambda path: NgsimSource(path=path).load(),
+    "i-80": lambda path: read_ngsim(path, location="i-80"),
+    "table": lambda path: TableSource(path=path, columns={**BY_GAP, "position": "x"}).load(),
+    "episodes": lambda path: EpisodesSource(path=path).load(),
+    "openacc": lambda path: OpenAccSource(path=path).load(),
+    "drives": lambda path: read_drives(path, COLUMNS, 0.1),
+    "record": lambda path: read_speed_record(path),
+    "leaders": lambda path: RecordLeaders(path=path, training=STRETCH, held_out=STRETCH).load(
+        0.1, 9
+    ),
+}
+GOOD = csv_text(pair())
+TABLE = long_table()
+RECORD = "time_s,speed_mps\n"
+DRIVES = "drive,time_s,speed_mps\na,0,1\n"
+
+
+def ngsim(**change: object) -> str:
+    """A valid file but for one row: line 4."""
+    return csv_text([cells(7, 1), cells(7, 2), cells(7, 3, **change), cells(7, 4)])
+
+
+def change(frame: pd.DataFrame, row: int, **values: object) -> str:
+    changed = frame.astype(dict.fromkeys(values, object))
+    changed.loc[row, list(values)] = list(values.values())
+    return changed.to_csv(index=False)
+
+
+def table(row: int = 500, **values: object) -> str:
+    return change(TABLE, row, **values)
+
+
+def episodes(row: int, **values: object) -> str:
+    return change(pairs(2, 5), row, **values)
+
+
+def csv(frame: pd.DataFrame) -> str:
+    return frame.to_csv(index=False)
+
+
+# Reader, content of the file, what is said of it.
+BAD: list[tuple[str, str | bytes, str]] = [
+    # Files that are no tables.
+    ("ngsim", "", "is empty"),
+    ("ngsim", OFFICIAL + "\n", "has no rows"),
+    ("ngsim", "<!DOCTYPE html>\n<html>Not found</html>\n", "lacks the column Vehicle_ID"),
+    ("ngsim", bytes(range(256)) * 40, "is not UTF-8 text"),
+    ("ngsim", GOOD.encode("utf-16"), "is not UTF-8 text"),
+    ("ngsim", GOOD.encode() + b"7,1,\xe9" + b",1" * 15 + b"\n", "is not text"),
+    ("ngsim", gzip.compress(GOOD.encode())[:-20], "damaged or cut off"),
+    ("table", gzip.compress(csv(TABLE).encode())[:2000], "damaged or cut off"),
+    ("table", b"id,t,v,ahead,gap,x\n1,0,\xff,0,1,1\n", "is not text"),
+    ("table", b"id,t\r,v\n1,0,5\n", "empty, or names no columns"),
+    ("record", "", "not a readable table"),
+    # Columns and rows that are missing or twice.
+    ("ngsim", GOOD + "7,21,20,1113", "line 42 has 4 columns; expected 18"),
+    ("ngsim", native_text(pair()) + " 7 21 5\n", "line 41 has 3 columns; expected 18"),
+    ("ngsim", native_text([row[:17] for row in pair()]), "has 17 columns and no header"),
+    ("ngsim", GOOD.replace("v_Vel", "v_Velo"), "lacks the column v_Vel; .*'v_Velo'"),
+    ("ngsim", GOOD.replace("v_Width", "V LENGTH"), "has column 'v_Length' twice"),
+    ("ngsim", ngsim(Local_X='"18.0'), "line 4 .*quote|columns; expected 18"),
+    ("i-80", portal_text(pair(), "us-101"), r"'i-80'; .*found are us-101 \(40 rows\)"),
+    ("table", csv(TABLE.rename(columns={"v": "V"})), r"lacks the column v; .*is it 'V'.*columns="),
+    ("table", csv(pd.concat([TABLE, TABLE["v"]], axis=1)), "has column 'v' twice"),
+    ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n", "data row 1 has 5 columns; expected 6"),
+    ("table", csv(TABLE.iloc[:0]), "has a header but no rows"),
+    ("episodes", csv(pairs().drop(columns="leader_id")), "lacks the column leader_id.*data=table"),
+    ("openacc", openacc_text().replace("IVS2", "gap", 1), "lacks the column IVS2"),
+    ("openacc", csv(TABLE), "expected a native OpenACC file"),
+    ("record", "time,speed\n0,1\n1,1\n", "lacks the column time_s, speed_mps; .*leader.columns"),
+    ("record", RECORD, "holds 0 samples"),
+    # Cells that are blank, words, not finite or out of range.
+    ("ngsim", ngsim(v_Vel="abc"), "line 4, column 'v_Vel' holds 'abc'; expected a number"),
+    ("ngsim", ngsim(Local_Y="NaN"), "line 4, column 'Local_Y' holds nothing; expected a number"),
+    ("ngsim", ngsim(v_Acc="inf"), "line 4, column 'v_Acc' holds 'inf'"),
+    ("ngsim", ngsim(Space_Headway="9" * 40), "line 4, column 'Space_Headway' holds '9999"),
+    ("ngsim", ngsim(Vehicle_ID=""), "line 4, column 'Vehicle_ID' holds nothing; expected a whole"),
+    ("ngsim", ngsim(Vehicle_ID="7.5"), "column 'Vehicle_ID' holds '7.5'; expected a whole number"),
+    ("ngsim", ngsim(Vehicle_ID='"1,15"'), "line 4, column 'Vehicle_ID' holds '1,15'"),
+    ("ngsim", ngsim(Frame_ID="-1"), "line 4, column 'Frame_ID' holds '-1'"),
+    ("ngsim", ngsim(Lane_ID="70000"), "line 4, column 'Lane_ID' holds '70000'"),
+    ("ngsim", ngsim(v_Vel="x").replace("\n", "\n\n"), "line 7, column 'v_Vel' holds 'x'"),
+    ("table", table(v=""), "data row 501, column 'v' holds nothing; .* from 0 to 1e\\+12 m/s"),
+    ("table", table(v=1e20), r"data row 501, column 'v' holds '1e\+20'"),
+    ("table", table(gap="-inf"), "data row 501, column 'gap' holds '-inf'"),
+    ("table", table(gap=-1), "data row 501, column 'gap' holds '-1'"),
+    ("table", table(id=""), "data row 501, column 'id' is blank"),
+    ("episodes", episodes(6, gap_m=np.nan), "row 7, column 'gap_m' holds nothing"),
+    ("episodes", episodes(1, episode=4.5), "row 2, column 'episode' holds '4.5'"),
+    ("openacc", openacc_text().replace("430.5,", "430.5,-", 1), "row 6, column 'Speed1' holds '-"),
+    ("drives", DRIVES + ",0.1,1\n", "data row 2, column 'drive' is blank"),
+    ("record", RECORD + "0,1\n1,fast\n", "data row 2, column 'speed_mps' holds 'fast'"),
+    # Rows that contradict each other, and times.
+    ("table", table(t=9.9), "data row 501 and data row 500 differ, but are of one vehicle"),
+    ("table", table(t=9.91), r"data row 501 is 0\.01 s after the sample before it"),
+    ("table", table(1199, t=1e11), r"data row 1200 is 1e\+11 s after the first"),
+    ("table", csv(TABLE.assign(id=range(len(TABLE)))), "no vehicle has two samples"),
+    ("episodes", episodes(3, leader_id=8), "row 4, column 'leader_id' changes within an episode"),
+    ("episodes", episodes(2, time_s=0.05), "row 3, column 'time_s' is -0.05 s after"),
+    ("episodes", csv(pairs(2, 5).iloc[:6]), "row 6, column 'episode' is of one row"),
+    ("episodes", csv(pd.concat([pairs(), pairs()])), "row 601, column 'episode' begins again"),
+    ("openacc", openacc_text().replace("430.5,", "430.4,", 1), "differ, but are of one vehicle"),
+    ("drives", DRIVES + "a,0.1,1\na,0.2,1\na,0.7,1\n", "data row 4, .* is not evenly spaced"),
+    ("drives", DRIVES + "b,0,1\nb,0.1,1\n", "data row 1, .* is the only sample of its record"),
+    ("record", RECORD + "0,1\n0,1\n", "data row 2, column 'time_s' does not follow"),
+    ("leaders", RECORD + "0,1\n1,2\n2,1\n", r"covers 0–2 s, not the stretch 0–9 s"),
+    # Values that are implausible, and units.
+    ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),
+    ("source", csv_text(pair(range(200), v_Vel=400)), "holds 121.92 m/s .*max_speed=70"),
+    ("table", csv(TABLE.assign(t=1e3 * TABLE["t"])), "are 100 s apart; .*another unit"),
+    ("table", csv(TABLE.assign(v=3.6 * TABLE["v"])), "by their positions the vehicles drive"),
+    ("table", csv(TABLE.assign(x=-TABLE["x"])), "must grow in the direction of travel"),
+    ("drives", DRIVES + "a,0.1,1\na,0.2,9\n", r"data row 3 \(a\), .* changes by 80 m/s²"),
+    ("record", RECORD + "0,540\n1,540\n", r"data row 1 .* holds 540 m/s .*plausible\.max_speed"),
+    ("record", RECORD + "0,5\n500,5\n", "data row 2 .* is 500 s after the sample before it"),
+]
+
+
+@pytest.mark.parametrize(("reader", "content", "words"), BAD, ids=[x[2][:40] for x in BAD])
+def test_a_bad_table_gives_one_line(tmp_path: Path, reader: str, content, words: str) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(DataError, match=words) as caught:
+        READERS[reader](str(path))
+    assert "bad.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1 not really PAR1", None])
+@pytest.mark.parametrize("reader", ["table", "episodes", "record"])
+def test_a_damaged_parquet_file(tmp_path: Path, reader: str, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / "bad.parquet").write_bytes(content)
+    with pytest.raises(DataError, match=r"bad\.parquet: (not a readable table|no such file)"):
+        READERS[reader](str(tmp_path / "bad.parquet"))

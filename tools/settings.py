@@ -1,0 +1,101 @@
+"""Write docs/settings.md: every setting of every class, from the annotated fields themselves."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import pkgutil
+import re
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+from lcc_rl.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "settings.md"
+ROOMS = (
+    *("config.schemas", "agents", "pieces", "energy", "drivers", "data", "synthetic"),
+    "runs.loggers",
+)
+HEAD = """# Settings
+
+<!-- Written by `python tools/settings.py`; do not edit. -->
+
+A node of the configuration names its class by `_target_`; its other keys are the settings below.
+`lcc-rl train agent.gamma=0.95 reward.terms.safety.margin=0.5` sets two of them. A run's
+`config.yaml` holds the values of all settings. The files of `conf/` hold what differs from the
+defaults.
+"""
+
+
+def classes() -> Iterator[type[Settings]]:
+    """Yield the classes that have settings, room by room, each once."""
+    for room in ROOMS:
+        top = import_module(f"lcc_rl.{room}")
+        parts = pkgutil.walk_packages(getattr(top, "__path__", ()), f"{top.__name__}.")
+        for module in (top, *(import_module(part.name) for part in parts)):
+            for kind in vars(module).values():
+                own = inspect.isclass(kind) and kind.__module__ == module.__name__
+                if own and issubclass(kind, Settings):
+                    yield kind
+
+
+def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, type, default and meaning of each setting that a class itself declares."""
+    lines, _ = inspect.getsourcelines(kind)
+    (body,) = ast.parse("".join(lines)).body
+    assert isinstance(body, ast.ClassDef)
+    for node in body.body:
+        if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
+            value = "required" if node.value is None else default(ast.unparse(node.value))
+            yield ast.unparse(node.target), ast.unparse(node.annotation), value, said(lines, node)
+
+
+def default(source: str) -> str:
+    """Return a default without the words of dataclasses."""
+    return re.sub(r"^field\(default_factory=(?:lambda: )?(.*)\)$", r"\1", source)
+
+
+def said(lines: list[str], node: ast.AnnAssign) -> str:
+    """Return the comment of a setting: at its end, or in the lines above it."""
+    behind = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2].strip()
+    above: list[str] = []
+    place = node.lineno - 2
+    while lines[place].strip().startswith("# "):
+        above.insert(0, lines[place].strip().removeprefix("# "))
+        place -= 1
+    found = " ".join([*above, behind]).strip()
+    return "" if found.startswith("type: ") else found.partition("  # type:")[0]
+
+
+def page() -> str:
+    """Return the page: a section per class that declares settings."""
+    parts = [HEAD]
+    for kind in classes():
+        rows = list(settings(kind))
+        if not rows:
+            continue
+        bases = [base.__name__ for base in kind.__bases__ if issubclass(base, Settings)][:1]
+        also = (
+            f" It also has the settings of `{bases[0]}`." if bases not in ([], ["Settings"]) else ""
+        )
+        summary = (kind.__doc__ or "").partition("\n")[0]
+        parts.append(f"## {kind.__module__}.{kind.__name__}\n\n{summary}{also}\n")
+        table = ["| setting | type | default | |", "|---|---|---|---|"]
+        for name, kind_of, value, text in rows:
+            cells = (f"`{name}`", f"`{kind_of}`", f"`{value}`", text)
+            table.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        parts.append("\n".join(table) + "\n")
+    return "\n".join(parts)
+
+
+def main() -> int:
+    """Write the page."""
+    PAGE.write_text(page())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
