@@ -40,8 +40,8 @@ Keys of the environments' TensorDicts, at the root after a reset and under `"nex
 Shapes: `*B` batch of episodes, `N` vehicles of the string from front to back, `A` automated
 vehicles, `n` vehicles of the role, `k` a width that depends on settings; float32 unless said
 otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`. A *reset option* may be given to
-`env.reset(TensorDict({key: value}, env.batch_size))`; any other key is
-refused, unless a whole moment of an episode is given, of which the reset options count.
+`env.reset(TensorDict({key: value}, env.batch_size))`. Any other key is refused, unless a complete
+state of an episode is given; the reset options in it then apply.
 """
 
 

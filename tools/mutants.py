@@ -5,7 +5,7 @@
 
 tools/mutants.toml lists the faults. Each is applied to a copy of the tree, where the tests nearest
 to it run first and the whole suite only if these pass; --tests runs other tests instead of both.
-A test that fails without a fault, too, has caught nothing. The exit code is 1 if a fault survives.
+A test that also fails without a fault has caught nothing. The exit code is 1 if a fault survives.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from lcc_rl.cli.entry import main_guard
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
+from lcc_rl.config.schemas import as_plain
 from lcc_rl.data.leaders import stretch
 from lcc_rl.envs.inputs import string_of
 from lcc_rl.figures.drawing import in_words, legend_above, new_figure, save, style
@@ -59,9 +60,10 @@ def keep_ring(run: Path, path: Path) -> None:
 def figure_of_record() -> Figure:
     """Draw the speed record that platoons train on, and their test cases."""
     cfg = load("evaluate", ["variant=cacc"])
-    step, used = cfg.scenario.time_step, cfg.leader.training.udds
+    step, used = cfg.scenario.time_step, cfg.leader["training"]["udds"]
     leaders = build(cfg.leader, "leader").load(step, cfg.scenario.horizon, len(string_of(cfg)))
-    return record_figure(stretch(used.path, step, used.scale), used.from_s, leaders.cases)
+    record = stretch(used["path"], step, used["scale"])
+    return record_figure(record, used["from_s"], leaders.cases)
 
 
 def figure_of_limits(windows: pd.DataFrame) -> Figure:
@@ -92,7 +94,7 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
         where = ["--reference", str(reference / "tasks"), "--figures", str(figures)]
         fleets.main([task, *where])
     cfg = load("evaluate", ["task=ring-22"])
-    ring = space_time(read_parquet(reference / RING), SHOWN, cfg, every=1)
+    ring = space_time(read_parquet(reference / RING), SHOWN, as_plain(cfg), every=1)
     assert ring is not None
     save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
     drawn = {

@@ -64,7 +64,7 @@ DRIVERS = {
 
 
 def caption_of(trainings: Iterable[StudyConfig]) -> str:
-    """Say what the table shows, and what only the networks are held to.
+    """Return the caption of the table, with the limit that the networks are trained to keep.
 
     Args:
         trainings: configuration of each.

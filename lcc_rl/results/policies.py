@@ -79,11 +79,7 @@ def load_policy(
 
 
 def check_weights(weights: Any, path: Path) -> None:
-    """Check that weights are finite numbers by name.
-
-    Raises:
-        ResultsError: naming the file and the entry at fault.
-    """
+    """Check that weights are finite numbers by name; an error names the file and the entry."""
     if not isinstance(weights, dict) or not weights:
         raise ResultsError(f"{path}: weights are {type(weights).__name__}, expected named tensors")
     for name, value in weights.items():

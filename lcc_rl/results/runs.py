@@ -53,11 +53,7 @@ def check_folder(cfg: BaseConfig, folder: Path) -> None:
 
 
 def check_links(folder: Path) -> None:
-    """Refuse to resume in a folder that holds links: one of somebody else could lead anywhere.
-
-    Raises:
-        ResultsError: naming the link.
-    """
+    """Refuse to resume in a folder that holds links, which could lead anywhere."""
     link = next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None)
     if link is not None:
         raise ResultsError(f"{link}: a link, which may lead out of the folder; put the file there")
@@ -84,20 +80,12 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
 
 
 def stored_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration of a run to draw by, not to build from: it may name any module.
-
-    Raises:
-        ResultsError: if it is missing or damaged.
-    """
+    """Read the configuration of a run to draw by, not to build from: it may name any module."""
     return read_settings(folder / CONFIG)
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Read a stored configuration as plain containers.
-
-    Raises:
-        ResultsError: if it is damaged.
-    """
+    """Read a stored configuration as plain containers."""
     return parse_yaml(read_text(path), str(path))
 
 
@@ -118,15 +106,15 @@ def load(
 ) -> Rows:
     """Read one table of every run below a folder.
 
-    A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run.
-    So is said what shards of an evaluation are missing (``frame.attrs["missing"]``).
+    A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
+    and ``frame.attrs["missing"]`` the missing shards of an evaluation.
 
     Args:
         root: a run folder, or any folder above runs.
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
         strict: raise for a damaged run, or a missing shard, instead.
-        lazy: return a dataset of pyarrow, whose rows are read when asked: for tables that do not
-            fit into memory. Its columns of settings are those in which the runs differ.
+        lazy: return a pyarrow dataset, which reads rows when they are needed, for tables that do
+            not fit into memory. Its columns of settings are those in which the runs differ.
 
     Returns:
         The rows of all runs, in the order of their folders, with the column ``run`` and one
@@ -149,7 +137,9 @@ def load(
             if lazy:
                 parquet_metadata(path)
             else:
-                frames.append(_with_settings(read_parquet(path), settings))
+                frame = read_parquet(path)
+                new = {k: [v] * len(frame) for k, v in settings.items() if k not in frame.columns}
+                frames.append(pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1))
             found[path] = settings
         except ResultsError as error:
             if strict:
@@ -173,19 +163,13 @@ def load(
 
 
 def _settings(folder: Path) -> dict[str, Any]:
-    """Return the settings of a run by their dotted keys; none where it has no configuration."""
+    """Return the settings of a run by their dotted keys; none without a configuration."""
     config = folder / CONFIG
     return dict(flatten(read_settings(config))) if config.is_file() else {}
 
 
-def _with_settings(frame: pd.DataFrame, settings: Mapping[str, Any]) -> pd.DataFrame:
-    """Add settings as columns."""
-    new = {k: [v] * len(frame) for k, v in settings.items() if k not in frame.columns}
-    return pd.concat([frame, pd.DataFrame(new, index=frame.index)], axis=1)
-
-
 def _different(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return of every run its name and the settings in which not all runs agree."""
+    """Return the name of every run and the settings in which not all runs agree."""
     keys = dict.fromkeys(key for settings in runs for key in settings)
     kept = [k for k in keys if k == "run" or any(x.get(k) != runs[0].get(k) for x in runs)]
     found = [{key: settings.get(key) for key in kept} for settings in runs]
@@ -198,11 +182,7 @@ def _different(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say which shards of evaluations in several parts are missing.
-
-    Args:
-        runs: settings of every run by their dotted keys.
-    """
+    """Return a line for every evaluation, among runs' settings, that lacks some of its shards."""
     parts: dict[str, set[int]] = {}
     for settings in (x for x in runs if (x.get(SHARDS) or 1) > 1):
         others = {key: value for key, value in settings.items() if key not in (SHARD, "run")}
@@ -211,9 +191,9 @@ def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = []
     for key, present in parts.items():
         settings = json.loads(key)
-        gaps = [str(x) for x in range(settings[SHARDS]) if x not in present]
+        gaps = sorted(set(range(settings[SHARDS])) - present)
         if gaps:
-            which = ", ".join(gaps[:10]) + (", …" if len(gaps) > 10 else "")
+            which = ", ".join(map(str, gaps[:10])) + (", …" if len(gaps) > 10 else "")
             of = f"{len(gaps)} of {settings[SHARDS]} shards of variant {settings['variant']}"
             lines.append(f"{of} are missing: {SHARD}={which}")
     return lines

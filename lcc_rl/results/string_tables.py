@@ -18,12 +18,12 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
 
     Args:
         episodes: rows of one or more evaluations, one per strategy, run and follower.
-        case: name of the case; of ``"windows"`` the sums are means over the windows.
+        case: name of the case; the sums of ``"windows"`` are means over the windows.
 
     Returns:
-        One row per strategy. Sums run over followers and frames: Σ|e_v(i,0)| and its standard
-        deviation [m/s], Σ|jerk| and its standard deviation [m/s³], Σ reward with its 95 %
-        interval over seeds, switches and interventions, each the mean over seeds. Smallest gap and
+        One row per strategy. Sums run over followers and frames and are means over seeds:
+        Σ|e_v(i,0)| and its standard deviation [m/s], Σ|jerk| and its standard deviation [m/s³],
+        Σ reward with its 95 % interval over seeds, switches and interventions. Smallest gap and
         largest gap error [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share
         of frames driven by the learned policy are those of all seeds together.
 

@@ -49,7 +49,8 @@ def trusted(
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
     """Check that a stored configuration names no code outside :data:`REGISTRY`.
 
-    Building a node of it imports and calls what it names.
+    Building a node imports and calls what it names. Functions of the registry may write files;
+    only those that make a population may be named.
 
     Args:
         content: the configuration as plain containers.
@@ -57,37 +58,23 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
         trust: further modules that may be named, e.g. ``["mine"]``.
 
     Raises:
-        ResultsError: naming the target, or a reference instead of a value.
+        ResultsError: naming the target.
     """
     for key, _, value in settings_at(content):
-        if key.rpartition(".")[2] == TARGET and not is_registered(str(value), where, trust):
-            module = str(value).rpartition(".")[0]
+        module = str(value).rpartition(".")[0]
+        if key.rpartition(".")[2] != TARGET or module in trust:
+            continue
+        try:
+            found = find_target(str(value), where) if _within_registry(module) else None
+        except ConfigError as error:
+            raise ResultsError(f"{error}; of another release, or damaged") from error
+        # A module also holds what it imports, such as import_module.
+        home = str(getattr(found, "__module__", ""))
+        if not _within_registry(home) or not (inspect.isclass(found) or home == FUNCTIONS):
             raise ResultsError(
                 f"{where}: {key} names {value!r}, which is not part of lcc_rl; if you trust it, "
-                f"say trust=[{module}] (of lcc-rl export: --trust {module})"
+                f"add trust=[{module}] (to lcc-rl export: --trust {module})"
             )
-
-
-def is_registered(target: str, where: str, trust: Sequence[str] = ()) -> bool:
-    """Whether a target is defined in :data:`REGISTRY` or in a trusted module.
-
-    Functions of the registry may write files; only those that make a population may be named.
-
-    Raises:
-        ResultsError: if a module of the registry has no such target.
-    """
-    module = target.rpartition(".")[0]
-    if module in trust:
-        return True
-    if not _within_registry(module):
-        return False
-    # A module also holds what it imports, such as import_module.
-    try:
-        found = find_target(target, where)
-    except ConfigError as error:
-        raise ResultsError(f"{error}; of another release, or damaged") from error
-    home = str(getattr(found, "__module__", ""))
-    return _within_registry(home) and (inspect.isclass(found) or home == FUNCTIONS)
 
 
 def _within_registry(module: str) -> bool:

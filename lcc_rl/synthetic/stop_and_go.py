@@ -25,7 +25,7 @@ class StopAndGo(Settings):
     The default values are fitted to NGSIM I-80 by a differential evolution and a Nelder–Mead
     search (``tools/fit_stream.py`` at commit bb30b35): they minimise the distance between the
     leaders of the synthetic pairs and those of 264 real pairs in the mean and quantiles of
-    speed, acceleration and 30 s energy (see :mod:`lcc_rl.data.statistics`) and in the
+    speed, acceleration and 30 s energy and in the
     autocorrelation of acceleration, for platoons of four vehicles.
     """
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "a.png": figure,
     "error.txt": text,
     "config.yaml": lambda path: save_config(
-        load("train", ["trust=[" + "x," * 9_000 + "x]"]), path.parent
+        replace(load("train"), variant="x" * 20_000), path.parent
     ),
     "report.html": page,
 }

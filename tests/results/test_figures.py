@@ -20,13 +20,12 @@ from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.drivers.population import load_drivers
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import DataError
 from lcc_rl.evaluation.responses import responses
 from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.drawing import colour, in_file, save
-from lcc_rl.figures.leaders import figure_leaders, save_leaders
 from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
 from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
@@ -72,14 +71,6 @@ def drivers() -> pd.DataFrame:
     return pd.concat([load_drivers(mode=mode).head(6) for mode in ("local", "global")])
 
 
-def leaders(shift: float) -> pd.DataFrame:
-    time = 0.1 * np.arange(400)
-    speeds = {n: 5 + shift + 3 * np.sin(time / (1 + n)) for n in range(3)}
-    found = ({"episode": n, "time_s": time, "leader_speed_mps": x} for n, x in speeds.items())
-    return pd.concat(map(pd.DataFrame, found), ignore_index=True)
-
-
-SETS = {"real": leaders(0.0), "stream": leaders(1.0)}
 FIGURES = {
     "power_map": (alcc.power_map, ["kW", "speed [m/s]"]),
     "learning_curve": (lambda: learning_curve(training()), ["n = 2 seeds, 95 %"]),
@@ -112,10 +103,6 @@ FIGURES = {
         ["local\nn = 6", "global\nn = 6", "RMSPE [%]", "held at 1.5", "on a bound"],
     ),
     "joint": (lambda: joint_figure(drivers()), ["6 drivers (local calibration)", "correlation"]),
-    "leaders": (
-        lambda: figure_leaders(SETS),
-        ["leader energy in 30 s [kJ]", "real, 1,200 samples", "real: 3 of 3 leaders"],
-    ),
 }
 
 
@@ -131,12 +118,10 @@ def test_a_figure_draws_and_says_what_it_shows(name, tmp_path) -> None:
     assert b"<svg" in (tmp_path / f"{name}.svg").read_bytes()[:1000]
 
 
-def test_what_cannot_be_drawn_is_named(tmp_path) -> None:
+def test_what_cannot_be_drawn_is_named() -> None:
     for wrong, words in ((drivers().drop(columns="rmspe"), "rmspe"), (drivers()[:0], "no drivers")):
         with pytest.raises(DataError, match=words):
             calibration_figure(wrong)
-    with pytest.raises(ConfigError, match=r"ending must be one of.*png"):
-        save_leaders(SETS, tmp_path / "a.nonsense")
     assert in_file("pi_saturation ../x: y") == "pi_saturation_.._x__y"
 
 

@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 import torch
 from helpers import MIXED, slow_but
+from stream_statistics import compare_statistics, leader_statistics
 
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.statistics import compare_statistics, leader_statistics
 from lcc_rl.drivers.fit import fit
 from lcc_rl.drivers.population import bootstrap, fixed
 from lcc_rl.errors import ConfigError

@@ -26,6 +26,7 @@ CASES = {
     "case 2": ("Table V", 7, 8, 9),
     "case 3": ("Table VI", 10, 11, 12),
 }
+LIKE = "counterpart of the paper's Fig."
 RULES = ("cacc path", "cacc paper_like", "cacc tuned")
 HYBRIDS = ("hcfs", "hcfs oracle", "hcfs untuned")
 PARENTS = ("cacc tuned", LEARNED)
@@ -93,34 +94,20 @@ def _windows(made: Page, episodes: pd.DataFrame) -> None:
 
 
 def _case(made: Page, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
-    stem, (table, speeds, jerk, switching) = case.replace(" ", "_"), CASES[case]
+    stem, (table, speeds, jerk, who) = case.replace(" ", "_"), CASES[case]
     followers = int(steps[steps["case"] == case]["follower"].max())
     listed = [(stem, f"{case} ({table} of the paper)", case_table(episodes, case))]
     if case == "case 1":
         listed.append(("table_iv", "Table IV as printed, on another record", tables.printed()))
-    like = "counterpart of the paper's Fig. {}"
-    drawn = [
-        (
-            f"{stem}_velocities",
-            f"{case}: speeds; {like.format(speeds)}",
-            platoon.velocities(steps, case),
+    pictures = {
+        ("velocities", f"speeds; {LIKE} {speeds}"): platoon.velocities(steps, case),
+        ("jerk", f"jerk and its bound; {LIKE} {jerk}"): platoon.jerks(steps, case, 30.0),
+        ("switching_hcfs", f"who drives, hcfs; {LIKE} {who}"): platoon.switching(steps, case),
+        ("switching_hcfs_oracle", "who drives, hcfs oracle"): platoon.switching(
+            steps, case, "hcfs oracle"
         ),
-        (
-            f"{stem}_jerk",
-            f"{case}: jerk and its bound; {like.format(jerk)}",
-            platoon.jerks(steps, case, 30.0),
-        ),
-        (
-            f"{stem}_switching_hcfs",
-            f"{case}: who drives, hcfs; {like.format(switching)}",
-            platoon.switching(steps, case),
-        ),
-        (
-            f"{stem}_switching_hcfs_oracle",
-            f"{case}: who drives, hcfs oracle",
-            platoon.switching(steps, case, "hcfs oracle"),
-        ),
-    ]
+    }
+    drawn = [(f"{stem}_{name}", f"{case}: {x}", figure) for (name, x), figure in pictures.items()]
     text = f"""{followers} followers, 20 s. Sums run over all followers and frames and are means
         over trainings; the figures show the first training. The record is not the paper's, which
         is unpublished."""

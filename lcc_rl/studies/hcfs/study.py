@@ -112,10 +112,7 @@ def run(study: Study, command: str = "") -> list[Outcome]:
 
 
 def keep(folder: Path, trainings: Sequence[Path]) -> None:
-    """Write what the page is made of: a row per run, the cases over time, the learning curves.
-
-    Of the cases over time, those of the first training.
-    """
+    """Write the page's tables: a row per run, the first training's cases over time, and curves."""
     root = folder / "evaluation"
     seeds = [root / path.name for path in trainings]
     found = [read_parquet(path / EPISODES) for path in (root / BASELINES, *seeds)]

@@ -89,18 +89,12 @@ def win_rates(
     against: Sequence[str] | None = None,
     case: str = WINDOWS,
 ) -> pd.DataFrame:
-    """Compare a strategy with others on the same windows.
-
-    Args:
-        episodes: rows of one or more evaluations.
-        of: the strategy.
-        against: those it is compared with; all others by default.
-        case: name of the case.
+    """Compare the strategy ``of`` with others, all by default, on the same windows.
 
     Returns:
         One row per other strategy: share of windows [%] in which ``of`` earns more (a tie counts
-        half), mean difference of Σ reward, and that as a share of what the other loses [%], with
-        95 % intervals over windows and seeds. Trained strategies are compared seed by seed;
+        half), mean difference of Σ reward, and that difference as a share of the other's loss [%],
+        with 95 % intervals over windows and seeds. Trained strategies are compared seed by seed;
         ``seeds_ahead`` counts the seeds with a positive difference.
     """
     own = rewards(episodes, of, case)
@@ -113,20 +107,14 @@ def win_rates(
         shared = own.columns.intersection(other.columns)
         difference = own[shared] - other[shared]
         wins = (difference > 1e-6) + 0.5 * (difference.abs() <= 1e-6)
-        # Rewards are negative: what is saved of the loss.
+        row: dict[str, object] = {"strategy": of, "against": name}
+        row |= {"trainings": len(shared), "windows": len(difference)}
+        row |= intervals.crossed(wins).columns("wins_pct", 100.0)
+        row |= intervals.crossed(difference).columns("reward_gain")
+        # Rewards are negative: the share of the loss that is saved.
         gain = intervals.saving(-own[shared], -other[shared], paired=True)
-        rows.append(
-            {
-                "strategy": of,
-                "against": name,
-                "trainings": len(shared),
-                "windows": len(difference),
-                **intervals.crossed(wins).columns("wins_pct", 100.0),
-                **intervals.crossed(difference).columns("reward_gain"),
-                **gain.columns("gain_pct", 100.0),
-                "seeds_ahead": int((difference.mean() > 0).sum()),
-            }
-        )
+        row |= gain.columns("gain_pct", 100.0)
+        rows.append(row | {"seeds_ahead": int((difference.mean() > 0).sum())})
     return pd.DataFrame(rows)
 
 
@@ -176,8 +164,7 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     for name in like:
         row: dict[str, object] = {"strategy": NAMES[name]}
         for case, table in tables.items():
-            for end in ("", "_low", "_high"):
-                row[f"{case}{end}"] = table.at[name, f"reward{end}"]
+            row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in ("", "_low", "_high")}
         rows.append(row)
     for name, (*_, reward) in TABLE_IV.items():
         rows.append({"strategy": f"{name}, paper", "case 1": reward, "case 3": CASE_3[name]})
