@@ -186,7 +186,7 @@ def test_keep_never_overwrites(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"stream_truth\.parquet exists"):
         StreamSource(**SMALL, seed=1, keep=str(path)).load()
     assert not path.exists()
-    with pytest.raises(ConfigError, match=r"must name a \.csv or \.csv\.gz file, got 'a\.parquet'"):
+    with pytest.raises(ConfigError, match=r"keep .*csv.*got 'a\.parquet'"):
         StreamSource(keep="a.parquet")
 
 
