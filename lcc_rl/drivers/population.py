@@ -139,7 +139,6 @@ def bootstrap(
             the calibration [m/s]; None raises none. Time gaps stay.
 
     Raises:
-        ConfigError: if the mode is unknown or the speed not one that a driver can desire.
         DataError: if the table is not sound.
     """
     found = from_table(load_drivers(path, mode))
@@ -220,7 +219,6 @@ def kde(
         mode: see :func:`load_drivers`; globally calibrated drivers have five joint parameters.
 
     Raises:
-        ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
     require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
@@ -260,9 +258,6 @@ def fixed(
         acceleration: a [m/s²].
         deceleration: b [m/s²].
         min_gap: s0 [m].
-
-    Raises:
-        ConfigError: if a parameter is not one that a driver can have.
     """
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),

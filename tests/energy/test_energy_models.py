@@ -11,7 +11,6 @@ from scipy.interpolate import PchipInterpolator
 
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, PaperMotor
 from lcc_rl.energy.fuel import coefficients
-from lcc_rl.functional.power import motor_power
 
 POINTS = Path(__file__).parent / "circles_fuel_check_points.csv"
 MODELS: dict[str, EnergyModel] = {
@@ -104,13 +103,6 @@ def test_the_bridge_over_the_fuel_cut_is_narrow() -> None:
     exact = model.power(torch.full((301,), 20.0), near)
     assert exact.diff().abs().max() > 5e3
     assert smooth.diff().abs().max() < 0.1 * exact.diff().abs().max()
-
-
-def test_the_motor_of_the_paper_is_unchanged() -> None:
-    speed, acceleration = torch.rand(2, 100).mul(20.0)
-    torch.testing.assert_close(
-        PaperMotor().power(speed, acceleration), motor_power(speed, acceleration), rtol=0, atol=0
-    )
 
 
 def shipped_cycle(name: str) -> torch.Tensor:
