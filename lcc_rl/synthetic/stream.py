@@ -68,12 +68,12 @@ class StreamSource(Settings):
         low, high = self.duration_s
         if low > high:
             raise ConfigError(f"data.duration_s must be a range, got {low:g} to {high:g} s")
-        count = self.recordings * self.platoons * self.vehicles
-        size = f"data: recordings × platoons × vehicles = {count}, up to {high:g} s each,"
-        require_memory({size: count * high / FRAME * SAMPLE})
 
     def generate(self) -> Stream:
         """Simulate all recordings."""
+        count, longest = self.recordings * self.platoons * self.vehicles, self.duration_s[1]
+        size = f"data: recordings × platoons × vehicles = {count}, up to {longest:g} s each,"
+        require_memory({size: count * longest / FRAME * SAMPLE})
         made = [
             self.drive(recording_name(index), np.random.default_rng([self.seed, index]))
             for index in range(self.recordings)
