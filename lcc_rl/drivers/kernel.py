@@ -94,8 +94,9 @@ def compiled(dtype: str) -> Callable[..., None]:
     """Return :func:`squared_errors` for one precision; numba compiles it at its first call.
 
     numba keeps the machine code beside this file or, where that is read-only, in the user's cache
-    folder (``NUMBA_CACHE_DIR``). Each precision is a function of its own name: processes that
-    compile at the same time would mix up the files of one.
+    folder (``NUMBA_CACHE_DIR``). If it cannot be kept or read, the function is compiled for this
+    process. Each precision is a function of its own name: processes that compile at the same time
+    would mix up the files of one.
 
     Args:
         dtype: name of the precision, ``float32`` or ``float64``.
@@ -104,8 +105,20 @@ def compiled(dtype: str) -> Callable[..., None]:
     function = FunctionType(squared_errors.__code__, squared_errors.__globals__, name)
     # Sums may be fused with products; nothing else is changed for speed.
     compile_it = partial(numba.njit, fastmath={"contract"}, error_model="numpy", nogil=True)
+    uncached = compile_it()(function)
     try:
-        return compile_it(cache=True)(function)
+        chosen = compile_it(cache=True)(function)
     except RuntimeError as error:  # there is no place for the code
         log.info("compiling the drivers' simulation for this run only: %s", error)
-        return compile_it()(function)
+        return uncached
+
+    def call(*arguments: Any) -> None:
+        nonlocal chosen
+        try:
+            chosen(*arguments)
+        except Exception as error:  # a damaged file raises whatever unpickling it meets
+            log.info("compiling the drivers' simulation for this run only: %r", error)
+            chosen = uncached
+            chosen(*arguments)
+
+    return call

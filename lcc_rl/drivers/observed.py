@@ -28,6 +28,14 @@ class Selection(Settings):
     # Slower episodes are dropped: the relative error divides by speed [m/s].
     min_mean_speed_mps: NonNegative = 0.5
 
+    def __post_init__(self) -> None:
+        longest = self.max_duration_s
+        if longest is not None and longest < self.min_duration_s:
+            raise ValueError(
+                f"max_duration_s={longest:g} must not be below min_duration_s="
+                f"{self.min_duration_s:g}"
+            )
+
 
 @dataclass(frozen=True)
 class Observed:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.drivers.parameters import (
@@ -23,13 +24,11 @@ from lcc_rl.drivers.parameters import (
     users,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of
-from lcc_rl.errors import (
-    ConfigError,
-    DataError,
-)
+from lcc_rl.errors import LAST_SEED, ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.memory import require_memory
+from lcc_rl.settings import Count, Positive, checked
 
 DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, and its name
 
@@ -127,8 +126,9 @@ class DriverPopulation:
         }
 
 
+@checked
 def bootstrap(
-    path: str | Path | None = None, mode: str | None = None, least_speed: float | None = None
+    path: str | Path | None = None, mode: str | None = None, least_speed: Positive | None = None
 ) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
 
@@ -200,11 +200,12 @@ def _flags(table: pd.DataFrame) -> Tensor:
     return torch.tensor(at_bound(values, DEFAULT_BOUNDS["desired_speed"]))
 
 
+@checked
 def kde(
     path: str | Path | None = None,
-    drivers: int = 1000,
-    seed: int = 0,
-    bandwidth: float | None = None,
+    drivers: Count = 1000,
+    seed: Annotated[int, Field(ge=0, le=LAST_SEED)] = 0,
+    bandwidth: Positive | None = None,
     bounds: Mapping[str, Any] | None = None,
     mode: str | None = None,
 ) -> DriverPopulation:
@@ -243,6 +244,7 @@ def kde(
     return from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
 
 
+@checked
 def fixed(
     desired_speed: float = 25.0,
     time_gap: float = 1.2,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 from helpers import slow_but
 
+from lcc_rl.drivers import kernel
 from lcc_rl.drivers.calibrator import Calibration, Calibrator, Constants
 from lcc_rl.drivers.fit_error import FitError
 from lcc_rl.drivers.genetic import GeneticSettings
@@ -88,6 +90,27 @@ def test_errors_are_those_of_the_plain_simulation(model, more, compiled, uneven_
         error = FitError(observed, constants, names, model, objective)
         error.compiled = compiled
         torch.testing.assert_close(error(candidates), values, rtol=1e-9, atol=1e-9)
+
+
+def test_a_cache_that_cannot_be_read_costs_a_compilation_and_no_result(
+    uneven_lengths, monkeypatch, caplog
+):
+    def damaged(*arguments):
+        raise EOFError("Ran out of input")
+
+    def njit(cache=False, **how):
+        return (lambda function: damaged) if cache else numba_njit(**how)
+
+    numba_njit = kernel.numba.njit
+    observed, candidates = observe(uneven_lengths), random_candidates("idm", 3, 6)
+    error = FitError(observed, LAWS["idm"].constants(), fitted("global", "idm"))
+    expected = error(candidates)
+    monkeypatch.setattr(kernel.numba, "njit", njit)
+    monkeypatch.setattr(kernel, "compiled", cache(kernel.compiled.__wrapped__))
+    with caplog.at_level("INFO", logger="lcc_rl"):
+        for _ in range(2):
+            assert torch.equal(error(candidates), expected)
+    assert caplog.text.count("for this run only") == 1
 
 
 @EACH
@@ -254,6 +277,7 @@ def test_bad_tables_end_in_one_clear_error(change, message, uneven_lengths):
         ({"bounds": {"time_gap": [0.0, 1.0]}}, "time_gap"),
         ({"model": "ovm", "constants": Constants(acceleration=1.0)}, "acceleration"),
         ({"selection": {"min_gap_m": -1.0}}, "min_gap_m"),
+        ({"selection": {"max_duration_s": 5.0}}, "max_duration_s"),
         ({"local_genetic": {"population": 3}}, "population"),
     ],
 )

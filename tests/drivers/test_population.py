@@ -162,6 +162,8 @@ def test_missing_and_damaged_files_are_named(tmp_path):
         (lambda: fixed(time_gap=np.inf), "time_gap"),
         (lambda: fixed(min_gap=0.0), "min_gap"),
         (lambda: replace(fixed(), ids=()), "no drivers"),
+        (lambda: kde(bandwidth=-1.0), "bandwidth"),
+        (lambda: kde(drivers=0), "drivers"),
     ],
 )
 def test_no_driver_is_like_that(call, name):
