@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
-from study_frames import episodes, training
+from study_frames import episodes, training, windows
 
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
@@ -31,6 +31,7 @@ from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.figures.training import learning_curve, training_figure
 from lcc_rl.io.files import write_parquet
+from lcc_rl.results.means import Means
 from lcc_rl.results.policies import load_policy
 from lcc_rl.studies.alcc import figures as alcc
 
@@ -64,7 +65,7 @@ def steps() -> pd.DataFrame:
 
 
 def parts(column: str, *values: object, **size: int) -> pd.DataFrame:
-    return pd.concat([episodes(**size).assign(**{column: value}) for value in values])
+    return pd.concat([windows(**size).assign(**{column: value}) for value in values])
 
 
 def drivers() -> pd.DataFrame:
@@ -77,16 +78,16 @@ FIGURES = {
     "reward_terms": (lambda: alcc.reward_terms(training()), ["HDV energy", "n = 2 seeds"]),
     "sample_episode": (lambda: run_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
     "human_energy": (
-        lambda: run_figures.human_energy(episodes(), "reference"),
+        lambda: run_figures.human_energy(Means.of(episodes()), "reference"),
         ["n = 3 drivers", "+17.5 %", "kJ"],
     ),
     "improvement": (
-        lambda: run_figures.paired_improvement(episodes(), "alcc", "reference"),
-        ["1 of 3 drivers", "33 % of (window, driver) pairs", "over windows and seeds"],
+        lambda: run_figures.paired_improvement(Means.of(episodes()), "alcc", "reference"),
+        ["1 of 3 drivers", "over windows and seeds"],
     ),
     "distributions": (lambda: alcc.distributions(episodes()), ["n = 3 drivers", "75.0"]),
     "generalization": (
-        lambda: alcc.generalization_figure(episodes()),
+        lambda: alcc.generalization_figure(windows()),
         ["paper, 4 profiles", "n = 2", "mean of 2 seeds", "human driver"],
     ),
     "ablations": (
@@ -129,9 +130,9 @@ def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
     frame = episodes()
     frame = frame[(frame["training_seed"] != 1).fillna(True) & (frame["profile_id"] == 0)]
     for figure in (
-        run_figures.paired_improvement(frame, "alcc", "reference"),
-        run_figures.human_energy(frame, "alcc"),
-        alcc.generalization_figure(frame),
+        run_figures.paired_improvement(Means.of(frame), "alcc", "reference"),
+        run_figures.human_energy(Means.of(frame), "alcc"),
+        alcc.generalization_figure(Means.of(frame).windows),
     ):
         assert "1 training seed" in (found := texts(figure)) or "1 seed" in found
         assert "95 %" not in found
@@ -167,7 +168,8 @@ def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tm
     for axis in figure.axes:  # the legend covers no data
         assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0
     image = pixels(
-        run_figures.paired_improvement(episodes(), "alcc", "reference"), tmp_path / "y.png"
+        run_figures.paired_improvement(Means.of(episodes()), "alcc", "reference"),
+        tmp_path / "y.png",
     )
     assert count(image, colour("alcc"), 0.8) > 300
     assert count(image, colour("reference"), 0.45) > 50
