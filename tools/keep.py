@@ -20,7 +20,7 @@ from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.means import EPISODES, TRAINED, Means
 from lcc_rl.studies.alcc.report import CURVES, MAIN
-from lcc_rl.studies.alcc.settings import DRIVERS
+from lcc_rl.studies.alcc.study import DRIVERS
 from lcc_rl.studies.hcfs.study import STEPS, TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
 

@@ -94,11 +94,6 @@ FIGURES = {
         lambda: alcc.comparison_figure(parts("ablation", "none", "no_safety")),
         ["no safety", "n = 2 seeds"],
     ),
-    "followers": (lambda: alcc.followers_figure(parts("followers", 1, 5)), ["2 seeds"]),
-    "single": (
-        lambda: alcc.single_profile_figure(parts("study_profile", 3, 12, profiles=1)),
-        ["profile 12", "idm", "kJ"],
-    ),
     "calibration": (
         lambda: calibration_figure(drivers()),
         ["local\nn = 6", "global\nn = 6", "RMSPE [%]", "held at 1.5", "on a bound"],

@@ -170,14 +170,3 @@ def test_ablations_are_compared_with_the_humans_of_their_own_scenario() -> None:
     assert (one["rms_jerk_mps3"], one["worst_seed_rms_jerk_mps3"]) == (1.5, 2.0)
     assert one["worst_seed_path_energy_kj"] > one["path_energy_kj"]
     assert np.isnan(table.loc[("none", "reference"), "path_saving_against_reference_pct"])
-
-
-def test_single_profile_counts_seeds_that_beat_the_human() -> None:
-    frame = windows(profiles=1).assign(study_profile=7)
-    cars = frame["strategy"].eq("reference") & frame["training_seed"].eq(1).fillna(False)
-    frame.loc[cars, "total_energy_kj"] = 500.0
-    row = alcc_tables.single_profile(frame).iloc[0]
-    assert row["profile"] == "7"
-    assert row["idm_energy_kj"] == pytest.approx(152.0)
-    assert row["reference_seeds_below_idm"] == "1 of 2"
-    assert row["alcc_seeds_below_idm"] == "2 of 2"

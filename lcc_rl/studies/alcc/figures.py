@@ -25,7 +25,7 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.training import draw_curves
 from lcc_rl.functional.power import motor_power
-from lcc_rl.results.savings import UNTRAINED, by_driver, per_seed, savings
+from lcc_rl.results.savings import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 from lcc_rl.studies.alcc.tables import comparison
 
@@ -188,21 +188,20 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
             axis.annotate(f"{value:+.0f} % {mark}", (place, end), va=side, **look)
 
 
-def comparison_figure(windows: pd.DataFrame, by: str = "ablation") -> Figure:
+def comparison_figure(windows: pd.DataFrame) -> Figure:
     """Energy, safety and efficiency under each change of the study (no counterpart).
 
     Args:
         windows: rows of the evaluations; those of the study itself come first.
-        by: the column that names the change.
     """
-    table = comparison(windows, by)
-    names, strategies = (list(dict.fromkeys(table[name])) for name in (by, "strategy"))
+    table = comparison(windows)
+    names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
     figure = new_figure(10.0, 1.3 + 0.42 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
             part, hue = table[table["strategy"] == strategy], colour(strategy)
-            rows = [names.index(name) + offset for name in part[by]]
+            rows = [names.index(name) + offset for name in part["ablation"]]
             whiskers(axis, rows, part, column, hue)
             axis.plot(part[column], rows, "o", color=hue, ms=5, label=in_words(strategy))
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
@@ -215,69 +214,6 @@ def comparison_figure(windows: pd.DataFrame, by: str = "ablation") -> Figure:
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
     seeds = _how_many(table["seeds"])
     footnote(figure, f"n = {seeds}; lines: 95 % interval; dashed: the study's limit")
-    return figure
-
-
-def followers_figure(windows: pd.DataFrame) -> Figure:
-    """Energy saved against the number of human drivers behind (no counterpart).
-
-    Args:
-        windows: rows of the evaluations of all trained strategies, with the column
-            ``followers``.
-    """
-    table = comparison(windows, "followers")
-    table = table[table["strategy"] != "reference"]
-    column = "path_saving_against_reference_pct"
-    figure = new_figure(6.5, 3.8)
-    axis = figure.subplots()
-    names = list(dict.fromkeys(table["strategy"]))
-    for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
-        part = table[table["strategy"] == name]
-        label = f"{in_words(name)}, {_how_many(part['seeds'])}"
-        places = part["followers"].to_numpy(float) + offset
-        axis.plot(places, part[column], "o-", color=colour(name), label=label)
-        whiskers(axis, places, part, column, colour(name), upright=True)
-    axis.axhline(0.0, color=INK, lw=0.8)
-    legend_above(axis)
-    words = "path energy saved\nagainst reference [%]"
-    style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
-    return figure
-
-
-def single_profile_figure(windows: pd.DataFrame) -> Figure:
-    """Total energy of every seed trained and evaluated on one profile (no counterpart).
-
-    Args:
-        windows: rows of the evaluations, with the column ``study_profile``.
-    """
-    groups = dict(iter(windows.groupby("study_profile", sort=True)))
-    figure = new_figure(max(7.5, 1.8 + 1.9 * len(groups)), 4.2)
-    axis = figure.subplots()
-    labels, legend = [], {}
-    for place, (profile, part) in enumerate(groups.items()):
-        energy = per_seed(part, "total_energy_kj")
-        human, hue = float(energy["idm"].mean()), colour("idm")
-        axis.hlines(human, place - 0.36, place + 0.36, color=hue, lw=2.5)
-        legend["idm (human driver)"] = axis.plot([], [], "-", color=hue)[0]
-        learned = sorted((name for name in energy if name not in UNTRAINED), reverse=True)
-        for number, strategy in enumerate(learned):
-            values, hue = energy[strategy].to_numpy(float), colour(strategy)
-            centre = place - 0.16 + 0.32 * number
-            jitter = centre + _abreast(len(values), 0.1)
-            axis.plot(jitter, values, "o", color=hue, ms=5, alpha=0.6, mew=0)
-            axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=hue, lw=2)
-            legend[f"{in_words(strategy)}: seeds and mean"] = axis.plot([], [], "o", color=hue)[0]
-        label = f"profile {profile!s}\n"
-        if {"alcc", "reference"} <= set(energy):
-            # Not a percentage: in a jam a profile's energy can be near zero.
-            gain = energy["alcc"].mean() - energy["reference"].mean()
-            label += f"alcc {gain:+.1f} kJ\nagainst reference"
-        labels.append(label)
-    axis.set_xticks(range(len(groups)), labels, fontsize=9)
-    axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-    style(axis, "profile used for training and evaluation", "total energy [kJ per episode]")
-    look: dict[str, Any] = {"loc": "outside upper center", "frameon": False, "ncols": 3}
-    figure.legend(legend.values(), legend.keys(), **look)
     return figure
 
 

@@ -157,12 +157,11 @@ def learning(training: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def comparison(windows: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
+def comparison(windows: pd.DataFrame) -> pd.DataFrame:
     """Compare each change of the study with the baselines of its own scenario.
 
     Args:
-        windows: of the evaluations.
-        by: the column that names the change.
+        windows: of the evaluations, with the column ``ablation``, which names the change.
 
     Returns:
         One row per change and trained strategy: path energy [kJ], its savings against each of
@@ -171,11 +170,15 @@ def comparison(windows: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
     """
     baselines = [name for name in COMPARED if (windows["strategy"] == name).any()]
     rows = []
-    for change, part in windows.groupby(by, sort=False):
+    for change, part in windows.groupby("ablation", sort=False):
         learned = {x: y for x, y in per_seed(part, PATH).items() if x not in UNTRAINED}
         for strategy, energy in learned.items():
             own = part[part["strategy"] == strategy]
-            row: dict[str, object] = {by: change, "strategy": strategy, "seeds": _seeds(own)}
+            row: dict[str, object] = {
+                "ablation": change,
+                "strategy": strategy,
+                "seeds": _seeds(own),
+            }
             row |= mean(energy).columns("path_energy_kj")
             row["worst_seed_path_energy_kj"] = energy.max()
             for baseline in baselines:
@@ -196,43 +199,19 @@ def series(windows: pd.DataFrame) -> pd.DataFrame:
     """Savings of the total energy as drawn, the paper's measure, by the series of trainings.
 
     Args:
-        windows: of the evaluations, with the column ``training``, the series' name.
+        windows: of the evaluations, with the column ``ablation``, the series' name.
 
     Returns:
         One row per series: its trainings of ``alcc``, the share that they save against the
         reference and against ``idm``, and the control ``own_energy`` against the reference [%].
     """
     rows = []
-    for name, part in windows.groupby("training", sort=False):
+    for name, part in windows.groupby("ablation", sort=False):
         seeds = _seeds(part[part["strategy"] == "alcc"])
         row: dict[str, object] = {"training": name, "seeds": seeds}
         compared = (("alcc", "reference"), ("alcc", "idm"), ("own_energy", "reference"))
         for strategy, baseline in compared:
             found = savings(part, "total_energy_kj", strategy, baseline)
             row |= found.columns(f"{strategy}_against_{baseline}_pct", 100.0)
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def single_profile(windows: pd.DataFrame) -> pd.DataFrame:
-    """One profile for both training and evaluation, one row per ``study_profile``.
-
-    Total energy as drawn [kJ], the paper's measure, of ``idm``, ``reference`` and ``alcc``, the
-    saving of ``alcc`` against both, also of path energy [%], and how many seeds beat the human.
-    """
-    rows = []
-    for profile, part in windows.groupby("study_profile", sort=True):
-        energy = per_seed(part, "total_energy_kj")
-        human, seeds = energy["idm"].mean(), _seeds(part[part["strategy"] == "alcc"])
-        row: dict[str, object] = {"profile": str(profile), "seeds": seeds, "idm_energy_kj": human}
-        for strategy in (name for name in ("reference", "alcc") if name in energy):
-            row |= mean(energy[strategy]).columns(f"{strategy}_energy_kj")
-            better = int((energy[strategy] < human).sum())
-            row[f"{strategy}_seeds_below_idm"] = f"{better} of {len(energy[strategy])}"
-        for baseline in ("reference", "idm"):
-            for kind, column in KINDS.items():
-                found = savings(part, f"total_{column}", "alcc", baseline)
-                row |= found.columns(f"alcc_{kind}saving_against_{baseline}_pct", 100.0)
-        row["collisions"] = int(part.loc[part["training_seed"].notna(), "collisions"].sum())
         rows.append(row)
     return pd.DataFrame(rows)
