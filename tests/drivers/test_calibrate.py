@@ -10,7 +10,6 @@ from commands import run_command
 from helpers import slow_but
 from rich.console import Console
 
-from lcc_rl.cli.entry import main_guard
 from lcc_rl.commands import calibration
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
@@ -88,31 +87,6 @@ def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, err
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("raised", "code", "text"),
-    [
-        (DataError("a.csv: row 3:\n  bad"), 2, "lcc_rl: error: a.csv: row 3: bad\n"),
-        (OSError(28, "No space left on device"), 2, "No space left on device"),
-        (KeyboardInterrupt(), 130, "lcc_rl: interrupted\n"),
-    ],
-)
-def test_guard_prints_one_line(raised, code, text, capsys):
-    def fail():
-        raise raised
-
-    with pytest.raises(SystemExit) as stop:
-        main_guard(fail)()
-    assert stop.value.code == code
-    shown = capsys.readouterr().err
-    assert text in shown
-    assert shown.count("\n") == 1
-
-
-def test_guard_lets_bugs_through():
-    with pytest.raises(ZeroDivisionError):
-        main_guard(lambda: 1 / 0)()
-
-
 @pytest.fixture
 def command(source):
     """Function that runs the command in the folder of the episode file."""
@@ -129,10 +103,3 @@ def test_command_writes_into_the_run_folder(source, command):
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
     assert "v0 on a bound" in done.stdout
-
-
-def test_command_ends_bad_input_with_one_line_and_code_two(command):
-    done = command("data=episodes", "data.path=/no/such")
-    assert done.returncode == 2
-    assert "/no/such: no such file" in done.stderr
-    assert done.stderr.count("\n") == 1

@@ -91,13 +91,6 @@ def test_kde_resembles_the_drivers_within_the_bounds():
     assert not torch.equal(drawn.desired_speed, kde(drivers=5000, seed=2).desired_speed)
 
 
-def test_kde_clips_to_given_bounds_and_draws_all_free_parameters():
-    drawn = kde(drivers=50, bounds={"time_gap": [1.0, 1.5]}, mode="global")
-    assert drawn.time_gap.min() >= 1.0
-    assert drawn.time_gap.max() <= 1.5
-    assert drawn.constants.acceleration.shape == (50,)
-
-
 def test_drivers_of_several_models_are_a_population(table, written):
     table = table.assign(model=["idm", "gipps"] * 10)
     table["leader_deceleration_mps2"] = np.where(table["model"] == "gipps", 2.8, np.nan)
@@ -112,14 +105,6 @@ def test_drivers_of_several_models_are_a_population(table, written):
         kde(written(table))
     with pytest.raises(DataError, match="row 1, column 'leader_deceleration_mps2'"):
         from_table(table.assign(leader_deceleration_mps2=99.0))
-
-
-def test_fixed_is_one_driver():
-    population = fixed(desired_speed=22.0, time_gap=1.4, min_gap=3.0)
-    assert len(population) == 1
-    assert population.desired_speed.tolist() == [22.0]
-    assert population.constants.min_gap == 3.0
-    assert np.isnan(population.summary()["correlation"])
 
 
 def test_tables_of_one_mode_or_none_are_read(table, written):
@@ -146,14 +131,6 @@ def test_bad_tables_end_in_one_clear_error(table, written, change, message):
         load_drivers(written(change(table)))
 
 
-def test_missing_and_damaged_files_are_named(tmp_path):
-    with pytest.raises(DataError, match=r"nothing\.parquet: no such file"):
-        bootstrap(tmp_path / "nothing.parquet")
-    (tmp_path / "damaged.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(DataError, match=r"damaged\.parquet: not a readable"):
-        bootstrap(tmp_path / "damaged.parquet")
-
-
 @pytest.mark.parametrize(
     ("call", "name"),
     [
@@ -169,8 +146,3 @@ def test_missing_and_damaged_files_are_named(tmp_path):
 def test_no_driver_is_like_that(call, name):
     with pytest.raises(ConfigError, match=name):
         call()
-
-
-def test_one_driver_has_no_density(table, written):
-    with pytest.raises(DataError, match="density"):
-        kde(written(table.head(1)))

@@ -91,20 +91,6 @@ def test_power_has_a_finite_gradient_everywhere(name) -> None:
         assert all(part.isfinite().all() for part in found)
 
 
-def test_the_bridge_over_the_fuel_cut_is_narrow() -> None:
-    model = CirclesFuel(vehicle="midBase")
-    speed = torch.full((2,), 20.0)
-    far = torch.tensor([-2.0, 0.5])  # a width or more from the cut at −0.26 m/s²
-    torch.testing.assert_close(
-        model.smooth_power(speed, far), model.power(speed, far), atol=30.0, rtol=1e-3
-    )
-    near = torch.linspace(-0.4, -0.1, 301)
-    smooth = model.smooth_power(torch.full((301,), 20.0), near)
-    exact = model.power(torch.full((301,), 20.0), near)
-    assert exact.diff().abs().max() > 5e3
-    assert smooth.diff().abs().max() < 0.1 * exact.diff().abs().max()
-
-
 def shipped_cycle(name: str) -> torch.Tensor:
     table = pd.read_csv(str(files("lcc_rl.assets").joinpath("cycles", f"{name}.csv")))
     times = np.arange(0.0, table["time_s"].iloc[-1] + 0.05, 0.1)

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from helpers import slow_but
-from torchrl.envs.utils import check_env_specs
 
 import lcc_rl
 from lcc_rl.config import load
@@ -72,11 +71,6 @@ def test_an_episode_has_the_same_vehicles_whoever_drives() -> None:
         kinds.append(first[CLASS])
     assert (kinds[0] == kinds[1]).all()
     assert len(kinds[0].unique()) > 2
-
-
-@pytest.mark.parametrize("energy", ["mixture", "fuel", "electric"])
-def test_environments_fit_their_specs(energy) -> None:
-    check_env_specs(lcc_rl.make_env("alcc", 3, [f"energy={energy}"]), seed=0)
 
 
 def test_power_of_an_environment_is_that_of_the_models() -> None:

@@ -9,17 +9,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import MIXED, slow_but
+from helpers import slow_but
 from stream_statistics import compare_statistics, leader_statistics
 
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.drivers.calibrator import Calibrator
-from lcc_rl.drivers.population import bootstrap, fixed
+from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, simulate_follower
 from lcc_rl.io.files import read_parquet
 from lcc_rl.synthetic.lane import Stream, draw_drivers
-from lcc_rl.synthetic.stop_and_go import StopAndGo, jumps, stratified_normal
 from lcc_rl.synthetic.stream import StreamSource, truth_path
 
 SMALL: dict[str, Any] = {"recordings": 2, "platoons": 4, "vehicles": 3, "duration_s": (35.0, 50.0)}
@@ -97,16 +96,6 @@ def test_nobody_reverses_or_collides() -> None:
     assert (pairs["position_m_0"] - pairs["length_m_0"] - pairs["position_m"] > 0.5).all()
 
 
-def test_motion_is_consistent(stream: Stream) -> None:
-    for _, own in stream.samples.groupby(["recording", "vehicle"]):
-        speed, position = own["speed_mps"].to_numpy(), own["position_m"].to_numpy()
-        assert np.diff(position) == pytest.approx(0.05 * (speed[1:] + speed[:-1]), abs=1e-9)
-        assert np.diff(speed) / 0.1 == pytest.approx(
-            own["acceleration_mps2"].to_numpy()[1:], abs=1e-9
-        )
-        assert (np.diff(own["frame"]) == 1).all()
-
-
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     first, second, other = (tmp_path / name for name in ("a.csv", "b.csv", "c.csv"))
     StreamSource(**SMALL, seed=5).write(first)
@@ -129,13 +118,6 @@ def test_file_and_truth_are_kept_where_asked(tmp_path: Path) -> None:
     pairs = loaded.episodes[["recording", "follower_id", "leader_id"]].drop_duplicates()
     assert pairs.to_numpy().tolist() == truth[["recording", "vehicle", "preceding"]].values.tolist()
     assert "seed 5" in loaded.report[0]
-
-
-def test_a_recording_does_not_depend_on_how_many_there_are() -> None:
-    settings: dict[str, Any] = SMALL | {"recordings": 1}
-    one, two = StreamSource(**settings).generate(), StreamSource(**SMALL).generate()
-    part = two.samples[two.samples["recording"] == one.samples["recording"].iloc[0]]
-    pd.testing.assert_frame_equal(part.reset_index(drop=True), one.samples)
 
 
 def test_the_file_reads_back(stream: Stream, tmp_path: Path) -> None:
@@ -161,28 +143,6 @@ def test_drivers_can_keep_up() -> None:
     assert len(chosen[:, 0].unique()) > 50
 
 
-def test_own_drivers_and_leader_are_used() -> None:
-    still = dict.fromkeys(("level_spread_mps", "wave_spread_mps", "ripple_spread_mps"), 0.0)
-    leader = StopAndGo(mean_speed_mps=10.0, **still)
-    made = StreamSource(**SMALL, drivers=fixed(30.0, 1.6), leader=leader).generate()
-    assert (made.truth["time_gap_s"] == np.float32(1.6)).all()
-    leaders = made.samples[made.samples["preceding"] == 0]
-    assert leaders["speed_mps"].to_numpy() == pytest.approx(10.0)
-
-
-def test_stratified_sample_has_the_moments_of_the_normal() -> None:
-    values = stratified_normal(400, np.random.default_rng(0))
-    assert abs(values.mean()) < 0.02
-    assert values.std() == pytest.approx(1.0, abs=0.02)
-    assert np.isfinite(stratified_normal(1, np.random.default_rng(0))).all()
-
-
-def test_jumps_hold_as_long_as_stated() -> None:
-    values = jumps((20_000, 3), 0.02, np.random.default_rng(0))
-    assert (np.diff(values, axis=0) != 0).mean() == pytest.approx(0.02, rel=0.1)
-    assert values.std() == pytest.approx(1.0, abs=0.1)
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -197,8 +157,3 @@ def test_jumps_hold_as_long_as_stated() -> None:
 def test_bad_settings_are_named(name: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=name):
         StreamSource(**{name: value})
-
-
-def test_drivers_of_other_models_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"data\.drivers: expected IDM drivers.*gipps, idm, ovm"):
-        StreamSource(drivers=MIXED, recordings=1, platoons=2, vehicles=3).load()
