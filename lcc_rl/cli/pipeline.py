@@ -18,7 +18,7 @@ from lcc_rl.version import __version__
 def main(cfg: PipelineConfig) -> None:
     """Run everything into the run's folder, or complete the one given by ``resume``."""
     from lcc_rl.commands.pipeline import OVERRIDES, run, stored_overrides  # loads torch
-    from lcc_rl.results.runs import check_folder, check_links, save_config
+    from lcc_rl.results.runs import check_folder, save_config
 
     overrides = list(HydraConfig.get().overrides.task)
     folder = run_folder()
@@ -31,7 +31,6 @@ def main(cfg: PipelineConfig) -> None:
             )
         if not (folder / OVERRIDES).is_file():
             raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {OVERRIDES}")
-        check_links(folder)
         trust = list(cfg.trust)
         overrides = stored_overrides(folder / OVERRIDES, trust)
         cfg = load("pipeline", overrides)

@@ -33,7 +33,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
-from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
+from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import as_rich as scores_as_rich
 from lcc_rl.results.scores import scores
@@ -78,18 +78,11 @@ def run(
     """
     folder = Path(folder)
     if cfg.resume is not None:
-        folder, cfg = Path(cfg.resume), _resumed(cfg.resume, cfg.trust)
+        folder, cfg = Path(cfg.resume), load_config(cfg.resume, cfg.trust)
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
         return _run(cfg, folder, own, quiet, replace)
-
-
-def _resumed(folder: str, trust: Sequence[str]) -> EvaluateConfig:
-    """Return the configuration of a stopped evaluation."""
-    check_links(Path(folder))
-    own: EvaluateConfig = load_config(folder, trust)
-    return own
 
 
 def complete(cfg: EvaluateConfig, folder: Path) -> None:

@@ -52,13 +52,6 @@ def check_folder(cfg: BaseConfig, folder: Path) -> None:
         )
 
 
-def check_links(folder: Path) -> None:
-    """Refuse to resume in a folder that holds links, which could lead anywhere."""
-    link = next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None)
-    if link is not None:
-        raise ResultsError(f"{link}: a link, which may lead out of the folder; put the file there")
-
-
 def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     """Read the configuration of a run.
 

@@ -85,17 +85,3 @@ def test_a_sweep_of_a_billion_runs_is_one_line(tmp_path) -> None:
     assert done.returncode == 2
     assert done.stderr == "lcc_rl: error: a sweep has at most 100000 runs\n"
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["train.log", "policies/000001.pt", ".lock"])
-def test_links_in_a_resumed_folder_are_not_followed(finished, tmp_path, name) -> None:
-    folder = Path(shutil.copytree(finished, tmp_path / "run"))
-    mine = tmp_path / "mine"
-    mine.write_text("mine")
-    (folder / name).parent.mkdir(exist_ok=True)
-    (folder / name).unlink(missing_ok=True)
-    (folder / name).symlink_to(mine)
-    done = run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path)
-    assert done.returncode == 2
-    assert f"run/{name}: a link" in done.stderr
-    assert mine.read_text() == "mine"

@@ -6,8 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import time
-import zipfile
 from pathlib import Path
 
 import pandas as pd
@@ -22,9 +20,8 @@ from lcc_rl.commands.pipeline import stored_overrides
 from lcc_rl.config import identity, load
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
-from lcc_rl.io import files
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.io.settings import DEEPEST, LARGEST_FILE, parse_yaml, read_json, read_text
+from lcc_rl.io.settings import parse_yaml, read_json, read_text
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import load_config
@@ -196,68 +193,6 @@ def test_where_a_stream_is_kept_is_no_part_of_a_run() -> None:
 
 # -- bounds ----------------------------------------------------------------------------------------
 
-BOMB = "variant: alcc\na: &a [x,x]\n" + "".join(
-    f"{two}: &{two} [{','.join([f'*{one}'] * 9)}]\n"
-    for one, two in zip("abcdefghij", "bcdefghijk", strict=True)
-)
-BOMBS = {
-    "uses YAML references": BOMB,
-    f"nested more than {DEEPEST} deep": "variant: " + "[" * 100_000,
-    "more than 10000 characters": "variant: " + "1:" * 100_000 + "1",
-    f"(larger|longer) than {LARGEST_FILE}": "variant: [" + "1," * LARGEST_FILE + "]",
-}
-
-
-@pytest.mark.parametrize("words", BOMBS)
-def test_a_configuration_that_would_take_gigabytes(trained, tmp_path, words) -> None:
-    start = time.monotonic()
-    (tmp_path / "config.yaml").write_text(BOMBS[words])
-    shutil.copy(trained / "episodes.parquet", tmp_path)
-    policy = torch.load(trained / "policy.pt", weights_only=True)
-    torch.save({**policy, "config": BOMBS[words]}, tmp_path / "policy.pt")
-    for read in (load_config, load_policy, results.load):
-        with pytest.raises(ResultsError, match=rf"(config\.yaml|policy\.pt).*{words}"):
-            read(tmp_path)
-    assert time.monotonic() - start < 10
-
-
-def test_weights_that_claim_terabytes(trained, tmp_path) -> None:
-    path = tmp_path / "policy.pt"
-    policy = torch.load(trained / "policy.pt", weights_only=True)
-    torch.save({**policy, "more": [[torch.ones(1).expand(10**12)]]}, path)
-    with pytest.raises(ResultsError, match=r"policy\.pt: a tensor claims 4000000000000 bytes"):
-        read_torch(path)
-    torch.save({**policy, "more": torch.empty(10**12, device="meta")}, path)
-    with pytest.raises(ResultsError, match=r"policy\.pt: a tensor is not dense"):
-        read_torch(path)
-    torch.save({**policy, "more": bytearray(9)}, path)
-    with pytest.raises(ResultsError, match=r"policy\.pt: holds bytearray"):
-        read_torch(path)
-    torch.save(policy, path, _use_new_zipfile_serialization=False)
-    with pytest.raises(ResultsError, match=r"policy\.pt: not a readable weights file"):
-        read_torch(path)
-
-
-def test_weights_packed_to_nothing(trained, tmp_path) -> None:
-    path = tmp_path / "policy.pt"
-    with (
-        zipfile.ZipFile(trained / "policy.pt") as whole,
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed,
-    ):
-        for name in whole.namelist():
-            packed.writestr(name, whole.read(name))
-        packed.writestr("policy/data/99", bytes(10**7))
-    with pytest.raises(ResultsError, match="claims to be larger than it"):
-        read_torch(path)
-
-
-def test_containers_that_name_each_other_take_no_time(tmp_path) -> None:
-    nested: list = []
-    for _ in range(60):
-        nested = [nested, nested]
-    torch.save({"weights": nested}, tmp_path / "x.pt")
-    assert set(read_torch(tmp_path / "x.pt")) == {"weights"}
-
 
 # -- what is no file -------------------------------------------------------------------------------
 
@@ -398,7 +333,7 @@ def test_a_checkpoint_that_does_not_fit(run, change) -> None:
 def test_schema_versions_that_there_are_not(tmp_path, version) -> None:
     path = tmp_path / "a.parquet"
     write_parquet(pd.DataFrame({"a": [1]}), path, {"lcc_rl.schema": version})
-    with pytest.raises(ResultsError, match=r"a\.parquet: schema version .*reads 1") as caught:
+    with pytest.raises(ResultsError, match=r"a\.parquet: schema version .*expected 1") as caught:
         read_parquet(path)
     assert len(str(caught.value)) < 200
 
@@ -438,16 +373,6 @@ def test_a_killed_writer_leaves_nothing_that_is_read(tmp_path) -> None:
     (tmp_path / f".episodes.parquet.{os.getpid()}.tmp").write_bytes(b"PAR1 half")
     with pytest.raises(ResultsError, match=r"no episodes\.parquet"):
         results.load(tmp_path)
-
-
-def test_an_older_table_is_migrated(tmp_path, monkeypatch) -> None:
-    path = tmp_path / "a.parquet"
-    write_parquet(pd.DataFrame({"energy": [1.0]}), path)
-    monkeypatch.setattr(files, "SCHEMA_VERSION", "3")
-    rename = {"energy": "energy_kj"}
-    steps = {1: lambda f: f.rename(columns=rename), 2: lambda f: f.assign(unit="kJ")}
-    monkeypatch.setattr(files, "MIGRATIONS", steps)
-    assert read_parquet(path).to_dict("list") == {"energy_kj": [1.0], "unit": ["kJ"]}
 
 
 @pytest.mark.slow
