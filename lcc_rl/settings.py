@@ -15,6 +15,7 @@ one :class:`ConfigError` that names the setting.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
@@ -101,11 +102,12 @@ def refused(error: ValidationError, kind: Any, where: str) -> ConfigError:
 def checked(function: Callable[..., R]) -> Callable[..., R]:
     """Decorate a function so that its annotated arguments are checked like settings."""
     call = validate_call(config=STRICT)(function)
+    names = inspect.signature(function)
 
     @wraps(function)
     def checking(*args: Any, **given: Any) -> R:
         try:
-            return call(*args, **given)
+            return call(**names.bind(*args, **given).arguments)
         except ValidationError as error:
             raise refused(error, function, function.__name__) from error
 

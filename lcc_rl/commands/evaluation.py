@@ -11,9 +11,8 @@ import pandas as pd
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
-from lcc_rl.commands.maps import write_responses
 from lcc_rl.commands.tasks import check_named, only_named, task_of
-from lcc_rl.config import identity, is_sweep
+from lcc_rl.config import identity
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
@@ -111,8 +110,6 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
-    if isinstance(rows, pd.DataFrame) and cfg.evaluation.shards == 1 and not is_sweep():
-        write_responses(strategies, cfg, inputs.population, folder, {IDENTITY: identity(cfg)})
     if not quiet and isinstance(rows, pd.DataFrame):
         draw(folder, cfg.evaluation.rows)
     elif not quiet:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +25,10 @@ from lcc_rl.figures.drawing import (
     style,
 )
 from lcc_rl.figures.platoon import platoon_figures
-from lcc_rl.figures.policy_maps import policy_maps
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
-from lcc_rl.results.motion import RESPONSES
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, savings
 
@@ -46,8 +43,7 @@ def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
-        folder: holds config.yaml, episodes.parquet, steps.parquet and, if policies are to be
-            mapped, responses.parquet.
+        folder: holds config.yaml, episodes.parquet and steps.parquet.
         rows: what a row of episodes.parquet is of, ``episodes`` or ``vehicles``.
 
     Returns:
@@ -64,8 +60,6 @@ def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
-    if (folder / RESPONSES).is_file():
-        found = chain(found, policy_maps(read_parquet(folder / RESPONSES), steps, cfg))
     formats = cfg.get("figure_formats", ())
     return [
         save(figure, folder / "figures" / f"{in_file(stem)}.png", formats=formats)

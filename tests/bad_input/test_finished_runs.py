@@ -41,7 +41,7 @@ def test_a_finished_run_is_not_written_over(finished, tmp_path, words) -> None:
     assert content(folder) == before
 
 
-@pytest.mark.parametrize("kept", ["checkpoint.pt", "drivers.parquet", "overrides.json"])
+@pytest.mark.parametrize("kept", ["checkpoint.pt", "drivers.parquet", "command.txt"])
 def test_nor_are_drivers_a_stopped_training_or_a_stopped_pipeline(finished, tmp_path, kept) -> None:
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
     (folder / "episodes.parquet").rename(folder / kept)

@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from PIL import Image
 from study_frames import episodes, training, windows
 
-from lcc_rl.commands import evaluation
+from lcc_rl.commands import evaluation, maps
 from lcc_rl.config import load
 from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.drivers.population import load_drivers
@@ -28,7 +28,9 @@ from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, vel
 from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.figures.training import learning_curve
+from lcc_rl.io.files import read_parquet
 from lcc_rl.results.means import Means
+from lcc_rl.results.motion import RESPONSES
 from lcc_rl.results.policies import load_policy
 from lcc_rl.studies.alcc import figures as alcc
 
@@ -282,5 +284,7 @@ def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     evaluation.run(cfg, tmp_path)
     drawn = [path.name.rpartition(".") for path in (tmp_path / "figures").iterdir()]
     stems = {kind: {stem for stem, _, own in drawn if own == kind} for kind in ("png", "svg")}
-    assert {"policy_map", "overview", "improvement_alcc_vs_idm"} <= stems["png"]
+    assert {"overview", "improvement_alcc_vs_idm"} <= stems["png"]
     assert stems["png"] == stems["svg"]
+    assert [path.name for path in maps.run(tmp_path)] == ["policy_map.png"]
+    assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm tuned"}

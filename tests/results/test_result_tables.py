@@ -138,7 +138,7 @@ def test_win_rates_by_hand() -> None:
 
 
 CAR, MOTOR = as_fleet(CirclesFuel()), as_fleet(None)
-TASK = Task("mine", "net_energy", "kJ/km", "human", {"max_gap_m": 120.0, "min_time_gap_s": 1.0})
+TASK = Task(name="mine", limits={"max_gap_m": 120.0, "min_time_gap_s": 1.0})
 
 
 def driven(strategy: str, *energy: float, metres: float = 1000.0, **more: float) -> pd.DataFrame:
@@ -183,7 +183,7 @@ def test_a_share_is_limited_in_the_mean_and_a_column_may_be_the_score() -> None:
     own = driven("own", 1.0, 1.0, final_speed_spread_mps=0.1)
     rows = pd.concat([driven("human", 1.0, 1.0), own]).assign(share_ttc_unsafe=[0, 0, 0, 0.03])
     for bound, kept in ((0.02, True), (0.01, False)):
-        task = Task("mine", "final_speed_spread_mps", limits={"share_ttc_unsafe": bound})
+        task = Task(name="mine", score="final_speed_spread_mps", limits={"share_ttc_unsafe": bound})
         found = scores(rows, task, MOTOR)
         assert found["kept"].tolist() == [True, kept]
         assert found["score"].tolist() == pytest.approx([0.5, 0.1])
