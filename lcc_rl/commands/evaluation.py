@@ -111,18 +111,13 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
     if not quiet and isinstance(rows, pd.DataFrame):
-        draw(folder, cfg.evaluation.rows)
+        # Here: a training, which draws nothing, need not load matplotlib.
+        from lcc_rl.figures.evaluation import write_figures
+
+        write_figures(folder, cfg.evaluation.rows)
     elif not quiet:
         log.info("no figures: there are more than %d rows", FEW)
     return rows
-
-
-def draw(folder: Path, rows: str = "episodes") -> None:
-    """Draw the figures of an evaluation, whose rows are ``episodes`` or ``vehicles``."""
-    # Here: a training, which draws nothing, need not load matplotlib.
-    from lcc_rl.figures.evaluation import write_figures
-
-    write_figures(folder, rows)
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:

@@ -6,7 +6,6 @@ import logging
 import multiprocessing
 import os
 import threading
-from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from dataclasses import fields
 from io import StringIO

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 from pathlib import Path
@@ -12,11 +11,10 @@ import pandas as pd
 import pytest
 import torch
 import yaml
-from commands import NO_AGENT, UNTRAINED, run_command, tiny
+from commands import UNTRAINED, run_command, tiny
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation, training
-from lcc_rl.commands.pipeline import stored_overrides
 from lcc_rl.config import identity, load
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
@@ -149,26 +147,6 @@ def test_what_a_folder_trusts_is_not_trusted(run) -> None:
     change(run, trust=["os"])
     assert load_config(run).trust == []
     assert load_config(run, ["mine"]).trust == ["mine"]
-
-
-def test_a_stopped_pipeline_of_somebody_else(tmp_path, caplog) -> None:
-    path = tmp_path / "overrides.json"
-    base = [*NO_AGENT, "variants=[idm]"]
-    wrong = {
-        r"data\._target_ names 'os.system'": ["data._target_=os.system", "trust=[os]"],
-        "refers to another value": ["data.seed=${oc.env:SECRET}"],
-        "names a place to write": ["+data={keep: /tmp/x.csv}"],
-        "expected a list of settings": {"a": 1},
-        "damaged": "[" * 100_000,
-    }
-    for words, items in wrong.items():
-        whole = [*base, *items] if isinstance(items, list) else items
-        path.write_text(whole if isinstance(whole, str) else json.dumps(whole))
-        with pytest.raises(LccError, match=words):
-            stored_overrides(path, [])
-    path.write_text(json.dumps([*base, "data.keep=x.csv"]))
-    assert stored_overrides(path, []) == base
-    assert "data.keep=x.csv names a place to write and is left out" in caplog.text
 
 
 def test_keep_never_overwrites(tmp_path) -> None:
