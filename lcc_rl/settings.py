@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
@@ -94,9 +95,8 @@ def refused(error: ValidationError, kind: Any, where: str) -> ConfigError:
         return ConfigError(f"{key} is required: use {key}=…")
     if first["type"] == "value_error":
         return ConfigError(f"{key}: {first['ctx']['error']}")
-    return ConfigError(
-        f"{key} {first['msg'].replace('Input should', 'must')}, got {first['input']!r}"
-    )
+    wanted = re.sub(r"^\w+ should", "must", first["msg"])
+    return ConfigError(f"{key} {wanted}, got {first['input']!r}")
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:

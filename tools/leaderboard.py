@@ -20,8 +20,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.cli.entry import main_guard
-from lcc_rl.commands.evaluation import strategies_of
-from lcc_rl.commands.tasks import task_of
+from lcc_rl.commands.evaluation import strategies_of, task_of
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env

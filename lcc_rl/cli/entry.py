@@ -6,23 +6,21 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial, wraps
+from collections.abc import Callable, Sequence
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import patch
 
 import hydra
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
+from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.runs.interrupts import (
     BAD_INPUT,
     INTERRUPTED,
@@ -38,7 +36,6 @@ from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
 INPUT_ERRORS = (LccError, *HYDRA_ERRORS, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 SWEEP = {"-m", "--multirun"}
-NO_BEST = "No trials are completed"  # message of Optuna
 
 
 def entry_point(
@@ -59,7 +56,7 @@ def entry_point(
 
     def decorate(function: Callable[[Any], Any]) -> Callable[[], None]:
         def checked(config: DictConfig) -> Any:
-            heed_logs()
+            logging.raiseExceptions = False  # a log that cannot be written ends no run
             cfg = parsed(config, config_name, list(HydraConfig.get().overrides.task), is_sweep())
             if not is_sweep():
                 with ending_quietly():
@@ -103,24 +100,8 @@ def start(command: Callable[[], Any]) -> None:
 
 def run_sorted(command: Callable[[], Any]) -> None:
     """Run a Hydra command whose flags may stand anywhere among the settings."""
-    with patch.object(sys, "argv", [sys.argv[0], *flags_first(sys.argv[1:])]), listed_once():
+    with patch.object(sys, "argv", [sys.argv[0], *flags_first(sys.argv[1:])]):
         sweep(command)
-
-
-@contextmanager
-def listed_once() -> Iterator[None]:
-    """Let Hydra's help read all choices from one copy of its sources: it makes one per group."""
-    make, copies = ConfigLoaderImpl._parse_overrides_and_create_caching_repo, {}
-
-    def parsed(loader: ConfigLoaderImpl, config_name: str | None, overrides: list[str]) -> Any:
-        if config_name is not None or overrides:
-            return make(loader, config_name, overrides)
-        if loader not in copies:
-            copies[loader] = make(loader, None, [])
-        return copies[loader]
-
-    with patch.object(ConfigLoaderImpl, make.__name__, parsed):
-        yield
 
 
 def flags_first(words: Sequence[str]) -> list[str]:
@@ -153,9 +134,7 @@ def sweep(command: Callable[[], Any]) -> None:
             if folder is None:
                 raise KeyboardInterrupt from error
             raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
-        # Hydra's plugin asks for the best trial even if all failed; conclude reports those.
-        if not isinstance(error, ValueError) or NO_BEST not in str(error):
-            raise
+        raise
     finally:
         folder = SweepCallback.end()
     if folder is not None:
@@ -198,20 +177,6 @@ def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], An
         return result
 
     return recording
-
-
-def heed_logs() -> None:
-    """Let a log file that cannot be written end the command, as any other file does.
-
-    By default Python prints a traceback for each line that is lost, and nothing else happens.
-    """
-    for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.FileHandler):
-            handler.handleError = partial(_lost, handler.baseFilename)  # type: ignore[method-assign]
-
-
-def _lost(path: str, record: logging.LogRecord) -> NoReturn:
-    raise ResultsError(f"{path}: cannot be written: {sys.exception()}")
 
 
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:

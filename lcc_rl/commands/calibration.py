@@ -8,7 +8,6 @@ from pathlib import Path
 from time import perf_counter
 
 import pandas as pd
-import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -17,7 +16,7 @@ from rich.table import Table
 from lcc_rl.config import config_hash
 from lcc_rl.config.nodes import CALLED, build
 from lcc_rl.config.schemas import CalibrateConfig
-from lcc_rl.drivers.calibrator import OUT, Calibration, Calibrator
+from lcc_rl.drivers.calibrator import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source
@@ -41,7 +40,7 @@ def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None
     Writes ``config.yaml``, ``drivers.parquet``, ``calibration.png`` and ``joint_distribution.png``.
 
     Args:
-        cfg: a configuration with data, calibration, seed, device and threads.
+        cfg: configuration of the entry point ``calibrate``.
         folder: where the files go.
         console: where progress, report and summary go; by default the terminal.
 
@@ -49,9 +48,7 @@ def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None
         The calibrated drivers, as written.
 
     Raises:
-        ConfigError: if a setting is unknown or impossible.
-        DataError: if the data cannot be read or hold no usable episode.
-        ResultsError: if a file cannot be written.
+        LccError: one clear error for whatever is wrong with settings, data or files.
     """
     with claim(Path(folder)):
         check_folder(cfg, Path(folder))
@@ -65,7 +62,16 @@ def _run(cfg: CalibrateConfig, folder: Path, console: Console) -> pd.DataFrame:
     dataset = build_source(cfg.data).load()
     _say(console, dataset.report)
     start = perf_counter()
-    result = _calibrate(calibrator, dataset.episodes, cfg.seed, device, console)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task("calibration")
+
+        def show(generation: int, total: int, text: str) -> None:
+            bar.update(task, completed=generation, total=total, description=text)
+
+        result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=show)
     seconds = perf_counter() - start
     save_config(cfg, folder)
     _say(console, result.report)
@@ -73,23 +79,6 @@ def _run(cfg: CalibrateConfig, folder: Path, console: Console) -> pd.DataFrame:
     console.print(_summary(result.drivers))
     _say(console, [f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
-
-
-def _calibrate(
-    calibrator: Calibrator,
-    episodes: pd.DataFrame,
-    seed: int,
-    device: torch.device,
-    console: Console,
-) -> Calibration:
-    """Calibrate with a progress bar on a terminal."""
-    with _progress(console) as bar:
-        task = bar.add_task("calibration")
-
-        def show(generation: int, total: int, text: str) -> None:
-            bar.update(task, completed=generation, total=total, description=text)
-
-        return calibrator(episodes, seed=seed, device=device, progress=show)
 
 
 def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:
@@ -109,11 +98,6 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
 def _say(console: Console, lines: list[str]) -> None:
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _summary(drivers: pd.DataFrame) -> Table:

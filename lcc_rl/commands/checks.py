@@ -20,8 +20,8 @@ from lcc_rl.envs.inputs import (
     string_of,
 )
 from lcc_rl.envs.rollout import OBSERVATION
-from lcc_rl.errors import ConfigError, require, unknown_name
-from lcc_rl.evaluation.episodes import any_leader, check_shard, plan_of
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.evaluation.episodes import any_leader, plan_of
 from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
@@ -46,7 +46,7 @@ OBJECTIVES = {
     # Of the table of windows; it has no energies, the default is read as the first.
     "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
 }
-MEASURED = ("ttc", "time_gap", "power")
+MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": ("communication",)}
 MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
 RECORD = 4096  # bytes of an iteration's row in the record
 
@@ -59,14 +59,14 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    check_sizes(cfg)
-    require(
-        cfg.evaluation.shards == 1,
-        f"evaluation.shards={cfg.evaluation.shards}: a training's evaluation is one table; divide "
-        "that of lcc-rl evaluate policy=<run>",
-    )
+    check_measured(cfg)
+    if cfg.evaluation.shards > 1:
+        raise ConfigError(
+            f"evaluation.shards={cfg.evaluation.shards}: a training's evaluation is one table; "
+            "divide that of lcc-rl evaluate policy=<run>"
+        )
     check_installed(cfg)
-    check_objective(cfg)
+    objectives(cfg)
     build_logger(cfg)
     build_source(cfg.data)
     build(cfg.split, "split", CALLED)
@@ -162,15 +162,15 @@ def check_variant(cfg: StudyConfig) -> None:
         own = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a variant of the user's own, known to this command line only
         return
-    if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
-        raise ConfigError(
-            f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
-            "driver say variant=idm"
-        )
     if learns(cfg) and not learns(own):
         rules = "'compare=[idm,acc,…]' without variant=…" if cfg.task else "a learned variant"
         raise ConfigError(
             f"variant={cfg.variant} learns nothing: remove agent=…, or choose {rules}"
+        )
+    if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
+        raise ConfigError(
+            f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
+            "driver use variant=idm"
         )
 
 
@@ -181,41 +181,28 @@ def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
 
 
 def objectives(cfg: TrainConfig) -> list[str]:
-    """Return the columns that ``objective`` names; a run made before there was any has none."""
-    wanted = cfg.objective
-    names = [wanted] if isinstance(wanted, str) else list(wanted)
-    vehicles = cfg.evaluation.rows == "vehicles"
-    return [OBJECTIVES["vehicles"][0]] if vehicles and names == [TrainConfig.objective] else names
-
-
-def check_objective(cfg: TrainConfig) -> None:
-    """Check that ``objective`` names columns of the summary.
+    """Return the columns of the summary that ``objective`` names.
 
     Raises:
-        ConfigError: naming the unknown one.
+        ConfigError: naming one that there is not.
     """
-    names = objectives(cfg)
-    require(bool(names), "objective is empty: name at least one column of the summary")
-    for name in names:
-        known = OBJECTIVES.get(cfg.evaluation.rows, ())
+    known = OBJECTIVES[cfg.evaluation.rows]
+    names = [cfg.objective] if isinstance(cfg.objective, str) else cfg.objective
+    if cfg.evaluation.rows == "vehicles" and names == [TrainConfig.objective]:
+        return [known[0]]
+    for name in names or [""]:
         if name not in known:
-            raise unknown_name("objective", str(name), known)
+            raise unknown_name("objective", name, known)
+    return names
 
 
-def check_sizes(cfg: StudyConfig) -> None:
-    """Check, before anything runs, what would fail only at its end.
+def check_measured(cfg: StudyConfig) -> None:
+    """Check that the scenario has the pieces that write what an evaluation measures.
 
     Raises:
-        ConfigError: naming the option.
+        ConfigError: naming those that it lacks.
     """
-    check_shard(cfg.evaluation.shard, cfg.evaluation.shards)
-    pieces = cfg.scenario.pieces
-    measured = [name for name in MEASURED if pieces.get(name) is None]
-    require(
-        not measured or cfg.evaluation.rows != "episodes",
-        f"scenario.pieces lacks {measured}, which the evaluation measures",
-    )
-    require(
-        cfg.evaluation.rows != "vehicles" or pieces.get("communication") is not None,
-        "evaluation.rows=vehicles measures what scenario.pieces.communication writes",
-    )
+    needed = MEASURED[cfg.evaluation.rows]
+    lacking = [name for name in needed if cfg.scenario.pieces.get(name) is None]
+    if lacking:
+        raise ConfigError(f"scenario.pieces lacks {lacking}, which the evaluation measures")

@@ -10,9 +10,9 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
-from lcc_rl.commands.tasks import check_named, only_named, task_of
+from lcc_rl.commands.checks import check_evaluation, check_installed, check_measured, check_variant
 from lcc_rl.config import identity
+from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
@@ -34,11 +34,12 @@ from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
+from lcc_rl.results.scores import Task, scores
 from lcc_rl.results.scores import as_rich as scores_as_rich
-from lcc_rl.results.scores import scores
 from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
+from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present, claim, forget
@@ -46,7 +47,7 @@ from lcc_rl.runs.states import check_present, claim, forget
 log = logging.getLogger("lcc_rl")
 
 EPISODES, STEPS, IDENTITY = "episodes.parquet", "steps.parquet", "lcc_rl.config"
-ROWS = ("episodes", "vehicles")
+TASK = f"{Task.__module__}.{Task.__name__}"
 
 
 def run(
@@ -84,10 +85,15 @@ def run(
         return _run(cfg, folder, own, quiet, replace)
 
 
+def made_by(table: Path) -> str | None:
+    """Return the hash of the configuration that a table was made by; None without a table."""
+    return parquet_metadata(table).get(IDENTITY) if table.exists() else None
+
+
 def complete(cfg: EvaluateConfig, folder: Path) -> None:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
-    if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
+    if made_by(table) == identity(cfg):
         made, paths = table.stat().st_mtime, map(Path, filter(None, (cfg.policy, *cfg.compare)))
         files = [path / POLICY if path.is_dir() else path for path in paths]
         if all(path.stat().st_mtime <= made for path in files if path.exists()):
@@ -99,7 +105,7 @@ def complete(cfg: EvaluateConfig, folder: Path) -> None:
 
 def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
     prepare_torch(cfg)
-    check_sizes(cfg)
+    check_measured(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     own = own and not only_named(cfg)
@@ -118,6 +124,33 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
     elif not quiet:
         log.info("no figures: there are more than %d rows", FEW)
     return rows
+
+
+def task_of(cfg: StudyConfig) -> Task | None:
+    """Return the task of a configuration; None without one."""
+    if cfg.task is None:
+        return None
+    task: Task = build({TARGET: TASK, **cfg.task}, "task", Task)
+    check_unit(task.unit, build_energy(cfg))
+    return task
+
+
+def only_named(cfg: EvaluateConfig) -> bool:
+    """Whether a task compares those that are named only: nobody's policy is its own variant's."""
+    return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
+
+
+def check_named(names: Sequence[str]) -> None:
+    """Check that whom ``compare`` names exists: a controller, a baseline, a folder or a policy.
+
+    Raises:
+        ConfigError: naming the nearest that does.
+    """
+    for name in names:
+        plain_name = Path(name).name == name and not Path(name).suffix
+        if plain_name and name not in rules() and name != PRETRAINED and not Path(name).exists():
+            known = [*rules(), PRETRAINED, "<run folder>", "<policy.pt>"]
+            raise unknown_name("strategy (compare)", name, known)
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
@@ -178,11 +211,8 @@ def evaluate_and_write(
         The rows; of many a dataset, which is read only when asked.
 
     Raises:
-        ConfigError: if ``evaluation.rows`` is unknown.
         Interrupted: if it was stopped between the first and the last block.
     """
-    if cfg.evaluation.rows not in ROWS:
-        raise unknown_name("choice of evaluation.rows", str(cfg.evaluation.rows), ROWS)
     metadata = {IDENTITY: identity(cfg)}
     if cfg.evaluation.rows == "vehicles":
         results = [cases.evaluate(strategy, cfg, inputs) for strategy in strategies]

@@ -18,7 +18,7 @@ from rich.console import Console
 from lcc_rl import results
 from lcc_rl.cli.entry import root_key
 from lcc_rl.commands import calibration, evaluation, training
-from lcc_rl.commands.checks import check_settings, check_sizes
+from lcc_rl.commands.checks import check_measured, check_settings
 from lcc_rl.config import load
 from lcc_rl.config.nodes import with_defaults
 from lcc_rl.config.schemas import (
@@ -92,10 +92,10 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
         prepare_torch(cfg)
         for name, part in trainings.items():
             check_settings(part, folder / name)
-        check_sizes(final)
+        check_measured(final)
         save_config(cfg, folder)
-        for name, part in {**trainings, FINAL: final}.items():
-            save_config(part, folder / PARTS / name)
+        for name, own in {**trainings, FINAL: final}.items():
+            save_config(own, folder / PARTS / name)
         with atomic_path(folder / COMMAND) as temporary:
             temporary.write_text(command)
         return _run(cfg, trainings, final, folder, command)

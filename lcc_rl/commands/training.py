@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -11,16 +10,16 @@ import pandas as pd
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
-from lcc_rl.commands.evaluation import EPISODES, IDENTITY, evaluate_and_write
+from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write, made_by
 from lcc_rl.config import identity
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
-from lcc_rl.errors import ConfigError, ResultsError, require
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
-from lcc_rl.io.files import Rows, as_rows, parquet_metadata
+from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.string_tables import case_table
@@ -79,13 +78,10 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
     """
     own: TrainConfig = load_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
-        made_by = (
-            parquet_metadata(folder / table).get(IDENTITY) if (folder / table).exists() else None
-        )
-        if made_by not in (None, identity(own)):
+        if made_by(folder / table) not in (None, identity(own)):
             raise ResultsError(
-                f"{folder}: {table} belongs to another configuration than config.yaml (hash "
-                f"{made_by}, not {identity(own)}); resume with the settings it was started with"
+                f"{folder}: {table} belongs to another configuration than config.yaml; resume with "
+                "the settings it was started with"
             )
     if not isinstance(build_logger(cfg), Silent):
         own.logger = cfg.logger
@@ -116,11 +112,11 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
 
 def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
     """Build the strategy of a variant that builds on a trained policy."""
-    require(
-        cfg.deployed is not None,
-        f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
-        "or say lcc-rl evaluate to evaluate one",
-    )
+    if cfg.deployed is None:
+        raise ConfigError(
+            f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
+            "or use lcc-rl evaluate to evaluate one"
+        )
     weights, own = load_policy(str(cfg.policy), cfg.variant, cfg.trust)
     check_policy(cfg, own)
     cfg.agent = own.agent
@@ -136,7 +132,9 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
     if resume:
         trainer.load()
     save_config(cfg, folder)
-    trainer.on_keep = partial(keep_policy, agent, cfg, folder)
+    trainer.on_keep = lambda iteration: save_policy(
+        agent.policy.state_dict(), cfg, folder / POLICIES / f"{iteration:06d}.pt"
+    )
     with build_logger(cfg).opened(folder) as trainer.on_row:
         trainer.run()
     if trainer.best is not None:
@@ -146,16 +144,10 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
     save_policy(agent.policy.state_dict(), cfg, folder / POLICY)
 
 
-def keep_policy(agent: Agent, cfg: TrainConfig, folder: Path, iteration: int) -> None:
-    """Write the policy as it is after an iteration to ``policies/<iteration>.pt``."""
-    path = folder / POLICIES / f"{iteration:06d}.pt"
-    save_policy(agent.policy.state_dict(), cfg, path)
-
-
 def complete(cfg: TrainConfig, folder: Path) -> Rows:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
-    if table.exists() and parquet_metadata(table).get(IDENTITY) == identity(cfg):
+    if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return as_rows(table)
     if table.exists():

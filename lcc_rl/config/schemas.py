@@ -21,8 +21,10 @@ from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
+Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
+# Each names a folder in the job's.
+Variants = Annotated[list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]], Field(min_length=1)]
 Million = Annotated[int, Field(ge=1, le=1_000_000)]
-FOLDER = r"^\w[\w.-]*$"  # name of a folder in another one
 FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
 Format = Literal["png", "pdf", "svg"]
 
@@ -100,12 +102,18 @@ class EvaluationConfig(Settings):
     compiled: bool | None = None
     full_length: bool = False
 
+    def settled(self) -> None:
+        if self.shard >= self.shards:
+            raise ConfigError(
+                f"evaluation.shard must lie from 0 to {self.shards - 1}, got {self.shard}"
+            )
+
 
 class BaseConfig(Settings):
     """What every command shares."""
 
     seed: Seed
-    device: str
+    device: Device  # cpu, cuda or cuda:<number>
     threads: Parallel
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
     data: Node
@@ -166,7 +174,7 @@ class PipelineConfig(TrainConfig):
     """``lcc-rl run``."""
 
     calibration: Node
-    variants: Annotated[list[Annotated[str, Field(pattern=FOLDER)]], Field(min_length=1)]
+    variants: Variants  # at least one
     jobs: Parallel
 
 

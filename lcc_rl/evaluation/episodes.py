@@ -40,11 +40,6 @@ from lcc_rl.results.tables import FASTER
 WORTH_COMPILING = 20_000_000
 
 
-def check_shard(shard: int, shards: int) -> None:
-    """Check that a shard of this number exists."""
-    require(0 <= shard < shards, f"evaluation.shard must lie from 0 to {shards - 1}, got {shard}")
-
-
 @dataclass(frozen=True)
 class Plan:
     """The episodes of an evaluation in blocks of one size.

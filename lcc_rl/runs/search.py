@@ -8,11 +8,10 @@ from __future__ import annotations
 import logging
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -25,9 +24,10 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.errors import ConfigError, ResultsError, require
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.states import survey
+from lcc_rl.settings import Count, Settings, parse
 
 log = logging.getLogger("lcc_rl")
 
@@ -43,46 +43,33 @@ def register() -> None:
     Plugins.instance().register(SearchSweeper)
 
 
+class SearchSettings(Settings):
+    """Settings of a search, ``hydra.sweeper`` on the command line."""
+
+    directions: list[Literal["minimize", "maximize"]]  # of each value that objective names
+    storage: str  # address of Optuna's storage
+    study_name: str  # in it
+    n_trials: Count  # that are to be complete
+    n_jobs: Count  # trials launched together
+    seed: int  # of Optuna's sampler (TPE)
+    # Setting: fixed value or sweep (interval, range, choice, lists) in Hydra's words; sweeps on the
+    # command line add to it.
+    params: dict[str, Any]
+
+
 class SearchSweeper(Sweeper):
     """Searches settings until the wanted number of trials of a stored study is complete.
 
     The same command resumes it: trials that were cut off come first, failed ones are replaced. Each
-    trial is a run in its own folder, and several are drawn before they are launched together.
-
-    Args:
-        directions: ``minimize`` or ``maximize`` of each value that ``objective`` names.
-        storage: address of Optuna's storage.
-        study_name: name of the study in it.
-        n_trials: trials that are to be complete.
-        n_jobs: trials launched together.
-        seed: of Optuna's sampler (TPE).
-        params: setting → fixed value or sweep (``interval``, ``range``, ``choice``, lists) in
-            Hydra's words; sweeps on the command line add to it.
-
-    Raises:
-        ConfigError: if Optuna is missing or a number is out of range.
+    trial is a run in its own folder, and several are drawn before they are launched together. Its
+    arguments are those of :class:`SearchSettings`.
     """
 
     __module__ = PLACE
 
-    def __init__(
-        self,
-        directions: Sequence[str],
-        storage: str,
-        study_name: str,
-        n_trials: int,
-        n_jobs: int,
-        seed: int,
-        params: dict[str, Any],
-    ) -> None:
-        require(min(n_trials, n_jobs) >= 1, "hydra.sweeper.n_trials and n_jobs must be positive")
-        for direction in directions:
-            if direction not in ("minimize", "maximize"):
-                words = "expected minimize or maximize"
-                raise ConfigError(f"hydra.sweeper.directions: {words}, found '{direction}'")
-        self.directions, self.storage, self.study_name = list(directions), storage, study_name
-        self.n_trials, self.n_jobs, self.seed = n_trials, n_jobs, seed
-        self.params = [f"{key}={value}" for key, value in params.items()]
+    def __init__(self, **given: Any) -> None:
+        plain: Any = OmegaConf.to_container(OmegaConf.create(given))
+        self.given = parse(SearchSettings, plain, "hydra.sweeper")
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -98,7 +85,8 @@ class SearchSweeper(Sweeper):
     def sweep(self, arguments: list[str]) -> None:
         """Launch what lacks of the trials, and write the best beside the runs."""
         optuna = load_optuna()
-        parsed = self.parser.parse_overrides(self.params + arguments)
+        own = [f"{key}={value}" for key, value in self.given.params.items()]
+        parsed = self.parser.parse_overrides([*own, *arguments])
         settings = {item.get_key_element(): item for item in parsed}  # the last one counts
         swept = {key: item for key, item in settings.items() if item.is_sweep_override()}
         space = {key: distribution(optuna, item) for key, item in swept.items()}
@@ -110,9 +98,9 @@ class SearchSweeper(Sweeper):
         self.folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, self.folder / "multirun.yaml")
         study = self.study(optuna)
-        left = self.n_trials - resumed(study, self.folder, self.n_trials)
-        for first in range(0, left, self.n_jobs):
-            trials = [self.ask(study, space) for _ in range(min(self.n_jobs, left - first))]
+        left = self.given.n_trials - resumed(study, self.folder, self.given.n_trials)
+        for first in range(0, left, self.given.n_jobs):
+            trials = [self.ask(study, space) for _ in range(min(self.given.n_jobs, left - first))]
             batch = [[*fixed, *(f"{k}={v}" for k, v in trial.params.items())] for trial in trials]
             self.validate_batch_is_legal(batch)
             done = self.launcher.launch(batch, initial_job_idx=trials[0].number)
@@ -129,23 +117,25 @@ class SearchSweeper(Sweeper):
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:
             study = optuna.create_study(
-                storage=self.storage,
-                study_name=self.study_name,
-                directions=self.directions,
+                storage=self.given.storage,
+                study_name=self.given.study_name,
+                directions=self.given.directions,
                 load_if_exists=True,
             )
         except RuntimeError as error:
             words = "was begun with an older version of Optuna"
-            raise ResultsError(f"{self.storage} {words}; give the sweep a new name") from error
-        if len(study.directions) != len(self.directions):
+            raise ResultsError(
+                f"{self.given.storage} {words}; give the sweep a new name"
+            ) from error
+        if len(study.directions) != len(self.given.directions):
             words = f"holds a search with {len(study.directions)} objectives"
-            raise ResultsError(f"{self.storage} {words}; give the sweep a new name")
+            raise ResultsError(f"{self.given.storage} {words}; give the sweep a new name")
         return study
 
     def ask(self, study: Any, space: dict[str, Any]) -> Any:
         """Draw the next trial by a sampler of its own seed: resuming equals not having stopped."""
         number = len(study.get_trials(deepcopy=False))
-        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+        seed = int(np.random.SeedSequence([self.given.seed, number]).generate_state(1)[0])
         study.sampler = load_optuna().samplers.TPESampler(seed=seed)
         return study.ask(space)
 
@@ -156,9 +146,9 @@ class SearchSweeper(Sweeper):
             study.tell(trial, state=load_optuna().trial.TrialState.FAIL)
             return
         values = list(value) if isinstance(value, (list, tuple)) else [value]
-        if len(values) != len(self.directions):
+        if len(values) != len(self.given.directions):
             words = f"objective names {len(values)} columns"
-            raise ConfigError(f"{words}, hydra.sweeper.directions {len(self.directions)}")
+            raise ConfigError(f"{words}, hydra.sweeper.directions {len(self.given.directions)}")
         study.tell(trial, values)
 
 

@@ -7,7 +7,7 @@ from commands import DATA
 from helpers import slow_but
 
 from lcc_rl.commands import evaluation
-from lcc_rl.commands.tasks import task_of
+from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 

@@ -7,7 +7,6 @@ import logging
 import pytest
 import torch
 
-from lcc_rl.errors import ConfigError
 from lcc_rl.runs.precision import product_error, set_precision
 
 
@@ -37,8 +36,3 @@ def test_bf16_products_are_warned_of(caplog, monkeypatch) -> None:
     monkeypatch.setattr("lcc_rl.runs.precision.product_error", lambda: 4e-3)
     set_precision("medium")
     assert caplog.records[0].levelno == logging.WARNING
-
-
-def test_unknown_precision() -> None:
-    with pytest.raises(ConfigError, match="Did you mean 'medium'"):
-        set_precision("medum")

@@ -130,7 +130,6 @@ def test_a_search_of_which_every_run_failed_names_them(tmp_path, monkeypatch) ->
     def command() -> None:
         monkeypatch.setattr(SweepCallback, "folder", tmp_path)
         assert run_job(lambda cfg: 1 / 0, tiny("train"), tmp_path / "a") is None
-        raise ValueError("No trials are completed yet.")
 
     with pytest.raises(LccError, match="1 of 1 runs failed"):
         entry.sweep(command)
