@@ -105,11 +105,7 @@ def run_sorted(command: Callable[[], Any]) -> None:
 
 
 def flags_first(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line, its flags, as ``-m``, first, variants in lower case.
-
-    Raises:
-        ConfigError: naming a flag that does not exist.
-    """
+    """Return the words of a command line, its flags, as ``-m``, first, variants in lower case."""
     parser = get_args_parser()
     parser.allow_abbrev = False  # --experiment is none of Hydra's flags
     known, unknown = parser.parse_known_intermixed_args(list(words))
@@ -225,9 +221,6 @@ def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
     Args:
         cfg: the configuration, with the key ``resume``.
         own: settings that may be given beside the folder.
-
-    Raises:
-        ConfigError: naming other settings.
     """
     if cfg.resume is None:
         return run_folder()

@@ -6,7 +6,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.cli.entry import entry_point, resumed_folder
 from lcc_rl.config.schemas import PipelineConfig
-from lcc_rl.runs.console import headlines
+from lcc_rl.runs.output import headlines
 
 
 @entry_point("pipeline", "lcc_rl.commands.pipeline")

@@ -46,12 +46,7 @@ def watch(root: Path, console: Console, every: float = 2.0) -> None:
 
 
 def look(folder: str, console: Console, watching: bool) -> None:
-    """Show a folder once, or keep showing it.
-
-    Raises:
-        ConfigError: if the name is empty, for example from an unset variable.
-        ResultsError: if there is no such folder.
-    """
+    """Show a folder once, or keep showing it."""
     if not folder:
         raise ConfigError("the name of the folder is empty; say, e.g., outputs")
     if watching and console.is_terminal:

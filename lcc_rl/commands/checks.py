@@ -55,9 +55,6 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     """Check every setting of a training before the data are read, which may take long.
 
     Everything is built once, around a leader at constant speed.
-
-    Raises:
-        ConfigError: naming the option.
     """
     check_measured(cfg)
     if cfg.evaluation.shards > 1:
@@ -86,11 +83,7 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
 
 
 def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:
-    """Check that an evaluation fits into memory, once the data are read and nothing else is done.
-
-    Raises:
-        ConfigError: saying what it needs.
-    """
+    """Check that an evaluation fits into memory, once the data are read."""
     own, profiles = deployed(any_leader(cfg)), inputs.evaluation
     env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
     require_memory(evaluation_bytes(cfg, env.reset(), inputs), cfg.device)
@@ -135,9 +128,6 @@ def check_installed(cfg: StudyConfig, compared: Sequence[str] = ()) -> None:
     Args:
         cfg: configuration of a study, of which the baselines are checked, too.
         compared: names of further controllers.
-
-    Raises:
-        ConfigError: saying how to install it.
     """
     names = {*cfg.evaluation.baselines, *compared} - {DIRECT}
     others = [baseline_controller(name) for name in sorted(names) if applies(cfg, name)]
@@ -153,11 +143,7 @@ def build_logger(cfg: TrainConfig) -> Any:
 
 
 def check_variant(cfg: StudyConfig) -> None:
-    """Refuse a learner under the name of a variant that learns nothing, and the reverse.
-
-    Raises:
-        ConfigError: naming both.
-    """
+    """Refuse a learner under the name of a variant that learns nothing, and the reverse."""
     try:
         own = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a variant of the user's own, known to this command line only
@@ -181,11 +167,7 @@ def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
 
 
 def objectives(cfg: TrainConfig) -> list[str]:
-    """Return the columns of the summary that ``objective`` names.
-
-    Raises:
-        ConfigError: naming one that there is not.
-    """
+    """Return the columns of the summary that ``objective`` names."""
     known = OBJECTIVES[cfg.evaluation.rows]
     names = [cfg.objective] if isinstance(cfg.objective, str) else cfg.objective
     if cfg.evaluation.rows == "vehicles" and names == [TrainConfig.objective]:
@@ -197,11 +179,7 @@ def objectives(cfg: TrainConfig) -> list[str]:
 
 
 def check_measured(cfg: StudyConfig) -> None:
-    """Check that the scenario has the pieces that write what an evaluation measures.
-
-    Raises:
-        ConfigError: naming those that it lacks.
-    """
+    """Check that the scenario has the pieces that write what an evaluation measures."""
     needed = MEASURED[cfg.evaluation.rows]
     lacking = [name for name in needed if cfg.scenario.pieces.get(name) is None]
     if lacking:

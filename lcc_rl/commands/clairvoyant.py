@@ -81,11 +81,7 @@ def _tell(
 
 
 def start(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
-    """Read a policy to start from.
-
-    Raises:
-        ConfigError: if its string has no human drivers.
-    """
+    """Read a policy to start from."""
     policy = load_policy(path, cfg.variant, tuple(cfg.trust))
     if HUMAN not in string_of(policy[1]).names:
         raise ConfigError(

@@ -141,11 +141,7 @@ def only_named(cfg: EvaluateConfig) -> bool:
 
 
 def check_named(names: Sequence[str]) -> None:
-    """Check that whom ``compare`` names exists: a controller, a baseline, a folder or a policy.
-
-    Raises:
-        ConfigError: naming the nearest that does.
-    """
+    """Check that whom ``compare`` names exists: a controller, a baseline, a folder or a policy."""
     for name in names:
         plain_name = Path(name).name == name and not Path(name).suffix
         if plain_name and name not in rules() and name != PRETRAINED and not Path(name).exists():
@@ -159,9 +155,6 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     Args:
         cfg: configuration of the entry point ``evaluate``.
         own: whether the configuration's own variant is among them; None: as the command decides.
-
-    Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
     """
     own = not only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
@@ -209,9 +202,6 @@ def evaluate_and_write(
 
     Returns:
         The rows; of many a dataset, which is read only when asked.
-
-    Raises:
-        Interrupted: if it was stopped between the first and the last block.
     """
     metadata = {IDENTITY: identity(cfg)}
     if cfg.evaluation.rows == "vehicles":

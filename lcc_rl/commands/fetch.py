@@ -44,9 +44,6 @@ def fetch(
 
     Returns:
         The number of rows downloaded.
-
-    Raises:
-        DataError: if the portal does not deliver the table, with the rows that it counts.
     """
     try:
         import pooch

@@ -40,8 +40,8 @@ from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.tables import show
-from lcc_rl.runs.console import tell
 from lcc_rl.runs.interrupts import INTERRUPTED
+from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
@@ -104,11 +104,7 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
 def composed(
     cfg: PipelineConfig, overrides: list[str]
 ) -> tuple[dict[str, TrainConfig], EvaluateConfig]:
-    """Compose every part of a job: its trainings by variant, and the evaluation.
-
-    Raises:
-        ConfigError: if an override is unknown or wrong.
-    """
+    """Compose every part of a job: its trainings by variant, and the evaluation."""
     for item in overrides:
         if root_key(item) == "variant":
             raise ConfigError(

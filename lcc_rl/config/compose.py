@@ -37,11 +37,7 @@ HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
 def chosen_folder(resumed: str | None, fresh: str) -> str:
-    """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew.
-
-    Raises:
-        ConfigError: if there is no run to resume.
-    """
+    """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew."""
     if resumed and not (Path(resumed) / "config.yaml").is_file():
         raise ConfigError(f"resume={resumed}: not a run folder: it has no config.yaml")
     return str(resumed or fresh)
@@ -82,11 +78,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
 
 
 def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """Return what Hydra composes.
-
-    Raises:
-        ConfigError: if Hydra refuses an override.
-    """
+    """Return what Hydra composes."""
     try:
         if GlobalHydra.instance().is_initialized():
             return compose(entry, overrides=as_meant(overrides))
@@ -150,9 +142,6 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         overrides: what was typed.
         sweep: the runs of a sweep share what was typed, so a setting that one of them uses may be
             given to another.
-
-    Raises:
-        ConfigError: if a setting is unknown, wrong or has no effect.
     """
     try:
         # Settings may refer to the default of a class.

@@ -26,11 +26,7 @@ def short_name(target: object) -> str:
 
 
 def find_target(target: str, where: str) -> Any:
-    """Return the class or function that a ``_target_`` names.
-
-    Raises:
-        ConfigError: if there is none, or importing its module fails.
-    """
+    """Return the class or function that a ``_target_`` names."""
     module, _, name = target.rpartition(".")
     try:
         found = getattr(import_module(module), name)
@@ -58,9 +54,6 @@ def with_defaults(value: Any, where: str = "") -> Any:
     Args:
         value: a setting as plain containers; references to other settings may be unresolved.
         where: its place in the configuration, for messages.
-
-    Raises:
-        ConfigError: if a target is unknown.
     """
     if isinstance(value, list):
         return [with_defaults(item, f"{where}[{place}]") for place, item in enumerate(value)]
@@ -84,9 +77,6 @@ def check_nodes(value: Any, where: str) -> None:
     Args:
         value: a setting as plain containers.
         where: its place in the configuration, for messages.
-
-    Raises:
-        ConfigError: naming a setting that is unknown, missing or wrong.
     """
     for key, _, node in [(where, None, value), *settings_at(value, where)]:
         if is_node(node):
@@ -116,10 +106,6 @@ def build(
         name: the name of the part there.
         **resources: further arguments of a class or function without :class:`Settings`, given
             where its parameters have these names.
-
-    Raises:
-        ConfigError: if the target is unknown, a setting is unknown, missing or wrong, or the
-            object is of another kind.
     """
     if not is_node(node):
         without = f"; to leave it out, use ~{where}" if node is None else ""
@@ -171,11 +157,7 @@ def _fits(made: Any, needed: type | Sequence[str]) -> bool:
 
 
 def check_numbers(value: Any, where: str) -> None:
-    """Refuse numbers that are not finite or too large, in lists and mappings, too.
-
-    Raises:
-        ConfigError: naming the setting.
-    """
+    """Refuse numbers that are not finite or too large, in lists and mappings, too."""
     for key, _, item in settings_at(value, where):
         if isinstance(item, float) and not abs(item) <= LARGEST:
             raise ConfigError(

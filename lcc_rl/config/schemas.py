@@ -198,9 +198,6 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
     Args:
         content: a configuration as plain containers.
         kind: class of the tree; by default the command's that has these settings.
-
-    Raises:
-        ConfigError: naming the first setting that is unknown, missing or wrong.
     """
     kind = kind or _kind_of(content)
     check_numbers(content, "")

@@ -22,9 +22,6 @@ def check_used(content: Mapping[str, Any], overrides: Sequence[str], sweep: bool
         overrides: what was typed.
         sweep: the runs of a sweep share what was typed, so what one of them learns by may be
             given to another that learns nothing.
-
-    Raises:
-        ConfigError: naming the option and why it has no effect.
     """
     if "scenario" not in content:
         return

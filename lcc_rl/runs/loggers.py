@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, Literal
 
 from torchrl.record.loggers import Logger
 
 from lcc_rl.errors import ConfigError, how_to_install
+from lcc_rl.settings import Settings
 
-KINDS = ("tensorboard", "wandb", "mlflow")
 Row = Mapping[str, float]
 
 
@@ -26,38 +25,19 @@ class Silent:
         yield lambda row: None
 
 
-@dataclass
-class RowLogger:
-    """Logs every training row with one of TorchRL's loggers, under the run folder's name.
+class RowLogger(Settings):
+    """Logs every training row with one of TorchRL's loggers, under the run folder's name."""
 
-    Args:
-        kind: ``"tensorboard"``, ``"wandb"`` or ``"mlflow"``.
-        where: folder or tracking address; None for ``logs`` in the run's folder.
-        project: wandb's project, or MLflow's experiment.
-        offline: wandb keeps its files on this machine until ``wandb sync``.
+    WRITES = ("where",)  # settings that name a place to write
 
-    Raises:
-        ConfigError: if the kind is unknown.
-    """
-
-    WRITES: ClassVar = ("where",)  # settings that name a place to write
-
-    kind: str
-    where: str | None = None
-    project: str = "lcc_rl"
-    offline: bool = True
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ConfigError(f"logger.kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
+    kind: Literal["tensorboard", "wandb", "mlflow"]
+    where: str | None = None  # folder or tracking address; null: logs in the run's folder
+    project: str = "lcc_rl"  # wandb's project, or MLflow's experiment
+    offline: bool = True  # wandb keeps its files on this machine until wandb sync
 
     @contextmanager
     def opened(self, folder: Path) -> Iterator[Callable[[Row], None]]:
-        """Yield a function that logs a row at its iteration.
-
-        Raises:
-            ConfigError: if the logger's package is not installed.
-        """
+        """Yield a function that logs a row at its iteration."""
         try:
             logger = self._make(folder)
         except ImportError as error:

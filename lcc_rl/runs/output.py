@@ -1,12 +1,43 @@
-"""Standard output that somebody may stop reading."""
+"""What a command writes to the terminal, which somebody may stop reading, and what to its log."""
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any, cast
+
+# Between INFO, the details, and WARNING: what somebody who waits wants to know.
+HEADLINE = 25
+logging.addLevelName(HEADLINE, "NOTE")
+
+log = logging.getLogger("lcc_rl")
+
+
+def tell(text: str) -> None:
+    """Log a line that :func:`headlines` lets through to the terminal."""
+    log.log(HEADLINE, text)
+
+
+@contextmanager
+def headlines() -> Iterator[None]:
+    """Show headlines and warnings on the terminal, without dates; log files get every line."""
+    changed = []
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.StreamHandler) and not isinstance(
+            handler, logging.FileHandler
+        ):
+            changed.append((handler, handler.level, handler.formatter))
+            handler.setLevel(max(handler.level, HEADLINE))
+            handler.setFormatter(logging.Formatter("%(message)s"))
+    try:
+        yield
+    finally:
+        for handler, level, formatter in changed:
+            handler.setLevel(level)
+            handler.setFormatter(formatter)
 
 
 class Unbroken:

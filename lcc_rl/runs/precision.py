@@ -15,11 +15,7 @@ SINGLE = 1e-4  # relative error beyond which products are no longer single preci
 
 
 def prepare_torch(cfg: BaseConfig) -> torch.device:
-    """Set up torch and return the device.
-
-    Raises:
-        ConfigError: if the device is not available on this machine.
-    """
+    """Set up torch and return the device."""
     try:
         device = torch.device(cfg.device)
         torch.empty(0, device=device)

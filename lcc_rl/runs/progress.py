@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from lcc_rl.config import is_sweep
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.runs.console import tell
+from lcc_rl.runs.output import tell
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")

@@ -109,11 +109,7 @@ class SearchSweeper(Sweeper):
         write_best(study, self.folder / RESULT)
 
     def study(self, optuna: ModuleType) -> Any:
-        """Return the stored study, or a new one.
-
-        Raises:
-            ResultsError: if it has another number of objectives, or is of an older Optuna.
-        """
+        """Return the stored study, or a new one."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:
             study = optuna.create_study(
@@ -153,11 +149,7 @@ class SearchSweeper(Sweeper):
 
 
 def load_optuna() -> ModuleType:
-    """Import Optuna.
-
-    Raises:
-        ConfigError: if it is not installed.
-    """
+    """Import Optuna."""
     try:
         import optuna
     except ImportError as error:
@@ -171,9 +163,6 @@ def distribution(optuna: ModuleType, sweep: Override) -> Any:
 
     ``interval(a, b)`` is a real number, with ``tag(int, …)`` a whole one and with ``tag(log, …)``
     drawn on a logarithmic scale; a range or list is one of its values.
-
-    Raises:
-        ConfigError: if an interval is empty, or its logarithm.
     """
     kinds = optuna.distributions
     if not sweep.is_interval_sweep():

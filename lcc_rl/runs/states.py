@@ -63,10 +63,6 @@ def claim(folder: Path) -> Iterator[None]:
     """Lock a run's folder and remove what a killed process left half-written.
 
     The lock is released however the process ends.
-
-    Raises:
-        Busy: if another process holds the lock.
-        ResultsError: if the folder cannot be written.
     """
     made, lock = False, FileLock(folder / LOCK)
     try:
@@ -119,11 +115,7 @@ def working(folder: Path) -> Iterator[None]:
 
 
 def check_present(folder: Path) -> None:
-    """Check that the folder of a run was not removed meanwhile; a file would make it anew.
-
-    Raises:
-        ResultsError: if it is gone.
-    """
+    """Check that the folder of a run was not removed meanwhile; a file would make it anew."""
     if not folder.is_dir():
         raise ResultsError(f"{folder}: cannot be written: the folder was removed during the run")
 
@@ -195,11 +187,7 @@ def read_progress(folder: Path) -> dict[str, float] | None:
 
 
 def run_folders(root: Path) -> list[Path]:
-    """Return the run folders at or below a folder, sorted, without those that contain runs.
-
-    Raises:
-        ResultsError: if there is no such folder.
-    """
+    """Return the run folders at or below a folder, sorted, without those that contain runs."""
     if not root.is_dir():
         raise ResultsError(f"{root}: no such folder")
     found = []
@@ -213,11 +201,7 @@ def run_folders(root: Path) -> list[Path]:
 
 
 def survey(root: Path) -> list[RunState]:
-    """Return the state of every run at or below a folder.
-
-    Raises:
-        ResultsError: if there is no such folder.
-    """
+    """Return the state of every run at or below a folder."""
     return [
         inspect_run(folder, str(folder.relative_to(root)) if folder != root else root.name)
         for folder in run_folders(root)

@@ -222,9 +222,6 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
 
     Returns:
         The function's result; None if it failed.
-
-    Raises:
-        KeyboardInterrupt: if the user stopped the run; it stops the sweep.
     """
     if sys.stdout.isatty():
         mute()
@@ -244,11 +241,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
 
 
 def conclude(folder: Path) -> None:
-    """Log how a sweep ended.
-
-    Raises:
-        LccError: if there was no run or a run failed.
-    """
+    """Log how a sweep ended."""
     states = survey(folder)
     if not states:
         raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")

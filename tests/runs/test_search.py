@@ -100,7 +100,7 @@ def test_an_impossible_interval_is_named(typed) -> None:
 
 
 def test_wrong_settings_are_named(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="directions.*minimize.*got 'down'"):
+    with pytest.raises(ConfigError, match=r"directions.*minimize.*got 'down'"):
         sweeper(tmp_path, directions=["down"])
     with pytest.raises(ConfigError, match="n_trials"):
         sweeper(tmp_path, trials=0)
