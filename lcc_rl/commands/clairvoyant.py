@@ -30,7 +30,7 @@ from lcc_rl.commands.pipeline import root_key
 from lcc_rl.config import load
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import load_inputs
-from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
@@ -87,7 +87,7 @@ def start(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
         ConfigError: if its string has no human drivers.
     """
     policy = load_policy(path, cfg.variant, tuple(cfg.trust))
-    if HUMAN not in string_of(policy[1]).names:
+    if HUMAN not in policy[1].scenario.vehicles.names:
         raise ConfigError(
             f"--policy {path} was trained as variant {policy[1].variant}, which has no human "
             "drivers; expected that of a car with a human behind, such as alcc"

@@ -19,7 +19,7 @@ from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.functional.pattern import RING, VehicleString, parse_string
+from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
 
 
@@ -57,15 +57,6 @@ class Inputs:
         return self.training
 
 
-def string_of(cfg: StudyConfig) -> VehicleString:
-    """Return the string of vehicles of a configuration.
-
-    Raises:
-        ConfigError: pointing at the place in the pattern where it cannot be read.
-    """
-    return parse_string(cfg.scenario.string, cfg.scenario.road)
-
-
 def build_drivers(cfg: StudyConfig) -> Population:
     """Build the human drivers of a configuration.
 
@@ -101,7 +92,7 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
         return Inputs(nobody, nobody, population)
-    wanted = len(string_of(cfg)) if cfg.evaluation.rows == "vehicles" else None
+    wanted = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
     leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, wanted)
     windows, training = leaders.windows, leaders.training
     if len(training):
