@@ -23,8 +23,8 @@ from lcc_rl.cli.entry import main_guard
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.commands.tasks import task_of
 from lcc_rl.config.schemas import EvaluateConfig
-from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.envs.step import entries, pieces_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.strategies import Strategy

@@ -19,7 +19,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.cli.entry import main_guard
-from lcc_rl.commands.reproduce import REPORTS
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
@@ -29,6 +28,7 @@ from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
+from lcc_rl.studies.reproduce import REPORTS
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 RING = "tasks/ring_steps.parquet"

@@ -26,8 +26,7 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from lcc_rl.commands.pipeline import root_key
-from lcc_rl.config import load
+from lcc_rl.config import check_overrides, load
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs
@@ -42,7 +41,6 @@ from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.studies.runner import check_overrides
 
 DRIVERS = 12
 BLOCK = 480  # episodes planned side by side: a few GiB
@@ -165,10 +163,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
-    for word in overrides:
-        if root_key(word) in GIVEN:
-            raise ConfigError(f"{word}: the controller is that of --policy, as it was trained")
-    check_overrides(overrides)
+    check_overrides(overrides, GIVEN, "the controller is that of --policy, as it was trained")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     episodes = plan(options, overrides)
     Console().print(as_rich(summary(episodes), "the whole profile known"))

@@ -14,11 +14,10 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, build
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import build_energy
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.finite import ACTION
-from lcc_rl.envs.inputs import load_inputs
+from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, unknown_name

@@ -18,9 +18,12 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
+from lcc_rl.energy import EnergyModel, Fleet, as_fleet
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
+
+MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,22 @@ def build_drivers(cfg: StudyConfig) -> Population:
     """
     needed = ("desired_speed", "time_gap", "constants")
     return cast(Population, build(cfg.drivers, "drivers", needed))
+
+
+def build_energy(cfg: StudyConfig) -> Fleet:
+    """Build the energy models of a configuration; without the node, that of the ALCC paper.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    node = cfg.energy
+    if node is not None and isinstance(node.get("models"), Mapping):
+        models = {
+            name: build(model, f"energy.models.{name}", EnergyModel)
+            for name, model in node["models"].items()
+        }
+        node = {**node, "models": models}
+    return as_fleet(node and build(node, "energy", MEANT))
 
 
 def build_source(node: Any) -> Any:

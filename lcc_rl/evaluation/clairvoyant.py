@@ -17,9 +17,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.energy import Fleet, as_fleet, build_energy
+from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
-from lcc_rl.envs.inputs import Inputs
+from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import any_leader, pairs

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import Inputs
+from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
