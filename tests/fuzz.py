@@ -34,7 +34,7 @@ from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import constant_profiles, string_of
+from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.errors import LccError
 from lcc_rl.io import memory
 from lcc_rl.runs.interrupts import SIGNALS
@@ -187,7 +187,7 @@ def build_study(overrides: Sequence[str]) -> None:
         if getattr(cfg, key) is not None:
             build(getattr(cfg, key), key)
     if cfg.leader is not None:
-        followers = len(string_of(cfg))
+        followers = len(cfg.scenario.vehicles)
         build(cfg.leader, "leader").load(scenario.time_step, scenario.horizon, followers)
 
 

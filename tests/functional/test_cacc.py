@@ -156,6 +156,21 @@ def test_named_gains_are_stable_and_as_described() -> None:
 # -- reward ----------------------------------------------------------------------------------------
 
 
+TABLE_IV = {  # strategy: Σ|e_v|, Σ|jerk|, Σ reward
+    "CACC": (159.39, 720.06, -59.70),
+    "DDPG": (146.22, 2344.60, -56.81),
+    "HCFS": (25.26, 192.19, -9.64),
+}
+
+
+@pytest.mark.parametrize("strategy", TABLE_IV)
+def test_weights_reproduce_table_iv(strategy) -> None:
+    speed_error, jerk, printed = TABLE_IV[strategy]
+    # The reward is additive in both absolute values, so sums go in as they are.
+    got = PlatoonReward()(torch.tensor(speed_error), torch.tensor(jerk))
+    assert abs(float(got) - printed) < 0.1
+
+
 def test_one_step_reward() -> None:
     # From 10 m/s at 1 m/s² after 0.5: reaches 10.2, leader at 10.5; jerk 2.5.
     got = PlatoonReward(10.0, 20.0, 0.03, 30.0).one_step(
