@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import signal
@@ -49,6 +50,15 @@ def assert_same_tables(one: Path, two: Path) -> None:
     for table in ("training", "episodes", "steps"):
         frames = (read_parquet(folder / f"{table}.parquet") for folder in (one, two))
         pd.testing.assert_frame_equal(*frames, check_exact=True)
+
+
+def content(folder: Path) -> dict[str, str]:
+    """Return a checksum of every file of a folder, those of Hydra included."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 @dataclass(frozen=True)
