@@ -123,7 +123,7 @@ def test_ones_own_module_can_be_trusted_by_name_but_not_by_the_folder(
     [
         ('["data._target_=os.system", "trust=[os]"]', "data._target_ names 'os.system'"),
         ('["data.seed=${oc.env:SECRET}"]', "refers to"),
-        ('["+data={keep: x.csv}"]', "names a place to write"),
+        ('["+data={keep: x.csv}", "variants=[idm]"]', "names a place to write"),
         ('{"a": 1}', "expected a list of settings"),
         ("[" * 100_000, "damaged"),
     ],
