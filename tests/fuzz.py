@@ -1,6 +1,6 @@
 """Fuzzes configurations: random overrides end in a built study or in an error of the package.
 
-The long run: ``python -m tests.fuzz --minutes 10``; a case again: ``--case SEED``.
+The long run: ``python tests/fuzz.py --minutes 10``; a case again: ``--case SEED``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import torch
+from commands import process_state
 
 import lcc_rl.conf
 from lcc_rl.agents.factory import build_agent, learns
@@ -37,12 +37,15 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles, string_of
 from lcc_rl.errors import LccError
 from lcc_rl.io import memory
-from lcc_rl.runs.interrupts import SIGNALS
 
 CONF = Path(lcc_rl.conf.__path__[0])
 # Limits of a case; a training or an evaluation may rightly take longer, and is ended sooner.
 SECONDS, LONGEST, GIGABYTES = 90, 20, 6
-VARIANTS = tuple(sorted(path.stem for path in (CONF / "variant").glob("*.yaml")))
+CHOICES = {
+    folder.name: sorted(path.stem for path in folder.glob("*.yaml"))
+    for folder in sorted(CONF.iterdir())
+    if folder.is_dir() and folder.name not in ("hydra", "logger", "__pycache__")
+}
 SMALL = ("experiment=smoke", "scenario.horizon=20")
 DATA = ("data.platoons=2", "data.recordings=2")
 RECIPES = (
@@ -51,13 +54,6 @@ RECIPES = (
     *("split.by=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
     *("scenario.string=automated*2", "scenario.string={size:6,penetration:0.3}"),
     "controller@scenario.controllers.automated=handover",
-)
-GROUPS = tuple(
-    sorted(
-        path.name
-        for path in CONF.iterdir()
-        if path.is_dir() and path.name not in ("hydra", "logger")
-    )
 )
 # Files, folders, foreign code and machines are the business of other tests.
 FOREIGN = ("_target_", "path", "policy", "resume", "sweep", "keep", "device", "compiled", "trust")
@@ -87,26 +83,22 @@ class TooLong(BaseException):
 def keys_of(variant: str) -> dict[str, Any]:
     """Return the values of a variant's configuration by dotted keys, those of nodes, too."""
     cfg = as_plain(load("train", [f"variant={variant}"]))
-    unused = ("data", "split") if "leader" in cfg and cfg["leader"] is not None else ()
-    return {
-        key: value
-        for key, value in _keys(cfg)
-        if not {*key.split(".")} & {*FOREIGN} and key.partition(".")[0] not in unused
-    }
-
-
-def _keys(node: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in node.items():
-        key = f"{place}.{name}" if place else str(name)
-        yield key, value
+    unused = ("data", "split") if cfg.get("leader") is not None else ()
+    found, left = {}, list(cfg.items())
+    while left:
+        key, value = left.pop(0)
+        if {*key.split(".")} & {*FOREIGN} or key in unused:
+            continue
+        found[key] = value
         if isinstance(value, dict):
-            yield from _keys(value, key)
+            left = [(f"{key}.{name}", x) for name, x in value.items()] + left
+    return found
 
 
 def make(seed: int) -> Case:
     """Return the case of a seed."""
     draw = random.Random(seed)
-    variant = draw.choice(VARIANTS)
+    variant = draw.choice(CHOICES["variant"])
     recipe = draw.choice(RECIPES).split() if draw.random() < 0.4 else []
     goal = draw.choices(("build", "train", "evaluate"), (0.9, 0.05, 0.05))[0]
     ring = "scenario=ring" in recipe
@@ -122,12 +114,10 @@ def _override(draw: random.Random, variant: str) -> str:
         return _number(draw, known)
     key = draw.choice(list(known))
     if kind < 0.75:
-        group = draw.choice(GROUPS)
-        names = [path.stem for path in (CONF / group).glob("*.yaml")]
+        group = draw.choice(list(CHOICES))
         at = draw.choice(("", "", "", "@scenario.controllers.automated", "@deployed"))
-        return (
-            f"{draw.choice(('', '+', '++'))}{group}{at}={draw.choice([*names, 'nobody', 'null'])}"
-        )
+        value = draw.choice([*CHOICES[group], "nobody", "null"])
+        return f"{draw.choice(('', '+', '++'))}{group}{at}={value}"
     if kind < 0.79:
         place = draw.randrange(len(key))
         key = key[:place] + draw.choice(("x", ".", "")) + key[place + draw.randint(0, 1) :]
@@ -154,18 +144,14 @@ def _number(draw: random.Random, known: Mapping[str, Any]) -> str:
 
 
 def attempt(case: Case) -> str:
-    """Carry out a case; return how it ended, ``works``, ``refused`` or ``refused without words``.
-
-    Raises:
-        Exception: any other than the package's own: what a fuzzer is for.
-    """
+    """Carry out a case; return how it ended: an error of the package's own is one way."""
     try:
         if case.goal == "build":
             build_study(case.overrides)
         else:
-            cfg = load("train" if case.goal == "train" else "evaluate", case.overrides)
+            command = training if case.goal == "train" else evaluation
             with tempfile.TemporaryDirectory() as folder:
-                command = training if case.goal == "train" else evaluation
+                cfg = load(case.goal, case.overrides)
                 command.run(cfg, Path(folder) / "run", quiet=True)
     except LccError as error:
         return "refused" if str(error).strip() else "refused without words"
@@ -201,30 +187,22 @@ def limited(seconds: int) -> Iterator[None]:
     def free(device: object = "cpu") -> int:
         return GIGABYTES << 29  # half: torch and its libraries take their part
 
-    handlers = {kind: signal.getsignal(kind) for kind in SIGNALS}
-    before, threads = resource.getrlimit(resource.RLIMIT_DATA), torch.get_num_threads()
+    before = resource.getrlimit(resource.RLIMIT_DATA)
     alarm = signal.signal(signal.SIGALRM, stop)
     signal.alarm(seconds)
     resource.setrlimit(resource.RLIMIT_DATA, (GIGABYTES << 30, before[1]))
     try:
-        with warnings.catch_warnings(), patch.object(memory, "available", free):
+        with process_state("fuzz", (), Path.cwd()), patch.object(memory, "available", free):
             warnings.simplefilter("ignore")
             yield
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, alarm)
         resource.setrlimit(resource.RLIMIT_DATA, before)
-        torch.set_num_threads(threads)
-        for kind, handler in handlers.items():
-            signal.signal(kind, handler)
 
 
 def run(seeds: Iterator[int], deadline: float) -> tuple[Counter[str], list[tuple[Case, str]]]:
-    """Carry out the cases of some seeds until a moment of :func:`time.monotonic`.
-
-    Returns:
-        How many ended how, and those that failed with their traceback.
-    """
+    """Carry out cases until a moment of :func:`time.monotonic`; return counts and failures."""
     counts: Counter[str] = Counter()
     failures = []
     for seed in seeds:
@@ -236,9 +214,8 @@ def run(seeds: Iterator[int], deadline: float) -> tuple[Counter[str], list[tuple
             with limited(SECONDS if short else LONGEST):
                 end = attempt(case)
         except (Exception, TooLong) as error:
-            end = "failed" if short or not isinstance(error, TooLong) else "long"
-            if end == "failed":
-                failures.append((case, traceback.format_exc()))
+            end = "long" if isinstance(error, TooLong) and not short else "failed"
+            failures += [(case, traceback.format_exc())] * (end == "failed")
         counts[f"{case.goal} {end}"] += 1
     return counts, failures
 

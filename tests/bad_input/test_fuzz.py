@@ -12,7 +12,7 @@ import torch
 def test_random_overrides_work_or_are_refused() -> None:
     counts, failures = fuzz.run(iter(range(10)), time.monotonic() + 300.0)
     text = "\n".join(f"{case.overrides}: {trail}" for case, trail in failures)
-    assert not failures, f"python -m tests.fuzz --case {failures[0][0].seed}\n{text}"
+    assert not failures, f"python tests/fuzz.py --case {failures[0][0].seed}\n{text}"
     assert {end.partition(" ")[2] for end in counts} <= {"works", "refused"}
     assert counts["build works"] > 0
     assert counts["build refused"] > 0
