@@ -53,12 +53,12 @@ def test_the_tests_know_every_variant() -> None:
     assert sorted(VARIANTS) == options("variant")
 
 
-@pytest.mark.parametrize("experiment", options("experiment"))
-def test_every_experiment_composes_for_every_command(experiment) -> None:
-    variant = ["variant=ddpg"] if "hcfs" in experiment else []
-    for entry in ("train", "evaluate", "pipeline"):
+@pytest.mark.parametrize("entry", ["train", "evaluate", "pipeline"])
+def test_every_experiment_composes_for_every_command(entry) -> None:
+    for experiment in options("experiment"):
+        variant = ["variant=ddpg"] if "hcfs" in experiment else []
         cfg = load(entry, [f"experiment={experiment}", *variant])
-    assert cfg.training.episodes % cfg.training.environments == 0
+        assert cfg.training.episodes % cfg.training.environments == 0
 
 
 @pytest.mark.parametrize("group", ["data", "drivers", "energy", "leader", "logger", "split"])

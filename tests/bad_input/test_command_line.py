@@ -42,20 +42,15 @@ def run(finished, tmp_path) -> Path:
         ("train variant=alccc", "'alccc'.*'alcc'"),
         ("train variant=idm --experiment 3", "--experiment.*key=value"),
         ("calibrate --seed 3", "--seed"),
-        ("train data=ngsim", "data.path"),
         ("train data=ngsim data.path=nowhere.csv", "nowhere.csv"),
         ("train resume=nowhere", "nowhere"),
-        ("train resume=.", "not a run folder"),
         ("evaluate variant=alcc policy=nowhere", "nowhere"),
         ("pipeline variants=[]", "variants is empty"),
         ("pipeline variant=idm", "variant=idm has no effect on lcc-rl run"),
         (f"pipeline {' '.join(NO_AGENT)} data.recordings=1", "split.by=vehicle"),
         (f"train -m variant=idm {' '.join(LISTS)}", "at most 100000 runs"),
-        ("train hydra.run.dir=file", "file"),
-        ("pipeline hydra.run.dir=file", "file"),
         ("train hydra.run.dir=file/run", "Not a directory"),
         (f"train hydra.run.dir={'x' * 5000}", "too long"),
-        ("train hydra.run.dir=/proc/run", "/proc/run"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> None:
@@ -90,8 +85,8 @@ def test_a_finished_run_is_not_written_over(run, tmp_path, entry) -> None:
     assert content(run) == before
 
 
-@pytest.mark.parametrize("kept", ["checkpoint.pt", "drivers.parquet", "overrides.json"])
-def test_nor_are_drivers_a_stopped_training_or_a_stopped_pipeline(run, tmp_path, kept) -> None:
+@pytest.mark.parametrize("kept", ["checkpoint.pt", "overrides.json"])
+def test_nor_is_a_stopped_training_or_a_stopped_pipeline(run, tmp_path, kept) -> None:
     (run / "episodes.parquet").rename(run / kept)
     before = content(run)
     done = run_command("lcc_rl.cli.evaluate", *RULE, "hydra.run.dir=run", cwd=tmp_path)
@@ -119,7 +114,6 @@ def test_the_same_command_gives_the_same_rows_again(run, tmp_path) -> None:
     "words",
     [
         ("resume=run", "seed=3"),
-        ("resume=run", "training.episodes=abc"),
         ("hydra.run.dir=run", *RULE, "evaluation.drivers=0"),
         ("hydra.run.dir=run", *RULE, "drivers=fixed", "drivers._target_=os.getcwd"),
     ],
@@ -168,19 +162,11 @@ def test_the_second_process_in_a_folder_touches_nothing(tmp_path, entry, monkeyp
 # -- output that nobody reads ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("module", "words"),
-    [
-        ("lcc_rl.cli.status", ("run",)),
-        pytest.param("lcc_rl.cli.train", (*RULE, "hydra.run.dir=new"), marks=pytest.mark.slow),
-    ],
-)
-def test_a_closed_pipe_ends_nothing_and_says_nothing(run, tmp_path, module, words) -> None:
+def test_a_closed_pipe_ends_nothing_and_says_nothing(run, tmp_path) -> None:
+    command = [sys.executable, "-m", "lcc_rl.cli.status", "run"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, "-m", module, *words], cwd=tmp_path, **pipes) as child:
+    with subprocess.Popen(command, cwd=tmp_path, **pipes) as child:
         child.stdout.close()  # as head -0 does
         errors = child.stderr.read().decode()
         assert child.wait(timeout=300) == 0, errors
     assert errors == ""
-    if words[0] != "run":
-        assert inspect_run(tmp_path / "new").state == "finished"

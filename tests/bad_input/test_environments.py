@@ -22,11 +22,8 @@ SEED, GAP = ("episode", "seed"), ("vehicles", "gap")
 BAD = [
     ({("humn", "driver"): torch.zeros(2, 1, 1).long()}, r"humn\.driver is no .*those that exist"),
     ({GAP: torch.zeros(2, 2, 1)}, r"vehicles\.gap is no .*episode\.seed, leader\.profile"),
-    ({"profile": "first"}, "profile is no .*those that exist"),
     ({("episode", "step"): torch.zeros(2, 1).long()}, r"episode\.step is no reset option"),
     ({DRIVER: torch.zeros(2, 1, 1)}, r"human\.driver must be \[2, 1, 1\] torch.int64, got"),
-    ({SEED: torch.full((2, 1), torch.nan)}, r"episode\.seed must be .* got .* torch.float32"),
-    ({DRIVER: "first"}, r"human\.driver must be .* got NonTensorData"),
     ({DRIVER: torch.zeros(2, 3, 1).long()}, r"human\.driver must be .* got \[2, 3, 1\]"),
     ({DRIVER: torch.full((2, 1, 1), 10**6)}, r"human\.driver must lie in 0…\d+, got 1000000"),
     ({SEED: torch.tensor([[1], [-3]])}, r"episode\.seed must lie in 0…4294967295, got -3"),
@@ -57,11 +54,6 @@ def test_every_way_to_reset_refuses_them(envs) -> None:
         env.reset(TensorDict({SEED: torch.zeros(3, 1).long()}, [3]))
 
 
-def test_the_last_window_of_a_record_can_be_chosen(envs) -> None:
-    last = TensorDict({PROFILE: torch.tensor([[0], [1]]), START: torch.full((2, 1), 379)}, [2])
-    assert (envs["group"].reset(last)[START] == 379).all()
-
-
 @pytest.mark.parametrize("kind", ["group", "single"])
 def test_a_whole_moment_may_be_given_and_replays_its_episode(envs, kind) -> None:
     env, given = envs[kind], TensorDict({SEED: torch.tensor([[3], [4]])}, [2])
@@ -81,10 +73,8 @@ def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
 @pytest.mark.parametrize(
     ("size", "seed", "words"),
     [
-        ((10**5, 10**5), 0, r"batch_size=.* needs about \d+.* of memory"),
         (10**30, 0, r"batch_size=.* needs about \d+.* of memory"),
         ((), -1, "seed must be"),
-        ((), 0.5, "seed must be"),
     ],
 )
 def test_an_impossible_batch_or_seed(size, seed, words) -> None:
@@ -113,8 +103,7 @@ class Remembering(Controller):
 
     def setup(self, world) -> None:
         super().setup(world)
-        self.last, self.seen = None, deque()
-        self.register_buffer("total", torch.zeros(()))
+        self.last, self.seen, self.total = None, deque(), torch.zeros(())
 
     def command(self, speed):
         if self.how == "last":

@@ -67,17 +67,12 @@ FOREIGN: list[tuple[dict[str, object] | str, str]] = [
     ({TARGET: "mine.Comfort"}, "names 'mine.Comfort'.*trust="),
     ({TARGET: "lcc_rl.config.import_module"}, TARGET),
     ({TARGET: "lcc_rl.data.episodes.write_episodes"}, TARGET),
-    ({"trust": ["os"], TARGET: "os.system"}, TARGET),
     ({"seed": "${oc.env:SECRET}"}, "seed refers to"),
-    ({"data.path": "'x${lcc.folder:a,b}y'"}, "data.path refers to"),
     ("seed: !!python/object:os.system {}", "damaged"),
     (": [", "damaged"),
     ("[" * 100_000, "damaged"),
-    ("\x00", "damaged"),
     ({"agent": "ddpg"}, "agent: expected a node"),
-    ({"seed": "abc"}, "seed must be"),
     ({"scenario": None}, "scenario must be"),
-    ({"scenario.pieces": []}, r"scenario\.pieces must be"),
 ]
 
 
@@ -140,25 +135,14 @@ def test_a_stopped_pipeline_of_somebody_else(tmp_path, stored, words) -> None:
     assert not list(tmp_path.rglob("x.csv"))
 
 
-def test_a_resumed_run_may_be_given_a_logger_and_nothing_else(run) -> None:
-    words = (f"resume={run}", "logger=rows", "logger.kind=typo")
-    assert "logger.kind" in run_command("lcc_rl.cli.train", *words, cwd=run.parent).stderr
-    done = run_command("lcc_rl.cli.train", f"resume={run}", "seed=3", cwd=run.parent)
-    assert "seed=3" in done.stderr
-
-
 def test_keep_never_overwrites(tmp_path) -> None:
     path, small = tmp_path / "stream.csv", {"recordings": 1, "platoons": 2, "vehicles": 3}
-    StreamSource(**small, keep=str(path)).load()
+    for _ in range(2):  # the same again is fine
+        StreamSource(**small, keep=str(path)).load()
     before = content(tmp_path)
-    StreamSource(**small, keep=str(path)).load()  # the same again is fine
     with pytest.raises(ConfigError, match=r"data\.keep: .*stream\.csv exists and holds something"):
         StreamSource(**small, seed=1, keep=str(path)).load()
     assert content(tmp_path) == before
-    path.unlink()
-    with pytest.raises(ConfigError, match=r"stream_truth\.parquet exists"):
-        StreamSource(**small, seed=1, keep=str(path)).load()
-    assert not path.exists()
 
 
 # -- weights ---------------------------------------------------------------------------------------
@@ -172,18 +156,17 @@ class Evil:
 
 
 def policy_with(path: Path, weights: object = None, **changes: object) -> None:
-    """Change a policy's weights or settings; entries of settings have names as ``agent.gamma``."""
+    """Change a policy's weights, or its settings by their dotted keys."""
     policy = torch.load(path, weights_only=True)
-    old, own = policy["weights"], isinstance(weights, dict) and bool(weights)
-    new = {**old, **weights} if own else weights
-    config = changed(policy["config"], changes)
-    torch.save({"weights": old if weights is None else new, "config": config}, path)
+    old = policy["weights"]
+    new = old | weights if isinstance(weights, dict) else weights or old
+    torch.save({"weights": new, "config": changed(policy["config"], changes)}, path)
 
 
 def one_wrong_byte(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0x10
-    path.write_bytes(content)
+    old = bytearray(path.read_bytes())
+    old[len(old) // 2] ^= 0x10
+    path.write_bytes(old)
 
 
 # What a policy's file may not be.
@@ -192,12 +175,7 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
     "malicious archive": lambda path: torch.save(Evil(), path),
     "other type": lambda path: policy_with(path, {"more": bytearray(9)}),
     "one wrong byte": one_wrong_byte,
-    "truncated": lambda path: path.write_bytes(path.read_bytes()[:1000]),
-    "text": lambda path: path.write_text("weights"),
-    "missing": lambda path: path.unlink(),
     "list": lambda path: policy_with(path, [1]),
-    "empty": lambda path: policy_with(path, {}),
-    "number": lambda path: policy_with(path, {WEIGHT: 1}),
     "not a number": lambda path: policy_with(path, {WEIGHT: torch.full((16, 7), torch.nan)}),
     "no entries": lambda path: torch.save({"config": ""}, path),
     "no agent": lambda path: policy_with(path, agent=None),
@@ -217,7 +195,6 @@ FITS = [
     ({"weights": {WEIGHT: torch.ones(3, 3)}}, "alcc", r"p\.pt.*trained with 3 observed entries"),
     ({"weights": {"more": torch.ones(1)}}, "alcc", r"p\.pt.*Unexpected key"),
     ({"agent._target_": "lcc_rl.agents.SAC"}, "idm", r"p\.pt.*unknown setting"),
-    ({"agent.hidden": [8, 8]}, "idm", r"p\.pt.*size mismatch"),
     ({"scenario.time_step": 0.5}, "idm", r"p\.pt.*scenario\.time_step=0\.5, got 0\.1"),
     ({"scenario.controllers.automated.max_acceleration": 1.0}, "alcc", r"max_acceleration=1\.0"),
     ({}, "reference", "trained as variant alcc"),
@@ -252,7 +229,7 @@ def test_a_checkpoint_that_does_not_fit(run) -> None:
     assert content(run) == before
 
 
-@pytest.mark.parametrize("place", ["pipe", "folder", "/dev/zero", "nothing"])
+@pytest.mark.parametrize("place", ["pipe", "folder", "nothing"])
 def test_what_is_no_file_is_not_waited_for(tmp_path, place) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()

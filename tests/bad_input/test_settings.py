@@ -21,40 +21,31 @@ AUTO = "scenario.controllers.automated"
 WRONG = {
     # unknown names
     "sead=3": "'sead'.*'seed'",
-    "+sead=3": "'sead'.*'seed'",
     "agent=dddpg": "agent 'dddpg'.*'ddpg'",
-    "hydra/launcher=cluster": "hydra/launcher 'cluster'",
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "reward.terms.safty.weight=1": "'safty'",
-    "training.epsodes=3": "training .*'episodes'",
     "data.sede=3": "data .*'seed'",
     # types
     "seed=abc": "seed must be .* integer",
     "agent=null": "agent=null",
     "scenario.pieces.ttc=5": "ttc: expected a node",
     "data.path=a (copy).csv": r"data\.path=a \(copy\)\.csv.*quotes",
-    "scenario.initial_speed=${nowhere}": "nowhere",
     "+scenario.controllers.human.time_gap=${scenario}": "parent node",
     "~drivers": "drivers is required",
     f"~{AUTO}": "names only human",
     # ranges
     "scenario.time_step=nan": "scenario.time_step must be .*finite",
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
-    "training.gap_range=[inf,1]": "gap_range.* must be .*finite",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "reward.terms.safety.weight=-1": "reward.terms.safety.weight must be greater",
     "agent.gamma=nan": "gamma",
-    "agent.hidden=[-1]": "hidden",
     "agent.batch_size=50000": "buffer_size",
     "training.episodes=25": "training.episodes",
-    "matmul_precision=medum": "'medium'",
     "+logger={_target_: lcc_rl.runs.loggers.RowLogger, kind: paper}": "kind must be one of",
     # objects of another kind
     "data._target_=os.getcwd": "data.*",
-    f"{AUTO}._target_=fractions.Fraction": "automated.*Fraction",
     "reward.terms.safety._target_=nowhere.X": "cannot find 'nowhere.X'",
     "device=meta": "device must be .* got 'meta'",
-    "device=cuda:77": "device 'cuda:77' is not available",
     # what does not fit together
     "scenario.string='automated bus'": "role 'bus', but .* only automated, human",
     "scenario.string='automated (human*2'": "never closed at character 11",
@@ -65,14 +56,12 @@ WRONG = {
     # sizes that no machine has
     f"training.environments={HUGE} training.episodes={HUGE}": "training.environments=.* needs",
     f"agent.buffer_size={HUGE}": "agent.buffer_size=.* needs about .* PiB",
-    f"agent=analytic training.environments={HUGE} training.episodes={HUGE}": "needs about",
     "scenario.string='automated human*100000000'": "10000 vehicles",
     f"data.platoons={HUGE}": r"platoons × vehicles = \d+.* needs about",
 }
 # Options without effect on the variant, and why.
 IGNORED = {
     "variant=cacc split.by=vehicle": "leader=trajectories",
-    "variant=cacc drivers=kde": "there is no human driver",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "variant=idm training.episodes=20": "variant idm learns nothing",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
@@ -118,11 +107,6 @@ def test_a_bad_setting_of_a_calibration_is_named(tmp_path, typed, words) -> None
         calibration.run(load("calibrate", [typed]), tmp_path)
 
 
-def test_a_learner_is_no_variant_that_learns_nothing(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="variant=idm learns nothing: remove agent="):
-        training.run(load("train", ["variant=idm", "agent=ddpg"]), tmp_path)
-
-
 def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
     tmp_path, monkeypatch
 ) -> None:
@@ -133,13 +117,12 @@ def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
         evaluation.run(cfg, tmp_path)
 
 
-@pytest.mark.parametrize("name", ["big.csv.gz", "big.parquet"])
-def test_tables_larger_than_memory(tmp_path, monkeypatch, name) -> None:
-    frame, path = long_table(rows=200), tmp_path / name
-    frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
+def test_a_table_larger_than_memory(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "big.csv.gz"
+    long_table(rows=200).to_csv(path, index=False)
     columns = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
     source = TableSource(path=str(path), columns=columns)
     source.load()
     monkeypatch.setattr(memory, "available", lambda device: 29_000)
-    with pytest.raises(ConfigError, match=rf"reading .*{name} needs about"):
+    with pytest.raises(ConfigError, match=r"reading .*big\.csv\.gz needs about"):
         source.load()
