@@ -7,10 +7,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
-from commands import AGENT, HORIZON, run_command
+from commands import AGENT, HORIZON
 from helpers import slow_but
 
-from lcc_rl import results
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
@@ -98,12 +97,3 @@ def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
     reward = rows[rows["case"] == "windows"].groupby("strategy")["reward"].sum()
     if variant == "hcfs":
         assert reward["hcfs"] > 1.1 * max(reward["cacc tuned"], reward["ddpg"])
-
-
-@pytest.mark.slow
-def test_sweep_as_typed(tmp_path) -> None:
-    words = ["-m", "variant=cacc,ddpg,hcfs", *TINY, "training.episodes=8", "hydra.sweep.dir=sweep"]
-    run_command("lcc_rl.cli.train", *words, cwd=tmp_path, check=True)
-    frame = results.load(tmp_path / "sweep")
-    assert frame["variant"].nunique() == 3
-    assert {"agent.gamma", "gains.k3", "deployed.jerk_bound"} <= set(frame)

@@ -16,7 +16,6 @@ from commands import content, run_command, tiny
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation, training
-from lcc_rl.config import load
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
@@ -219,14 +218,6 @@ def test_a_compared_policy_drives_with_its_own_controller(trained, tmp_path) -> 
     cfg = tiny("evaluate", "variant=idm", f"compare=[{path}]", agent=False)
     rows = evaluation.run(cfg, tmp_path / "out", quiet=True)
     assert "alcc" in set(rows["strategy"])
-
-
-def test_a_checkpoint_that_does_not_fit(run) -> None:
-    shutil.copy(run / "policy.pt", run / "checkpoint.pt")
-    before = content(run)
-    with pytest.raises(ResultsError, match=r"checkpoint\.pt: (does not fit|belongs to another)"):
-        training.run(load("train", [f"resume={run}"]), run, quiet=True)
-    assert content(run) == before
 
 
 @pytest.mark.parametrize("place", ["pipe", "folder", "nothing"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from io import StringIO
 
 import numpy as np
 import pandas as pd
@@ -12,17 +11,14 @@ import torch
 from commands import tiny
 from helpers import ACTION, compose, network, single_env, small_env
 from platoons import env_of, hcfs, ramps
-from rich.console import Console
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.drivers.fit import fit
-from lcc_rl.drivers.genetic import GeneticSettings, minimise
+from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.errors import DataError, Diverged
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.figures.page import Page
 from lcc_rl.pieces import IDM, Controller, Feature, MotorPower, RewardTerm
-from lcc_rl.results.tables import strategies_side_by_side
 
 
 def nan_at(step, value, at=3):
@@ -160,23 +156,6 @@ def test_a_training_names_what_it_would_have_learned_from(own, overrides, words,
     assert not (tmp_path / "run" / "policy.pt").exists()
 
 
-# -- what else computes ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-def test_an_individual_whose_objective_is_no_number_is_unfit(number) -> None:
-    settings = GeneticSettings(population=8, generations=4)
-
-    def found(objective):
-        bounds = torch.zeros(1), torch.ones(1)
-        return minimise(objective, *bounds, 2, torch.Generator().manual_seed(0), settings)
-
-    half = found(lambda x: torch.where(x[..., 0] > 0.5, number, (x[..., 0] - 0.25).abs()))
-    assert (half.best < 0.5).all()
-    hopeless = found(lambda x: torch.full(x.shape[:-1], number))
-    assert (hopeless.fitness == math.inf).all()
-
-
 def test_a_calibration_without_any_fit_names_the_episode() -> None:
     time = 0.1 * np.arange(200)
     still = pd.DataFrame({"time_s": time, "follower_speed_mps": 0.0, "leader_speed_mps": 0.0})
@@ -184,19 +163,3 @@ def test_a_calibration_without_any_fit_names_the_episode() -> None:
     observed = observe(still.assign(leader_length_m=5.0), Selection(min_mean_speed_mps=0.0))
     with pytest.raises(DataError, match=r"episode 7 .*no local parameters .* finite speed_rmspe"):
         fit(observed, genetic=GeneticSettings(population=4, generations=1))
-
-
-@pytest.mark.parametrize("number", [math.nan, -math.inf])
-def test_no_table_shows_what_is_no_number(number, tmp_path) -> None:
-    frame = pd.DataFrame({"strategy": ["a", "b"], "x": [1.0, number], "n": [1, 2]})
-    frame = frame.assign(x_low=[number, number], x_high=[2.0, number])
-    made = Page(tmp_path)
-    made.add("s", tables=[("", "c", frame)])
-    page = made.write("t").read_text().partition("<tbody>")[2]
-    console = Console(file=StringIO(), width=80)
-    rows = [("x", "x", "{:.2f}"), ("n", "n", "{:d}")]
-    console.print(strategies_side_by_side(frame, rows, "t", "c"))
-    for text in (page, console.file.getvalue()):
-        assert "–" in text
-        assert "nan" not in text
-        assert "inf" not in text
