@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
-from numbers import Integral, Real
-from typing import Any
 
 
 class LccError(Exception):
@@ -45,75 +43,12 @@ class Diverged(LccError):
 LARGEST = 1e9
 # Far beyond what fits into memory, which is said with what is needed; and seeds.
 LARGEST_SIZE, LAST_SEED = 10**15, 2**31 - 1
-WORDS = {
-    "(-inf, inf)": "be a number",
-    "(0, inf)": "be positive",
-    "[0, inf)": "not be negative",
-}
 
 
 def require(condition: bool, message: str) -> None:
     """Raise a ConfigError with the message unless the condition holds."""
     if not condition:
         raise ConfigError(message)
-
-
-def require_in(where: str, interval: str, **settings: Any) -> None:
-    """Check that settings of one piece or agent are numbers in an interval.
-
-    Args:
-        where: what has the settings: their place in the configuration.
-        interval: an interval such as ``"[0, 1)"``; with an infinite end it reaches to
-            :data:`LARGEST`.
-        **settings: the values by name.
-
-    Raises:
-        ConfigError: naming the first that is no number, not finite or outside, as
-            ``where.setting``.
-
-    Examples:
-        >>> require_in("agent", "[0, 1)", gamma=0.9)
-    """
-    low, high = (float(end) for end in interval[1:-1].split(","))
-    for name, value in settings.items():
-        number = isinstance(value, Real) and not isinstance(value, bool)
-        bounded = number and abs(value) <= LARGEST
-        if (
-            bounded
-            and (low < value or (interval[0] == "[" and value == low))
-            and (value < high or (interval[-1] == "]" and value == high))
-        ):
-            continue
-        wanted = WORDS.get(interval, f"lie in {interval}")
-        if interval in WORDS and not bounded:
-            wanted += f", and a finite number up to {LARGEST:g}"
-        raise ConfigError(f"{where}.{name} must {wanted}, got {value!r}")
-
-
-def require_positive(where: str, **settings: Any) -> None:
-    """Check that settings of one piece or agent are positive numbers; see :func:`require_in`."""
-    require_in(where, "(0, inf)", **settings)
-
-
-def require_whole(where: str, least: int, most: int | None = None, **settings: Any) -> None:
-    """Check that settings are whole numbers in a range: sizes, counts and seeds.
-
-    Args:
-        where: what has the settings; empty for options that belong to nothing.
-        least, most: the range; without ``most`` up to :data:`LARGEST_SIZE`.
-        **settings: the values by name.
-
-    Raises:
-        ConfigError: naming the first that is not, as ``where.setting``.
-    """
-    last = LARGEST_SIZE if most is None else most
-    for name, value in settings.items():
-        whole = isinstance(value, Integral) and not isinstance(value, bool)
-        if not (whole and least <= value <= last):
-            key = f"{where}.{name}" if where else name
-            small = most is None and not (whole and value > last)
-            bounds = f"from {least} up" if small else f"from {least} to {last}"
-            raise ConfigError(f"{key} must be a whole number {bounds}, got {value!r}")
 
 
 def how_to_install(extra: str) -> str:

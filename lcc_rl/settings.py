@@ -15,11 +15,12 @@ one :class:`ConfigError` that names the setting.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, validate_call
 from pydantic.dataclasses import dataclass
 
 from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
@@ -33,6 +34,7 @@ Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 S = TypeVar("S", bound="Settings")
+R = TypeVar("R")
 
 
 @dataclass_transform(kw_only_default=True, eq_default=False)
@@ -79,11 +81,11 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
         raise
 
 
-def refused(error: ValidationError, kind: type[Settings], where: str) -> ConfigError:
+def refused(error: ValidationError, kind: Any, where: str) -> ConfigError:
     """Return the one-line error for the first setting that pydantic refused."""
     first = error.errors()[0]
     if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
-        known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        known = [field.name for field in dataclasses.fields(kind)]
         what = f"setting of {where} ({kind.__name__})" if where else "option"
         return unknown_name(what, str(first["loc"][-1]), known)
     parts = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
@@ -95,6 +97,21 @@ def refused(error: ValidationError, kind: type[Settings], where: str) -> ConfigE
     return ConfigError(
         f"{key} {first['msg'].replace('Input should', 'must')}, got {first['input']!r}"
     )
+
+
+def checked(function: Callable[..., R]) -> Callable[..., R]:
+    """Decorate a function so that its annotated arguments are checked like settings."""
+    call = validate_call(config=STRICT)(function)
+    names = inspect.signature(function)
+
+    @wraps(function)
+    def checking(*args: Any, **given: Any) -> R:
+        try:
+            return call(**names.bind(*args, **given).arguments)
+        except ValidationError as error:
+            raise refused(error, function, function.__name__) from error
+
+    return checking
 
 
 def values(settings: Settings) -> dict[str, Any]:
@@ -116,7 +133,7 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Settings):
-        return values(value)
+        return {name: _plain(held) for name, held in values(value).items()}
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -20,7 +20,6 @@ WINDOW_S = 30.0
 UNITS = {"speed": "m/s", "acceleration": "m/s²", "energy": "kJ"}
 # Compared beside the quantiles; the mean of acceleration is close to zero.
 LEVEL = {"speed": "mean", "acceleration": "std", "energy": "mean"}
-ROLES = ("leader", "follower")
 
 
 def motion(episodes: pd.DataFrame, role: str = "leader") -> dict[str, NDArray[np.float64]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from lcc_rl.results.means import Means
+
 # Mean energies of the controlled car [kJ]: by training seed, the same for every driver.
 CARS = {"idm": {None: 100.0}, "reference": {0: 80.0, 1: 90.0}, "alcc": {0: 88.0, 1: 84.0}}
 HUMANS = {"direct": 60.0, "idm": 50.0, "reference": 50.0, "alcc": 40.0}
@@ -25,6 +27,11 @@ def episodes(drivers: int = 3, profiles: int = 2) -> pd.DataFrame:
     ]
     frame = pd.DataFrame(rows)
     return frame.astype({"training_seed": "Int64"})
+
+
+def windows(profiles: int = 2) -> pd.DataFrame:
+    """The means of :func:`episodes` over the drivers."""
+    return Means.of(episodes(profiles=profiles)).windows
 
 
 def row(strategy: str, seed: int | None, profile: int, driver: int) -> dict[str, object]:

@@ -91,8 +91,9 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     drivers = read_parquet(job / "calibration" / "drivers.parquet")
     assert rows["desired_speed_mps"].isin(drivers["desired_speed_mps"].astype("float32")).all()
     # Completing a complete job changes nothing, and no place to write that a file names is used.
-    stored = json.loads((job / "overrides.json").read_text())
-    (job / "overrides.json").write_text(json.dumps([*stored, "data.keep=x.csv"]))
+    for path in job.rglob("config.yaml"):
+        path.write_text(path.read_text().replace("keep: null", "keep: x.csv"))
+    assert "keep: x.csv" in (job / "config.yaml").read_text()
     run_command("lcc_rl.cli.pipeline", f"resume={job}", cwd=tmp_path, check=True)
     again = read_parquet(job / "evaluation" / "episodes.parquet")
     pd.testing.assert_frame_equal(rows, again, check_exact=True)

@@ -1,7 +1,8 @@
-"""Keep the small tables behind a page: python tools/keep.py lengths|means <folder>… --out <path>
+"""Keep the small tables behind a page: python tools/keep.py <what> <folder>… --out <path>
 
 lengths: the held-out windows of HCFS studies whose trainings differ in length, one file.
-means: of one evaluation, the means per window and per driver, two files in a folder.
+means: the means of one evaluation per window and per driver, two files in a folder.
+alcc: those of an ALCC study's main part, its learning curves, an episode and its drivers.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ from pathlib import Path
 
 import pandas as pd
 
+from lcc_rl import results
 from lcc_rl.cli.entry import main_guard
-from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.studies.hcfs.study import TRAINING
+from lcc_rl.results.means import EPISODES, TRAINED, Means
+from lcc_rl.studies.alcc.report import CURVES, MAIN
+from lcc_rl.studies.alcc.study import DRIVERS
+from lcc_rl.studies.hcfs.study import STEPS, TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
-from lcc_rl.studies.runner import EPISODES
 
-TRAINED = ["strategy", "training_seed"]
-NUMBERS = ("profile_id", "driver_id", "training_seed")  # name a thing, measure none
-GROUPS = {"windows": ["profile_id", "profile"], "drivers": ["driver_id"]}
+# Columns of the learning curves that are kept, besides the terms of the reward.
+CURVE = ("variant", "seed", "iteration", "episodes", "updates", "episode_reward", "collisions")
 
 
 def lengths(studies: Sequence[Path], path: Path) -> None:
@@ -42,32 +44,39 @@ def lengths(studies: Sequence[Path], path: Path) -> None:
     write_parquet(pd.concat(parts, ignore_index=True), path)
 
 
-def means(folder: Path, target: Path) -> None:
-    """Keep the mean of every measure per window and per driver; of ``min_…``, ``max_…`` these."""
-    rows = read_parquet(folder / EPISODES)
-    rows = rows.assign(collided=rows["collided"].astype("float32"))
-    measures = [str(name) for name in rows.select_dtypes("number") if name not in NUMBERS]
-    ends = {"min": "min", "max": "max"}
-    how = {name: ends.get(name.partition("_")[0], "mean") for name in measures}
-    for name, by in GROUPS.items():
-        groups = rows.groupby([*TRAINED, *by], dropna=False, as_index=False, observed=True)
-        kept = groups.agg(how)
-        kept[measures] = kept[measures].astype("float32").round(4)
-        write_parquet(kept, target / f"{name}.parquet")
+def means(evaluations: Sequence[Path], target: Path) -> None:
+    """Keep the means of an evaluation per window and per driver."""
+    Means.of(read_parquet(evaluations[0] / EPISODES)).write(target)
+
+
+def alcc(studies: Sequence[Path], target: Path) -> None:
+    """Keep what the page of an ALCC study shows of its main part."""
+    study = studies[0]
+    means([study / MAIN], target / MAIN)
+    steps = read_parquet(study / MAIN / STEPS)
+    steps = steps[steps["strategy"] == "alcc"]
+    keys = ["training_seed", "profile", "driver_id"]
+    first = (steps[keys] == steps[keys].iloc[0]).all(axis=1)
+    write_parquet(steps[first], target / MAIN / STEPS)
+    curves = results.load(study / "train", "training")
+    shown = [x for x in curves if x in CURVE or str(x).startswith("reward_")]
+    curves = curves[shown]
+    rewards = curves.select_dtypes("float").columns
+    write_parquet(curves.astype(dict.fromkeys(rewards, "float32")), target / CURVES)
+    write_parquet(read_parquet(study / DRIVERS), target / DRIVERS)
+
+
+KINDS = {"lengths": lengths, "means": means, "alcc": alcc}
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Keep what is asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("what", choices=("lengths", "means"))
-    parser.add_argument("folders", nargs="+", type=Path, help="studies, or one evaluation")
+    parser.add_argument("what", choices=KINDS)
+    parser.add_argument("folders", nargs="+", type=Path, help="studies, or evaluations")
     parser.add_argument("--out", type=Path, required=True, help="the file, or the folder")
     options = parser.parse_args(words)
-    if options.what == "lengths":
-        lengths(options.folders, options.out)
-    else:
-        require(len(options.folders) == 1, "means: of one evaluation")
-        means(options.folders[0], options.out)
+    KINDS[options.what](options.folders, options.out)
     return 0
 
 

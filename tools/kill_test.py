@@ -30,7 +30,7 @@ import torch
 from matplotlib.image import imread
 
 from lcc_rl.cli import evaluate, pipeline, train
-from lcc_rl.commands.pipeline import OVERRIDES
+from lcc_rl.commands.pipeline import COMMAND
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.data.episodes import write_episodes
@@ -99,7 +99,7 @@ class Job:
         # A shell that starts this in the background makes it, and all below it, deaf to SIGINT.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         words = [*self.words, f"{self.where}={folder}"]
-        if (folder / OVERRIDES).exists():
+        if (folder / COMMAND).exists():
             words = [f"resume={folder}"]
         sys.argv = [self.main.__module__, *words]
         code = 0

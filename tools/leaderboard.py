@@ -137,8 +137,9 @@ def write_tables(reference: Path, page: Path) -> None:
         if "score_name" not in table:  # of fleets
             continue
         first = {str(key): value for key, value in table.iloc[0].items()}
-        limits = {x.removeprefix(LIMIT): first[x] for x in first if x.startswith(LIMIT)}
-        task = Task(path.stem, first["score_name"], first["unit"], first["against"], limits)
+        limits = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
+        given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
+        task = Task(name=path.stem, limits=limits, **given)
         parts.append(f"### {path.stem}\n\n{first['windows']} windows.\n\n{drawn(task, table)}\n")
     text = page.read_text()
     require(BEGIN in text and END in text, f"{page}: it lacks the lines {BEGIN} and {END}")

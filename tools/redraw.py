@@ -1,6 +1,6 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
-The tables of docs/tasks.md and docs/hcfs.md, docs/reports, and of docs/figures: fleets.png,
+The tables of docs/{alcc,hcfs,tasks}.md, docs/reports, and of docs/figures: fleets.png,
 fleets_ring.png, limits.png, record.png and ring.png. The other figures need runs that were not
 kept, recorded data, or tools of earlier commits.
 """
@@ -19,6 +19,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.cli.entry import main_guard
+from lcc_rl.commands.reproduce import REPORTS
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
@@ -29,7 +30,6 @@ from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.studies.hcfs import report as hcfs_report
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 RING = "tasks/ring_steps.parquet"
@@ -107,11 +107,11 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     return [page, *(figures / name for name in names)]
 
 
-def redraw_hcfs(reference: Path, docs: Path) -> list[Path]:
-    """Write the tables of the study's page, and the page of its figures; return the files."""
-    page, report = docs / "hcfs.md", docs / "reports" / "hcfs.html"
+def redraw_study(name: str, reference: Path, docs: Path) -> list[Path]:
+    """Write the tables of a study's page, and the page of its figures; return the files."""
+    page, report = docs / f"{name}.md", docs / "reports" / f"{name}.html"
     report.parent.mkdir(exist_ok=True)
-    shutil.copyfile(hcfs_report.write_results(reference / "hcfs", page=page), report)
+    shutil.copyfile(REPORTS[name](reference / name, (), page), report)
     return [page, report]
 
 
@@ -126,7 +126,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.ring is not None:
         keep_ring(options.ring, options.reference / RING)
     print(*redraw(options.reference, options.figures, Path(options.page)), sep="\n")
-    print(*redraw_hcfs(options.reference, Path(options.page).parent), sep="\n")
+    for name in REPORTS:
+        print(*redraw_study(name, options.reference, Path(options.page).parent), sep="\n")
     return 0
 
 

@@ -11,7 +11,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file, in_words
 from lcc_rl.io.files import read_parquet
@@ -19,6 +19,7 @@ from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 from lcc_rl.results.runs import CONFIG, stored_config
 
 STEPS = "steps.parquet"
+KEPT = "evaluation.sample_episodes=4"
 
 
 def run(
@@ -47,11 +48,12 @@ def run(
         ConfigError: if there is no such run, strategy, episode, ending or time.
         ResultsError: if no sample episode is stored, or the file cannot be written.
     """
-    folder = _with_steps(Path(folder))
+    folder = with_steps(Path(folder))
     if out is not None:
         check_ending(Path(out))
     steps = read_parquet(folder / STEPS)
-    require(bool(len(steps)), f"{folder}: holds no sample episode; evaluate with {KEPT}")
+    if steps.empty:
+        raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
     names = list(dict.fromkeys(map(str, steps["strategy"])))
     strategy = names[-1] if strategy is None else strategy
     if strategy not in names:
@@ -68,8 +70,6 @@ def run(
 
 def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
     """Return the part of an episode that is shown."""
-    require(start >= 0.0, f"--start must be at least 0, got {start:g}")
-    require(duration is None or duration > 0.0, f"--duration must be positive, got {duration}")
     end = float("inf") if duration is None else start + duration
     inside = ((motion.time >= start) & (motion.time <= end)).nonzero()[0]
     if len(inside) < 2:
@@ -81,10 +81,7 @@ def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
     return motion.at(slice(inside[0], inside[-1] + 1))
 
 
-KEPT = "evaluation.sample_episodes=4"
-
-
-def _with_steps(folder: Path) -> Path:
+def with_steps(folder: Path) -> Path:
     """Return the folder that holds a run's sample episodes; of a main job its evaluation."""
     for place in (folder, folder / "evaluation"):
         if (place / STEPS).is_file():

@@ -17,8 +17,7 @@ from rich.table import Table
 from lcc_rl.config import config_hash
 from lcc_rl.config.nodes import CALLED, build
 from lcc_rl.config.schemas import CalibrateConfig
-from lcc_rl.drivers.calibrator import Calibrator
-from lcc_rl.drivers.fit import OUT, Calibration
+from lcc_rl.drivers.calibrator import OUT, Calibration, Calibrator
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source

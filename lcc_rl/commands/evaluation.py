@@ -11,9 +11,8 @@ import pandas as pd
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_sizes, check_variant
-from lcc_rl.commands.maps import write_responses
 from lcc_rl.commands.tasks import check_named, only_named, task_of
-from lcc_rl.config import identity, is_sweep
+from lcc_rl.config import identity
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
@@ -33,7 +32,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
-from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
+from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import as_rich as scores_as_rich
 from lcc_rl.results.scores import scores
@@ -78,18 +77,11 @@ def run(
     """
     folder = Path(folder)
     if cfg.resume is not None:
-        folder, cfg = Path(cfg.resume), _resumed(cfg.resume, cfg.trust)
+        folder, cfg = Path(cfg.resume), load_config(cfg.resume, cfg.trust)
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
         return _run(cfg, folder, own, quiet, replace)
-
-
-def _resumed(folder: str, trust: Sequence[str]) -> EvaluateConfig:
-    """Return the configuration of a stopped evaluation."""
-    check_links(Path(folder))
-    own: EvaluateConfig = load_config(folder, trust)
-    return own
 
 
 def complete(cfg: EvaluateConfig, folder: Path) -> None:
@@ -118,21 +110,14 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
-    if isinstance(rows, pd.DataFrame) and cfg.evaluation.shards == 1 and not is_sweep():
-        write_responses(strategies, cfg, inputs.population, folder, {IDENTITY: identity(cfg)})
     if not quiet and isinstance(rows, pd.DataFrame):
-        draw(folder, cfg.evaluation.rows)
+        # Here: a training, which draws nothing, need not load matplotlib.
+        from lcc_rl.figures.evaluation import write_figures
+
+        write_figures(folder, cfg.evaluation.rows)
     elif not quiet:
         log.info("no figures: there are more than %d rows", FEW)
     return rows
-
-
-def draw(folder: Path, rows: str = "episodes") -> None:
-    """Draw the figures of an evaluation, whose rows are ``episodes`` or ``vehicles``."""
-    # Here: a training, which draws nothing, need not load matplotlib.
-    from lcc_rl.figures.evaluation import write_figures
-
-    write_figures(folder, rows)
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:

@@ -1,21 +1,32 @@
-"""Maps of the policies of an evaluation: which are drawn, where, and their rows."""
+"""Map the policies of an evaluation: lcc-rl maps outputs/evaluate/<run>.
+
+A map shows the acceleration over gap and relative speed, at two speeds and within axes that the
+sample episodes visit, of the learned strategies and of a tuned rule.
+"""
 
 from __future__ import annotations
 
+import argparse
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.errors import LccError, ResultsError
+from lcc_rl.commands.animate import KEPT, with_steps
+from lcc_rl.commands.evaluation import IDENTITY, STEPS, strategies_of
+from lcc_rl.config import identity
+from lcc_rl.config.schemas import EvaluateConfig, as_plain
+from lcc_rl.errors import ConfigError, LccError, ResultsError
 from lcc_rl.evaluation.responses import responses
-from lcc_rl.evaluation.strategies import Strategy, baseline
+from lcc_rl.evaluation.strategies import baseline
+from lcc_rl.figures.drawing import save
+from lcc_rl.figures.policy_maps import policy_maps
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
+from lcc_rl.results.runs import load_config
+from lcc_rl.runs.precision import prepare_torch
 
 log = logging.getLogger("lcc_rl")
 
@@ -24,57 +35,52 @@ POINTS = 41  # along either axis
 LEAST_GAP, LEAST_REACH = 10.0, 2.0  # of the axes: largest gap [m], relative speed [m/s]
 
 
-def write_responses(
-    strategies: Sequence[Strategy],
-    cfg: StudyConfig,
-    population: Population,
-    folder: Path,
-    metadata: Mapping[str, str],
-) -> None:
-    """Write what the learned strategies and a tuned rule do over gap and relative speed.
+def run(folder: str | Path, trust: Sequence[str] = ()) -> list[Path]:
+    """Write responses.parquet of an evaluation and draw it; return the figures' paths.
 
-    At two speeds, and within axes, that the sample episodes of the learned ones visit; nothing
-    where nothing was learned or no episode is kept. A strategy that cannot drive everywhere there
-    is left out.
+    A strategy that cannot drive everywhere on the map is left out.
 
     Args:
-        strategies: of the evaluation.
-        cfg: its configuration.
-        population: the human drivers.
-        folder: holds steps.parquet; gets responses.parquet.
-        metadata: of the table.
+        folder: of an evaluation or a main job.
+        trust: modules outside this package that its configuration may name.
 
     Raises:
-        ResultsError: if a file cannot be read or written.
+        LccError: if there is no such evaluation, or no sample episode of a learned strategy.
     """
-    (folder / RESPONSES).unlink(missing_ok=True)  # of other strategies
+    folder = with_steps(Path(folder))
+    cfg = load_config(folder, trust)
+    if not isinstance(cfg, EvaluateConfig):
+        raise ConfigError(f"{folder}: not an evaluation; evaluate the policy first")
+    prepare_torch(cfg)
+    strategies, inputs = strategies_of(cfg, own=cfg.policy is not None)
     own = [s for s in strategies if s.policy is not None and not s.name.endswith("oracle")]
     learned = list({s.name: s for s in reversed(own)}.values())[:MOST]
-    motions = _motions(read_parquet(folder / "steps.parquet"), learned, cfg) if learned else []
-    if not motions:
-        return
-    grid, tables = grid_of(motions), []
+    steps, scenario = read_parquet(folder / STEPS), vars(cfg.scenario)
+    grid = grid_of(_motions(steps, [strategy.name for strategy in learned], scenario, folder))
     platoon = cfg.scenario.pieces.get("communication") is not None
-    rule = baseline(cfg, "cacc tuned" if platoon else "idm tuned")
-    for strategy in (*reversed(learned), rule):
+    tables = []
+    for strategy in (*reversed(learned), baseline(cfg, "cacc tuned" if platoon else "idm tuned")):
         try:
-            tables.append(responses(strategy, population, *grid))
+            tables.append(responses(strategy, inputs.population, *grid))
         except LccError as error:
-            log.info("no map of %s: %s", strategy.name, error)
-    if any(table["strategy"].iloc[0] != rule.name for table in tables):
-        write_parquet(pd.concat(tables, ignore_index=True), folder / RESPONSES, metadata)
+            log.warning("no map of %s: %s", strategy.name, error)
+    rows = pd.concat(tables, ignore_index=True)
+    write_parquet(rows, folder / RESPONSES, {IDENTITY: identity(cfg)})
+    return [
+        save(figure, folder / "figures" / f"{stem}.png", formats=cfg.figure_formats)
+        for stem, figure in policy_maps(rows, steps, as_plain(cfg))
+    ]
 
 
-def _motions(steps: pd.DataFrame, strategies: Sequence[Strategy], cfg: StudyConfig) -> list[Motion]:
+def _motions(
+    steps: pd.DataFrame, names: Sequence[str], scenario: dict[str, object], folder: Path
+) -> list[Motion]:
     """Return the sample episodes that there are of strategies."""
-    found = []
-    for strategy in strategies:
-        try:
-            episodes = sample_episodes(steps, strategy.name)
-            found += [motion_of(rows, vars(cfg.scenario)) for rows in episodes.values()]
-        except ResultsError:  # none was kept
-            continue
-    return found
+    kept = [name for name in names if (steps["strategy"] == name).any()]
+    if not kept:
+        raise ResultsError(f"{folder}: holds no episode of a policy; evaluate one with {KEPT}")
+    episodes = (sample_episodes(steps, name).values() for name in kept)
+    return [motion_of(rows, scenario) for some in episodes for rows in some]
 
 
 def grid_of(motions: Sequence[Motion]) -> tuple[list[float], list[float], list[float]]:
@@ -89,3 +95,15 @@ def grid_of(motions: Sequence[Motion]) -> tuple[list[float], list[float], list[f
     reach = max(LEAST_REACH, 1.5 * float(np.quantile(np.abs(seen[:, 2]), 0.98)))
     gaps = np.linspace(0.5, np.ceil(gap), POINTS)
     return [float(x) for x in speeds], gaps.tolist(), np.linspace(-reach, reach, POINTS).tolist()
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Map what is named on the command line; print the figures' names."""
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser.add_argument("run", type=Path, help="folder of an evaluation or main job")
+    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    given = parser.parse_args(words)
+    for path in run(given.run, given.trust):
+        print(path)
+    return 0

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import multiprocessing
 import os
 import threading
-from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from dataclasses import fields
 from io import StringIO
@@ -21,25 +19,33 @@ from lcc_rl import results
 from lcc_rl.cli.entry import root_key
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_settings, check_sizes
-from lcc_rl.config import load, raw
-from lcc_rl.config.nodes import forget_places, with_defaults
-from lcc_rl.config.schemas import KINDS, CalibrateConfig, PipelineConfig, TrainConfig, as_plain
+from lcc_rl.config import load
+from lcc_rl.config.nodes import with_defaults
+from lcc_rl.config.schemas import (
+    KINDS,
+    CalibrateConfig,
+    EvaluateConfig,
+    PipelineConfig,
+    TrainConfig,
+)
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.envs.inputs import build_source, load_inputs
-from lcc_rl.errors import Interrupted, ResultsError, require
+from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
+from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.main_page import as_rich, caption_of, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
-from lcc_rl.io.settings import read_json
+from lcc_rl.io.settings import read_text
+from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.tables import show
-from lcc_rl.results.trust import check_targets
 from lcc_rl.runs.console import tell
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
+from lcc_rl.version import __version__
 
 log = logging.getLogger("lcc_rl")
 
@@ -47,7 +53,8 @@ log = logging.getLogger("lcc_rl")
 # all others are passed on to calibration and trainings.
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 PATIENCE = 20.0  # a training ends after the iteration at hand [s]
-OVERRIDES, TRAJECTORIES = "overrides.json", "trajectories.parquet"
+COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
+PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last one and its folder
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
@@ -58,7 +65,8 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     A folder that already holds parts of the same job is completed.
 
     Args:
-        cfg: configuration of the entry point ``pipeline``.
+        cfg: configuration of the entry point ``pipeline``; with ``resume`` in it the job in that
+            folder is resumed with its own settings instead.
         folder: where everything goes: ``calibration``, a folder per variant, ``evaluation``.
         overrides: what was typed on the command line; passed on to the parts.
 
@@ -68,100 +76,85 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     Raises:
         LccError: one clear error for whatever is wrong with settings, data or files.
     """
-    with claim(Path(folder)):
-        return _run(cfg, Path(folder), overrides)
+    folder = Path(folder)
+    with claim(folder):
+        if cfg.resume is None:
+            check_folder(cfg, folder)
+            trainings, final = composed(cfg, overrides)
+            command = " ".join(["lcc-rl run", *overrides])
+        elif (folder / COMMAND).is_file():
+            cfg = load_config(folder, cfg.trust)
+            trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants}
+            final = load_config(folder / PARTS / FINAL, cfg.trust)
+            command = read_text(folder / COMMAND)
+        else:
+            raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {COMMAND}")
+        prepare_torch(cfg)
+        for name, part in trainings.items():
+            check_settings(part, folder / name)
+        check_sizes(final)
+        save_config(cfg, folder)
+        for name, part in {**trainings, FINAL: final}.items():
+            save_config(part, folder / PARTS / name)
+        with atomic_path(folder / COMMAND) as temporary:
+            temporary.write_text(command)
+        return _run(cfg, trainings, final, folder, command)
 
 
-def _run(cfg: PipelineConfig, folder: Path, overrides: list[str]) -> Rows:
-    prepare_torch(cfg)
-    require(bool(cfg.variants), "variants is empty: name at least one, e.g. variants=[alcc]")
+def composed(
+    cfg: PipelineConfig, overrides: list[str]
+) -> tuple[dict[str, TrainConfig], EvaluateConfig]:
+    """Compose every part of a job: its trainings by variant, and the evaluation.
+
+    Raises:
+        ConfigError: if an override is unknown or wrong.
+    """
     for item in overrides:
-        require(
-            root_key(item) != "variant",
-            f"{item} has no effect on lcc-rl run, which trains several: say variants=[…]",
-        )
+        if root_key(item) == "variant":
+            raise ConfigError(
+                f"{item} has no effect on lcc-rl run, which trains several: use variants=[…]"
+            )
     shared = [item for item in overrides if root_key(item) not in OWN]
-    # Every part is composed before the first one runs: a typo must not cost an hour.
-    parts = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
+    trainings = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
-    for part in (*parts.values(), final):
+    for part in (*trainings.values(), final):
         part.data = cfg.data
-    for name, part in parts.items():
-        check_settings(part, folder / name)
-    check_sizes(final)
-    with atomic_path(folder / OVERRIDES) as temporary:
-        temporary.write_text(json.dumps(overrides))
+    return trainings, final
+
+
+def _run(
+    cfg: PipelineConfig,
+    trainings: dict[str, TrainConfig],
+    final: EvaluateConfig,
+    folder: Path,
+    command: str,
+) -> Rows:
+    tell(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
     drivers = calibrate_once(cfg, folder)
-    for part in (*parts.values(), final):
+    for part in (*trainings.values(), final):
         part.data = with_defaults(_episodes(cfg, folder))
         part.drivers = with_defaults({"_target_": BOOTSTRAP, "path": str(drivers)})
     tell(f"training {', '.join(cfg.variants)}, {cfg.jobs} at a time; details in */train.log")
-    _train_all(parts, folder, cfg.jobs)
+    _train_all(trainings, folder, cfg.jobs)
     final.compare = [
         str(folder / name) for name in cfg.variants if (folder / name / "policy.pt").exists()
     ]
     tell("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
-    rows = evaluation.run(final, folder / "evaluation", own=False, quiet=paged)
+    rows = evaluation.run(final, folder / FINAL, own=False, quiet=paged)
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
-        place = folder / "evaluation" / "figures" / "learning_curve.png"
+        place = folder / FINAL / "figures" / "learning_curve.png"
         save(curve, place, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
-        _conclude(folder, overrides, caption_of(parts.values()))
+        write_figures(folder / FINAL)
+        caption = caption_of(trainings.values())
+        page, table = write_page(folder, [command], caption)
+        title = "A leader, the car, and a human driver behind it: held-out windows"
+        show(as_rich(table, title, caption))
+        tell(f"rows, figures and policies: {folder}")
+        tell(f"page: {page}")
     return rows
-
-
-def _conclude(folder: Path, overrides: list[str], caption: str) -> None:
-    """Draw the figures, print the headline and write the page."""
-    evaluation.draw(folder / "evaluation")
-    page, table = write_page(folder, [" ".join(["lcc-rl run", *overrides])], caption)
-    title = "A leader, the car, and a human driver behind it: held-out windows"
-    show(as_rich(table, title, caption))
-    tell(f"rows, figures and policies: {folder}")
-    tell(f"page: {page}")
-
-
-def stored_overrides(path: Path, trust: Sequence[str]) -> list[str]:
-    """Read what a stopped job was started with, which may come from somebody else.
-
-    Args:
-        path: the file.
-        trust: modules outside this package that it may name.
-
-    Raises:
-        ResultsError: if it is damaged, or names foreign code or a place to write.
-    """
-    overrides = read_json(path)
-    if not isinstance(overrides, list) or not all(isinstance(item, str) for item in overrides):
-        raise ResultsError(f"{path}: damaged: expected a list of settings")
-    overrides = [item for item in overrides if root_key(item) != "trust"]
-    for item in overrides:
-        if "${" in item:
-            raise ResultsError(f"{path}: {item} refers to another value; expected plain values")
-    places: dict[str, str] = {}
-    for content in _composed(overrides, path, trust):
-        places |= {place.partition("=")[0]: place for place in forget_places(content)}
-    for place in places.values():
-        log.warning("%s: %s names a place to write and is left out", path, place)
-    kept = [item for item in overrides if item.lstrip("+").partition("=")[0] not in places]
-    if any(forget_places(content) for content in _composed(kept, path, trust)):
-        raise ResultsError(f"{path}: names a place to write: {', '.join(places.values())}")
-    return kept
-
-
-def _composed(overrides: list[str], path: Path, trust: Sequence[str]) -> list[dict[str, Any]]:
-    """Compose a job and the training of each of its variants, as plain containers."""
-    shared = [item for item in overrides if root_key(item) not in OWN]
-    job = _checked("pipeline", overrides, path, trust)
-    parts = ([*shared, f"variant={name}"] for name in job["variants"])
-    return [job, *(_checked("train", part, path, trust) for part in parts)]
-
-
-def _checked(entry: str, overrides: list[str], path: Path, trust: Sequence[str]) -> dict[str, Any]:
-    """Compose one configuration; its targets are checked before one of them is imported."""
-    check_targets(raw(entry, overrides), str(path), trust)
-    return as_plain(load(entry, overrides))
 
 
 def _episodes(cfg: PipelineConfig, folder: Path) -> dict[str, Any]:

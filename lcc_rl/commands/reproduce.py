@@ -2,8 +2,8 @@
 
   lcc-rl reproduce alcc                            # embedded stream, 8 seeds, Table III
   lcc-rl reproduce alcc data=ngsim data.path=...   # real trajectories; any override
-  lcc-rl reproduce alcc --recipe quickstart --parts main,filter   # in an hour, not days
-  lcc-rl reproduce alcc --parts main,filter agent=analytic   # another agent, its settings
+  lcc-rl reproduce alcc --recipe quickstart --parts main   # in an hour, not days
+  lcc-rl reproduce alcc --parts main agent=analytic   # another agent, its settings
   lcc-rl reproduce alcc --recipe smoke --seeds 1   # everything once, in seconds
   lcc-rl reproduce hcfs                            # platoon: 8 DDPG parents, hybrids
   lcc-rl reproduce report outputs/alcc             # tables, figures and page, from parquet
@@ -24,7 +24,6 @@ from typing import Any
 from lcc_rl.config.schemas import FORMATS
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
-from lcc_rl.studies.alcc.settings import ABLATIONS, chooses_agent
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
 from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, read_notes
@@ -37,12 +36,10 @@ REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
     """Run the ALCC study and write its page; 1 if a training failed."""
-    usual = None if chooses_agent(arguments.overrides) else "paper_alcc"
+    usual = None if alcc.chooses_agent(arguments.overrides) else "paper_alcc"
     study = alcc.Study(
         **common(arguments, usual),
         ablations=tuple(arguments.ablations) or None,
-        profiles=arguments.profiles,
-        followers=tuple(arguments.followers),
     )
     outcomes = alcc.run(study, arguments.parts, command)
     return concluded(outcomes, study.folder, "alcc", arguments.formats)
@@ -92,11 +89,9 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(required=True)
     one = study_parser(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
     one.set_defaults(run=reproduce_alcc)
-    listing(one, "--parts", tuple(alcc.PARTS), "which parts to run: " + ",".join(alcc.PARTS))
-    listing(one, "--ablations", (), "which ablations; all by default: " + ",".join(ABLATIONS))
-    one.add_argument("--profiles", type=int, default=4, help="profiles of the part single")
-    numbers = "numbers of human drivers behind the car, of the part followers: 1,2,5,10"
-    one.add_argument("--followers", type=whole_numbers, default=[1, 2, 5, 10], help=numbers)
+    listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
+    names = f"all by default: {','.join(alcc.ABLATIONS)}; or your own as name:override"
+    listing(one, "--ablations", (), f"which ablations; {names}")
     two = study_parser(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     two.set_defaults(run=reproduce_hcfs)
     again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
@@ -126,11 +121,6 @@ def listing(
 ) -> None:
     """Add an option that takes names separated by commas."""
     target.add_argument(name, type=lambda words: words.split(","), default=default, help=text)
-
-
-def whole_numbers(text: str) -> list[int]:
-    """Split whole numbers separated by commas."""
-    return [int(word) for word in text.split(",")]
 
 
 def main(words: list[str]) -> int:

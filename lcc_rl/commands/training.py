@@ -22,7 +22,7 @@ from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows, parquet_metadata
 from lcc_rl.results.policies import load_policy, save_policy
-from lcc_rl.results.runs import check_folder, check_links, load_config, save_config
+from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import Silent
@@ -77,7 +77,6 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
 
     Where the rows are logged may be said anew: what is stored names no place to write.
     """
-    check_links(folder)
     own: TrainConfig = load_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
         made_by = (

@@ -11,7 +11,6 @@ from lcc_rl.config.compose import (
     is_sweep,
     load,
     parsed,
-    raw,
 )
 
 __all__ = [
@@ -25,5 +24,4 @@ __all__ = [
     "is_sweep",
     "load",
     "parsed",
-    "raw",
 ]

@@ -33,7 +33,6 @@ NOT_IDENTITY = (
 )
 # Launchers and sweepers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
-REFUSED = re.compile(r"Could not (?:override|append to config|delete from config)\S* '([^']+)'")
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -80,12 +79,6 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
     return parsed(composed(entry, overrides), entry, overrides)
-
-
-def raw(entry: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Return what Hydra composes as plain containers, before anything that it names is imported."""
-    found: Any = OmegaConf.to_container(composed(entry, overrides))
-    return found
 
 
 def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:

@@ -22,6 +22,7 @@ MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a 
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
 Million = Annotated[int, Field(ge=1, le=1_000_000)]
+FOLDER = r"^\w[\w.-]*$"  # name of a folder in another one
 FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
 Format = Literal["png", "pdf", "svg"]
 
@@ -165,7 +166,7 @@ class PipelineConfig(TrainConfig):
     """``lcc-rl run``."""
 
     calibration: Node
-    variants: list[str]
+    variants: Annotated[list[Annotated[str, Field(pattern=FOLDER)]], Field(min_length=1)]
     jobs: Parallel
 
 

@@ -28,8 +28,8 @@ from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
-from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
+from lcc_rl.errors import LARGEST, ConfigError, DataError, unknown_name
+from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, checked, parse
 
 WHOLE = "full length"  # a case that is a whole record, before the record's name
 Nodes = Mapping[str, Mapping[str, Any] | None]
@@ -201,7 +201,8 @@ class RecordLeaders(Settings):
         return settings
 
 
-def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Profiles:
+@checked
+def from_trajectories(path: str | Path | Sequence[str], time_step: Positive) -> Profiles:
     """Read the speed profiles of the leaders in car-following episodes of NGSIM files.
 
     Args:
@@ -212,7 +213,6 @@ def from_trajectories(path: str | Path | Sequence[str], time_step: float) -> Pro
     Raises:
         DataError: if a file cannot be read or holds no car-following episode.
     """
-    require_positive("profiles", time_step=time_step)
     episodes = NgsimSource(path=path).load().episodes
     return at_step(leader_profiles(episodes, FRAME), time_step)
 
@@ -390,7 +390,8 @@ class Mixture:
         for name, weight in (weights or {}).items():
             if name not in sources:
                 raise unknown_name("source in leader.weights", str(name), sources)
-            require_positive("leader.weights", **{str(name): weight})
+            if not 0.0 < weight <= LARGEST:
+                raise ConfigError(f"leader.weights.{name} must be positive, got {weight!r}")
         self.sources, self.weights = sources, dict(weights or {})
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:

@@ -1,114 +1,251 @@
-"""Calibration as described by a configuration."""
+"""Calibration of the parameters of observed drivers, all drivers at once (A6)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated, Any
 
+import numpy as np
 import pandas as pd
 import torch
+from pydantic import Field
+from torch import Tensor
 
-from lcc_rl.drivers.fit import DEFAULT_GENETIC, Calibration, fit
-from lcc_rl.drivers.fit_error import OBJECTIVES, SPEED
-from lcc_rl.drivers.genetic import GeneticSettings, Progress
-from lcc_rl.drivers.observed import Selection, observe
-from lcc_rl.drivers.parameters import IDM, MODES, Bounds, checked_bounds, fitted, law_of
-from lcc_rl.errors import ConfigError, require_in, unknown_name
+from lcc_rl.drivers.fit_error import GAP, GAP_SHARE, SPEED, FitError, Objective
+from lcc_rl.drivers.genetic import Evolution, GeneticSettings, Progress, minimise
+from lcc_rl.drivers.genetic import Objective as Minimised
+from lcc_rl.drivers.observed import Observed, Selection, observe
+from lcc_rl.drivers.parameters import COLUMNS, MODEL, Bounds, Mode, Model, at_bound, fitted
+from lcc_rl.errors import DataError, unknown_name
 from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.functional.laws import LAWS
+from lcc_rl.settings import Positive, Settings, given_as, values
+
+# Genetic algorithms of the choice of constants: over constants, and within each over (v0, T).
+OUTER = GeneticSettings(population=12, generations=12, founders=2, patience=4)
+INNER = GeneticSettings(population=16, generations=8)
+
+# Columns of the errors; those of the part held out end in ``_out``.
+ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
+OUT = "_out"
 
 
 @dataclass(frozen=True)
-class Calibrator:
-    """Calibration of all drivers in one or both modes.
+class Calibration:
+    """Result of a calibration.
 
     Args:
-        modes: ``local``, ``global`` or both, each once.
-        model: driver model, a key of :data:`lcc_rl.functional.laws.LAWS`.
-        objective: what is minimised, see :class:`lcc_rl.drivers.fit_error.FitError`.
-        holdout: share of each episode, its end, that is not fitted but predicted.
-        bounds: lower and upper bound by parameter, in its unit.
-        constants: parameters that the local mode does not fit, by name; None, or a parameter that
-            is None: the model's default.
-        selection: which episodes are used.
-        local_genetic: genetic algorithm of the local mode.
-        global_genetic: genetic algorithm of the global mode.
-        choose_constants: first choose the local mode's constants over all drivers.
-
-    Raises:
-        ConfigError: if a mode, model or objective is unknown, a mode is named twice or not at
-            all, a constant is none of the model's, or bounds are crossed.
+        drivers: one row per driver, in the order of the episodes in the input.
+        report: what was dropped, chosen and found, in plain lines.
     """
 
-    modes: Sequence[str] = ("local",)
-    model: str = IDM
-    objective: str = SPEED
-    holdout: float = 0.0
-    bounds: Bounds | None = None
-    constants: Mapping[str, float | None] | None = None
-    selection: Selection = field(default_factory=Selection)
-    local_genetic: GeneticSettings = DEFAULT_GENETIC["local"]
-    global_genetic: GeneticSettings = DEFAULT_GENETIC["global"]
-    choose_constants: bool = False
+    drivers: pd.DataFrame
+    report: list[str]
 
-    def __post_init__(self) -> None:
-        for mode in self.modes:
-            fitted(mode, self.model)
-        if not self.modes or len(set(self.modes)) < len(self.modes):
-            raise ConfigError(
-                f"calibration modes must be some of {', '.join(MODES)}, given once each, got "
-                f"{list(self.modes)}"
-            )
-        if self.objective not in OBJECTIVES:
-            raise unknown_name("calibration objective", self.objective, OBJECTIVES)
-        require_in("calibration", "[0, 0.9]", holdout=self.holdout)
-        checked_bounds(self.bounds)
-        self.shared()
 
-    def shared(self) -> DriverConstants:
-        """Return what the local mode does not fit.
+class Constants(Settings):
+    """Parameters that the local mode does not fit; None: the default of the driver model."""
 
-        Raises:
-            ConfigError: if one is given that the model lacks.
-        """
-        law = law_of(self.model)
-        given = {name: x for name, x in (self.constants or {}).items() if x is not None}
+    acceleration: Positive | None = None  # a [m/s²]
+    deceleration: Positive | None = None  # b [m/s²]
+    min_gap: Positive | None = None  # s0 [m]
+    sensitivity: Positive | None = None  # κ of ovm and fvdm [1/s]
+    form: Positive | None = None  # β of ovm and fvdm
+    speed_gain: Positive | None = None  # λ of fvdm [1/s]
+    leader_deceleration: Positive | None = None  # b̂ of gipps [m/s²]
+
+
+def _wide() -> GeneticSettings:
+    return GeneticSettings(population=64, generations=60)
+
+
+class Calibrator(Settings):
+    """Calibration of one driver per episode in one or both modes (A6), all of them at once.
+
+    The mode ``local`` fits (v0, T), ``global`` all parameters of the model.
+    """
+
+    modes: Annotated[Sequence[Mode], Field(min_length=1)] = ("local",)
+    model: Model = "idm"
+    objective: Objective = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
+    # Share of each episode, its end, that is predicted instead of fitted.
+    holdout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    bounds: given_as(Bounds) = field(default_factory=Bounds)  # type: ignore[valid-type]
+    constants: given_as(Constants) = field(default_factory=Constants)  # type: ignore[valid-type]
+    choose_constants: bool = False  # local: choose them by the mean error of all drivers first
+    selection: given_as(Selection) = field(default_factory=Selection)  # type: ignore[valid-type]
+    local_genetic: given_as(GeneticSettings) = field(  # type: ignore[valid-type]
+        default_factory=GeneticSettings
+    )
+    global_genetic: given_as(GeneticSettings) = field(  # type: ignore[valid-type]
+        default_factory=_wide
+    )
+
+    def settled(self) -> None:
+        given = {name: x for name, x in values(self.constants).items() if x is not None}
         for name in given:
-            if name not in law.shared:
-                raise unknown_name(f"constant of model {self.model}", name, law.shared)
-        return law.constants(**given)
+            if name not in LAWS[self.model].shared:
+                known = LAWS[self.model].shared
+                raise unknown_name(f"constant of model {self.model}", name, known)
+        self.shared: DriverConstants = LAWS[self.model].constants(**given)
 
     def __call__(
         self,
-        episodes: pd.DataFrame,
+        episodes: pd.DataFrame | Observed,
         seed: int = 0,
         device: torch.device | str = "cpu",
         progress: Progress | None = None,
     ) -> Calibration:
-        """Calibrate the drivers of an episode table; see :func:`lcc_rl.drivers.fit.fit`.
+        """Calibrate the drivers of an episode table.
+
+        Args:
+            episodes: the table, or what :func:`lcc_rl.drivers.observed.observe` made of it.
+            seed: seed of all randomness; equal seeds give equal drivers.
+            device: where to simulate, in float32; reported errors are evaluated in float64.
+            progress: called as ``progress(generation, total, text)``.
 
         Returns:
             The drivers of all modes, with the column ``mode``, and one report.
+
+        Raises:
+            DataError: if the table lacks a column or holds no usable episode, or an episode's
+                error is no number whatever the parameters.
         """
-        observed = observe(episodes, self.selection)
-        genetic = {"local": self.local_genetic, "global": self.global_genetic}
-        parts = [
-            fit(
-                observed,
-                mode,
-                self.bounds,
-                self.shared(),
-                genetic[mode],
-                seed,
-                self.choose_constants and mode == "local",
-                device,
-                progress,
-                self.model,
-                self.objective,
-                self.holdout,
+        observed = episodes
+        if not isinstance(observed, Observed):
+            observed = observe(observed, self.selection)
+        parts, report = [], list(observed.report)
+        for mode in dict.fromkeys(self.modes):
+            drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
+            parts.append(drivers)
+            report += [f"{mode}: {line}" for line in lines]
+        return Calibration(pd.concat(parts, ignore_index=True), report)
+
+
+class _Fit:
+    """Calibration in one mode; the arguments are those of :class:`Calibrator`."""
+
+    def __init__(
+        self,
+        settings: Calibrator,
+        mode: str,
+        observed: Observed,
+        seed: int,
+        device: torch.device | str,
+        progress: Progress | None,
+    ) -> None:
+        self.settings, self.mode, self.observed = settings, mode, observed
+        self.seed, self.progress = seed, progress
+        self.model, self.law = settings.model, LAWS[settings.model]
+        self.names, self.limits = fitted(mode, self.model), values(settings.bounds)
+        self.parts = {"": observed}
+        if settings.holdout:
+            self.parts[""], self.parts[OUT] = observed.split(settings.holdout)
+        self.simulated = self.parts[""].to(device, torch.float32)
+
+    def drivers(self) -> tuple[pd.DataFrame, list[str]]:
+        """Return one row per driver, and lines on what was chosen and found."""
+        constants, lines = self.settings.shared, []
+        if self.settings.choose_constants and self.mode == "local":
+            constants = self.chosen_constants()
+            shown = (f"{COLUMNS[x]} {getattr(constants, x):.3g}" for x in self.law.shared)
+            lines.append(f"constants chosen over all drivers: {', '.join(shown)}")
+        error, genetic = self.error(constants), getattr(self.settings, f"{self.mode}_genetic")
+        found = self.search(error, self.names, self.observed.count, genetic, self.progress)
+        drivers = self.table(found.best.to("cpu", torch.float64), constants)
+        return drivers, lines + _findings(drivers, self.limits["desired_speed"])
+
+    def error(self, constants: DriverConstants) -> FitError:
+        """Return what is minimised, as a function of the fitted parameters."""
+        objective = self.settings.objective
+        return FitError(self.simulated, constants, self.names, self.model, objective)
+
+    def search(
+        self,
+        error: Minimised,
+        names: Sequence[str],
+        problems: int,
+        genetic: GeneticSettings,
+        progress: Progress | None,
+    ) -> Evolution:
+        """Minimise over some parameters, within their bounds."""
+        lower, upper = self.simulated.gaps.new_tensor([self.limits[name] for name in names]).T
+        generator = torch.Generator().manual_seed(self.seed)
+        return minimise(error, lower, upper, problems, generator, genetic, progress)
+
+    def chosen_constants(self) -> DriverConstants:
+        """Choose what drivers share, by a search whose objective is the mean error of local fits.
+
+        Its candidates have the shape ``[1, candidates, constants]``.
+        """
+        drivers, shared, start = self.observed.count, self.law.shared, self.settings.shared
+
+        def mean_error(candidates: Tensor) -> Tensor:
+            count = candidates.shape[1]
+
+            def error(genes: Tensor) -> Tensor:
+                # Every pair of driver and candidate is a problem of its own.
+                own = candidates[0].repeat_interleave(genes.shape[1], dim=0).unbind(-1)
+                trial = start.with_(**dict(zip(shared, own, strict=True)))
+                side_by_side = genes.reshape(drivers, -1, genes.shape[-1])
+                return self.error(trial)(side_by_side).reshape(genes.shape[:-1])
+
+            found = self.search(error, self.names, drivers * count, INNER, None)
+            return found.fitness.reshape(drivers, count).mean(0, keepdim=True)
+
+        found = self.search(mean_error, shared, 1, OUTER, self.progress)
+        return start.with_(**dict(zip(shared, found.best[0].tolist(), strict=True)))
+
+    def table(self, best: Tensor, constants: DriverConstants) -> pd.DataFrame:
+        """Return identities, parameters ``[drivers, names]``, errors and flags, a row per driver.
+
+        Raises:
+            DataError: if no parameters give a driver an error that is a number.
+        """
+        columns: dict[str, Any] = {str(key): held for key, held in self.observed.identity.items()}
+        own = dict(zip(self.names, best.numpy().T, strict=True))
+        for name in self.law.parameters:
+            columns[COLUMNS[name]] = own.get(name, getattr(constants, name, None))
+        for end, part in self.parts.items():
+            exact = FitError(part.to("cpu", torch.float64), constants, self.names, self.model)
+            measures = exact.measures(best.unsqueeze(1))
+            for name, column in ERRORS.items():
+                columns[column + end] = measures[name].squeeze(1).numpy()
+            columns[f"samples{end}"] = part.samples
+        for name in self.law.parameters:
+            columns[f"{name}_at_bound"] = name in own and at_bound(own[name], self.limits[name])
+        drivers = pd.DataFrame({**columns, "mode": self.mode, MODEL: self.model})
+        objective = self.settings.objective
+        needed = [ERRORS[objective]] if objective in ERRORS else [ERRORS[SPEED], ERRORS[GAP_SHARE]]
+        lost = ~np.isfinite(drivers[needed].to_numpy()).all(axis=1)
+        if lost.any():
+            raise DataError(
+                f"episode {drivers['episode'].iloc[lost.argmax()]} (and {lost.sum() - 1} others): "
+                f"no {self.mode} parameters within the bounds give a finite {objective}; a "
+                "follower that never moves has no relative speed error, see "
+                "selection.min_mean_speed_mps"
             )
-            for mode in self.modes
-        ]
-        report = list(observed.report)
-        for mode, part in zip(self.modes, parts, strict=True):
-            report += [f"{mode}: {line}" for line in part.report[len(observed.report) :]]
-        return Calibration(pd.concat([part.drivers for part in parts], ignore_index=True), report)
+        # The episodes are sorted by length; the table has the order of the input.
+        return drivers.sort_values("episode", kind="stable", ignore_index=True)
+
+
+def _findings(drivers: pd.DataFrame, limits: tuple[float, float]) -> list[str]:
+    """Lines on the quality of the fit and on what it could not identify."""
+    error = 100.0 * drivers["rmspe"]
+    lines = [
+        f"RMSPE of {len(drivers)} drivers: mean {error.mean():.2f} %, "
+        f"median {error.median():.2f} %, worst {error.max():.1f} %"
+    ]
+    for end, part in (("", "fitted"), (OUT, "held out")):
+        if f"gap_rmse_m{OUT}" in drivers:
+            speed, gap = 100.0 * drivers[f"rmspe{end}"], drivers[f"gap_rmse_m{end}"]
+            lines.append(f"{part}: RMSPE {speed.mean():.2f} %, gap RMSE {gap.mean():.2f} m (means)")
+    share = drivers["desired_speed_at_bound"].mean()
+    if share > 0.0:
+        low, high = limits
+        lines.append(
+            f"{100 * share:.0f} % of the desired speeds lie on a bound ({low:g} or {high:g} m/s): "
+            "congested traffic does not tell how fast these drivers would like to go"
+        )
+    return lines

@@ -5,67 +5,40 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, require_in, require_whole
+from lcc_rl.errors import ConfigError
 from lcc_rl.io.memory import require_memory
+from lcc_rl.settings import NonNegative, Positive, Settings
 
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
-LARGEST = 100_000  # individuals of a population, and founders
-_LEAST = {"population": 4, "generations": 1, "founders": 1, "patience": 1}
-_INTERVALS = {
-    **dict.fromkeys(("elites", "difference_rate", "mutation_rate"), "[0, 1]"),
-    **dict.fromkeys(("mutation_start", "mutation_end"), "(0, inf)"),
-    **dict.fromkeys(("blend", "tolerance"), "[0, inf)"),
-}
+Individuals = Annotated[int, Field(ge=1, le=100_000)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-@dataclass(frozen=True)
-class GeneticSettings:
-    """Settings of the genetic algorithm.
+class GeneticSettings(Settings):
+    """Settings of the genetic algorithm."""
 
-    Args:
-        population: individuals per problem.
-        generations: generations at most.
-        founders: size of the first generation, in populations; its fittest found the next.
-        elites: share of a generation that may survive into the next by its fitness.
-        tournament: individuals drawn per tournament; the fittest becomes a parent.
-        blend: how far a child may lie outside its parents' interval (BLX-α), as a share of it.
-        difference_rate: probability that a child is shifted by the difference of two individuals.
-        mutation_rate: probability that a gene is mutated by Gaussian noise.
-        mutation_start: standard deviation of that noise at first, as a share of the bounds.
-        mutation_end: the same in the last generation; it falls geometrically in between.
-        patience: stop when no problem has improved for this many generations.
-        tolerance: relative improvement of the best fitness that counts as one.
-
-    Raises:
-        ConfigError: if a setting is out of its range.
-    """
-
-    population: int = 32
-    generations: int = 20
-    founders: int = 8
-    elites: float = 0.5
-    tournament: int = 2
-    blend: float = 0.5
-    difference_rate: float = 1.0
-    mutation_rate: float = 0.3
-    mutation_start: float = 0.1
-    mutation_end: float = 1e-4
-    patience: int = 5
-    tolerance: float = 1e-5
-
-    def __post_init__(self) -> None:
-        for name, interval in _INTERVALS.items():
-            require_in("genetic", interval, **{name: getattr(self, name)})
-        for name, least in _LEAST.items():
-            require_whole("genetic", least, LARGEST, **{name: getattr(self, name)})
-        require_whole("genetic", 1, self.population, tournament=self.tournament)
+    population: Annotated[int, Field(ge=4, le=100_000)] = 32  # individuals per problem
+    generations: Individuals = 20  # at most
+    founders: Individuals = 8  # size of the first generation, in populations; the fittest stay
+    elites: Probability = 0.5  # share of a generation that may survive by its fitness
+    tournament: Individuals = 2  # individuals drawn per tournament; the fittest is a parent
+    # How far a child may lie outside its parents' interval (BLX-α), as a share of it.
+    blend: NonNegative = 0.5
+    difference_rate: Probability = 1.0  # of a shift by the difference of two individuals
+    mutation_rate: Probability = 0.3  # of Gaussian noise on a gene
+    mutation_start: Positive = 0.1  # standard deviation of that noise, as a share of the bounds
+    mutation_end: Positive = 1e-4  # the same in the last generation; it falls geometrically
+    patience: Individuals = 5  # generations without any improvement after which the search stops
+    tolerance: NonNegative = 1e-5  # relative improvement of the best fitness that counts as one
 
 
 @dataclass(frozen=True)

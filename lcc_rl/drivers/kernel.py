@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import os
-import tempfile
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
+from types import FunctionType
 from typing import Any
 
+import numba
 import numpy as np
 
 log = logging.getLogger("lcc_rl")
-
-FOLDER = "lcc_rl"  # in the user's cache folder
 
 
 def squared_errors(
@@ -93,80 +89,36 @@ def squared_errors(
                     distance[i] += (gap[i] - seen) * (gap[i] - seen)
 
 
-class Kernel:
-    """:func:`squared_errors`, compiled by numba for one precision at its first call.
+@cache
+def compiled(dtype: str) -> Callable[..., None]:
+    """Return :func:`squared_errors` for one precision; numba compiles it at its first call.
 
-    The machine code is kept in the user's cache folder. Where it cannot be read or written, one
-    line of the log says so and the function is compiled for this process.
+    numba keeps the machine code beside this file or, where that is read-only, in the user's cache
+    folder (``NUMBA_CACHE_DIR``). If it cannot be kept or read, the function is compiled for this
+    process. Each precision is a function of its own name: processes that compile at the same time
+    would mix up the files of one.
 
     Args:
         dtype: name of the precision, ``float32`` or ``float64``.
     """
+    name = f"squared_errors_{dtype}"
+    function = FunctionType(squared_errors.__code__, squared_errors.__globals__, name)
+    # Sums may be fused with products; nothing else is changed for speed.
+    compile_it = partial(numba.njit, fastmath={"contract"}, error_model="numpy", nogil=True)
+    uncached = compile_it()(function)
+    try:
+        chosen = compile_it(cache=True)(function)
+    except RuntimeError as error:  # there is no place for the code
+        log.info("compiling the drivers' simulation for this run only: %s", error)
+        return uncached
 
-    def __init__(self, dtype: str) -> None:
+    def call(*arguments: Any) -> None:
+        nonlocal chosen
         try:
-            self.function = _compiled(_cache_folder(dtype))
-        except (OSError, RuntimeError) as error:  # RuntimeError: there is no home folder
-            self._uncached(error)
-
-    def __call__(self, *arguments: Any) -> None:
-        """Call :func:`squared_errors`."""
-        try:
-            self.function(*arguments)
+            chosen(*arguments)
         except Exception as error:  # a damaged file raises whatever unpickling it meets
-            self._uncached(error)
-            self.function(*arguments)
+            log.info("compiling the drivers' simulation for this run only: %r", error)
+            chosen = uncached
+            chosen(*arguments)
 
-    def _uncached(self, error: Exception) -> None:
-        log.info("compiling the drivers' simulation for this run only: %r", error)
-        self.function = _compiled(None)
-
-
-@cache
-def kernel_of(dtype: str) -> Kernel | None:
-    """Return the compiled simulation in a precision; None where numba is not installed."""
-    try:
-        import numba  # noqa: F401
-    except ImportError as error:
-        log.info("without numba, calibrations are several times slower: %s", error)
-        return None
-    return Kernel(dtype)
-
-
-def _compiled(folder: Path | None) -> Callable[..., None]:
-    """The function for numba to compile; its code is kept in a folder, None: is not kept."""
-    import numba
-
-    before = numba.config.CACHE_DIR
-    try:
-        numba.config.CACHE_DIR = "" if folder is None else str(folder)
-        # Sums may be fused with products; nothing else is changed for speed.
-        return numba.njit(
-            squared_errors,
-            cache=folder is not None,
-            fastmath={"contract"},
-            error_model="numpy",
-            nogil=True,
-        )
-    finally:
-        numba.config.CACHE_DIR = before
-
-
-def _cache_folder(dtype: str) -> Path:
-    """The folder of the code for this source, precision, processor and numba, made and writable.
-
-    numba writes an index and the code, each at once but not both together. In a folder of its own
-    the one always belongs to the other, whoever else compiles at the same time.
-    """
-    import llvmlite
-    import numba
-    from llvmlite import binding
-
-    processor = f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
-    parts = (numba.__version__, llvmlite.__version__, np.__version__, processor, dtype)
-    key = hashlib.sha256(Path(__file__).read_bytes() + "\n".join(parts).encode()).hexdigest()
-    given = numba.config.CACHE_DIR or os.environ.get("XDG_CACHE_HOME")
-    folder = Path(given or Path.home() / ".cache") / FOLDER / f"kernel-{key[:16]}"
-    folder.mkdir(parents=True, exist_ok=True)
-    tempfile.TemporaryFile(dir=folder).close()
-    return folder
+    return call

@@ -11,37 +11,30 @@ import torch
 from torch import Tensor
 
 from lcc_rl.data.episodes import ALIASES
-from lcc_rl.errors import ConfigError, DataError, require_in
+from lcc_rl.errors import DataError
+from lcc_rl.settings import NonNegative, Settings
 
 IDENTITY = ("recording", "follower_id", "leader_id")
 NUMERIC = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Criteria of the episodes used for calibration.
+class Selection(Settings):
+    """Criteria of the episodes used for calibration."""
 
-    Args:
-        min_gap_m: drop an episode whose gap ever falls below this, also beyond the part used [m].
-        max_duration_s: use the first so many seconds of each; None uses everything [s].
-        min_duration_s: drop shorter episodes [s].
-        min_mean_speed_mps: drop episodes at standstill; RMSPE divides by speed [m/s].
-
-    Raises:
-        ConfigError: if a limit is negative or the durations are crossed.
-    """
-
-    min_gap_m: float = 1.0
-    max_duration_s: float | None = 60.0
-    min_duration_s: float = 10.0
-    min_mean_speed_mps: float = 0.5
+    # Episodes whose gap ever falls below this are dropped, also beyond the part used [m].
+    min_gap_m: NonNegative = 1.0
+    max_duration_s: NonNegative | None = 60.0  # the first part of each is used; None: all [s]
+    min_duration_s: NonNegative = 10.0  # shorter episodes are dropped [s]
+    # Slower episodes are dropped: the relative error divides by speed [m/s].
+    min_mean_speed_mps: NonNegative = 0.5
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None or name != "max_duration_s":
-                require_in("selection", "[0, inf)", **{name: value})
-        if self.max_duration_s is not None and self.max_duration_s < self.min_duration_s:
-            raise ConfigError("selection: max_duration_s must not be below min_duration_s")
+        longest = self.max_duration_s
+        if longest is not None and longest < self.min_duration_s:
+            raise ValueError(
+                f"max_duration_s={longest:g} must not be below min_duration_s="
+                f"{self.min_duration_s:g}"
+            )
 
 
 @dataclass(frozen=True)

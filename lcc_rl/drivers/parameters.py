@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.functional.driver_models import DriverLaw
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.laws import LAWS
+from lcc_rl.settings import Number, Settings, values
 
 # Table column of every parameter of every model.
 COLUMNS = {
@@ -22,17 +23,6 @@ COLUMNS = {
     "form": "form",
     "speed_gain": "speed_gain_hz",
     "leader_deceleration": "leader_deceleration_mps2",
-}
-DEFAULT_BOUNDS = {
-    "desired_speed": (5.0, 40.0),
-    "time_gap": (0.3, 4.0),
-    "acceleration": (0.3, 4.0),
-    "deceleration": (0.3, 5.0),
-    "min_gap": (0.5, 5.0),
-    "sensitivity": (0.05, 5.0),
-    "form": (0.05, 3.0),
-    "speed_gain": (0.05, 3.0),
-    "leader_deceleration": (0.3, 5.0),
 }
 # What no driver has: beyond these a table is in other units, or not one of drivers.
 PLAUSIBLE = {
@@ -48,60 +38,49 @@ PLAUSIBLE = {
 }
 IDM = "idm"
 MODEL = "model"  # the column that names a driver's model; a table without it is of the IDM
-MODES = ("local", "global")
 # A parameter this close to a bound, as a share of the range, counts as being on it.
 BOUND_TOLERANCE = 0.005
 
-Bounds = Mapping[str, Sequence[float]]
-Limits = dict[str, tuple[float, float]]
+Model = Literal["idm", "ovm", "fvdm", "gipps"]
+Mode = Literal["local", "global"]
+Limits = Annotated[tuple[Number, Number], Field(strict=False)]  # lower and upper
 
 
-def law_of(model: str) -> DriverLaw:
-    """Return a driver model by its name.
+class Bounds(Settings):
+    """Lower and upper bound of every parameter that a calibration may fit."""
 
-    Raises:
-        ConfigError: if there is none of that name.
-    """
-    if model not in LAWS:
-        raise unknown_name("driver model", model, LAWS)
-    return LAWS[model]
+    desired_speed: Limits = (5.0, 40.0)  # v0 [m/s]
+    time_gap: Limits = (0.3, 4.0)  # T [s]
+    acceleration: Limits = (0.3, 4.0)  # a [m/s²]
+    deceleration: Limits = (0.3, 5.0)  # b [m/s²]
+    min_gap: Limits = (0.5, 5.0)  # s0 [m]
+    sensitivity: Limits = (0.05, 5.0)  # κ of ovm and fvdm [1/s]
+    form: Limits = (0.05, 3.0)  # β of ovm and fvdm
+    speed_gain: Limits = (0.05, 3.0)  # λ of fvdm [1/s]
+    leader_deceleration: Limits = (0.3, 5.0)  # b̂ of gipps [m/s²]
+
+    def settled(self) -> None:
+        for name, (lower, upper) in values(self).items():
+            low, high = PLAUSIBLE[name]
+            if not low <= lower < upper <= high:
+                raise ConfigError(
+                    f"bounds of {name!r} must be {low:g} <= lower < upper <= {high:g}, "
+                    f"got [{lower:g}, {upper:g}]"
+                )
+
+
+DEFAULT_BOUNDS = values(Bounds())
 
 
 def fitted(mode: str, model: str = IDM) -> tuple[str, ...]:
-    """Return the parameters that a mode fits: (v0, T), or all of the model.
-
-    Raises:
-        ConfigError: if there is no such mode or model.
-    """
-    if mode not in MODES:
-        raise unknown_name("calibration mode", mode, MODES)
-    parameters = law_of(model).parameters
+    """Return the parameters that a mode fits: (v0, T), or all of the model."""
+    parameters = LAWS[model].parameters
     return parameters[:2] if mode == "local" else parameters
 
 
 def users(parameter: str) -> list[str]:
     """Return the models that have a parameter."""
     return [model for model, law in LAWS.items() if parameter in law.parameters]
-
-
-def checked_bounds(bounds: Bounds | None) -> Limits:
-    """Fill in default bounds and check the given ones.
-
-    Raises:
-        ConfigError: if a parameter is unknown, its bounds are not lower < upper, or no driver has
-            such values.
-    """
-    limits = dict(DEFAULT_BOUNDS)
-    for name, pair in (bounds or {}).items():
-        if name not in COLUMNS:
-            raise unknown_name("driver parameter", name, COLUMNS)
-        low, high = PLAUSIBLE[name]
-        if len(pair) != 2 or not low <= pair[0] < pair[1] <= high:
-            raise ConfigError(
-                f"bounds of {name!r} must be {low:g} <= lower < upper <= {high:g}, got {list(pair)}"
-            )
-        limits[name] = (float(pair[0]), float(pair[1]))
-    return limits
 
 
 def at_bound(values: NDArray[np.float64], bounds: tuple[float, float]) -> NDArray[np.bool_]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.drivers.parameters import (
@@ -19,21 +21,14 @@ from lcc_rl.drivers.parameters import (
     PLAUSIBLE,
     Bounds,
     at_bound,
-    checked_bounds,
     users,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of
-from lcc_rl.errors import (
-    LAST_SEED,
-    ConfigError,
-    DataError,
-    require_in,
-    require_positive,
-    require_whole,
-)
+from lcc_rl.errors import LAST_SEED, ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.memory import require_memory
+from lcc_rl.settings import Count, Positive, checked
 
 DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, and its name
 
@@ -131,8 +126,9 @@ class DriverPopulation:
         }
 
 
+@checked
 def bootstrap(
-    path: str | Path | None = None, mode: str | None = None, least_speed: float | None = None
+    path: str | Path | None = None, mode: str | None = None, least_speed: Positive | None = None
 ) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
 
@@ -143,14 +139,11 @@ def bootstrap(
             the calibration [m/s]; None raises none. Time gaps stay.
 
     Raises:
-        ConfigError: if the mode is unknown or the speed not one that a driver can desire.
         DataError: if the table is not sound.
     """
     found = from_table(load_drivers(path, mode))
     if least_speed is None:
         return found
-    low, high = PLAUSIBLE["desired_speed"]
-    require_in("drivers", f"[{low:g}, {high:g}]", least_speed=least_speed)
     raised = found.desired_speed < least_speed
     speed = found.desired_speed.clamp(min=least_speed)
     return replace(found, desired_speed=speed, at_bound=found.at_bound & ~raised)
@@ -207,12 +200,13 @@ def _flags(table: pd.DataFrame) -> Tensor:
     return torch.tensor(at_bound(values, DEFAULT_BOUNDS["desired_speed"]))
 
 
+@checked
 def kde(
     path: str | Path | None = None,
-    drivers: int = 1000,
-    seed: int = 0,
-    bandwidth: float | None = None,
-    bounds: Bounds | None = None,
+    drivers: Count = 1000,
+    seed: Annotated[int, Field(ge=0, le=LAST_SEED)] = 0,
+    bandwidth: Positive | None = None,
+    bounds: Mapping[str, Any] | None = None,
     mode: str | None = None,
 ) -> DriverPopulation:
     """Population drawn from a Gaussian kernel density estimate of the joint distribution.
@@ -226,15 +220,10 @@ def kde(
         mode: see :func:`load_drivers`; globally calibrated drivers have five joint parameters.
 
     Raises:
-        ConfigError: if a setting is out of range or unknown.
         DataError: if the table is not sound, or too small or degenerate for a density.
     """
-    require_whole("drivers", 1, drivers=drivers)
-    require_whole("drivers", 0, LAST_SEED, seed=seed)
-    if bandwidth is not None:
-        require_positive("drivers", bandwidth=bandwidth)
     require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
-    limits = checked_bounds(bounds)
+    limits = Bounds(**(bounds or {}))
     table = load_drivers(path, mode)
     models = sorted(set(models_of(table, "driver table")))
     if len(models) > 1:
@@ -251,10 +240,11 @@ def kde(
     draws = density.resample(drivers, seed=np.random.default_rng(seed))
     drawn = {column: np.full(drivers, table[column].iloc[0]) for column in columns.values()}
     for name, row in zip(names, draws, strict=True):
-        drawn[COLUMNS[name]] = row.clip(*limits[name])
+        drawn[COLUMNS[name]] = row.clip(*getattr(limits, name))
     return from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
 
 
+@checked
 def fixed(
     desired_speed: float = 25.0,
     time_gap: float = 1.2,
@@ -270,11 +260,7 @@ def fixed(
         acceleration: a [m/s²].
         deceleration: b [m/s²].
         min_gap: s0 [m].
-
-    Raises:
-        ConfigError: if a parameter is not one that a driver can have.
     """
-    require_positive("drivers", desired_speed=desired_speed, time_gap=time_gap)
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
         time_gap=torch.tensor([float(time_gap)]),

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, MODES, PLAUSIBLE, users
-from lcc_rl.errors import DataError, ResultsError, unknown_name
+from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, PLAUSIBLE, users
+from lcc_rl.errors import DataError, ResultsError
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
 
@@ -26,14 +26,11 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
             table has, local where it has both.
 
     Returns:
-        One row per driver, columns as written by :func:`lcc_rl.drivers.fit.fit`.
+        One row per driver, columns as written by :class:`lcc_rl.drivers.calibrator.Calibrator`.
 
     Raises:
-        ConfigError: if the mode is unknown.
         DataError: naming file, row and column, if the table is missing, empty or not sound.
     """
-    if mode is not None and mode not in MODES:
-        raise unknown_name("calibration mode", mode, MODES)
     try:
         if path is None:
             with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED) as file:

@@ -1,10 +1,9 @@
 """Energy models: what driving draws from a battery or a tank, and who has which."""
 
 from lcc_rl.energy.base import EnergyModel
-from lcc_rl.energy.electric import ElectricCar
+from lcc_rl.energy.electric import ElectricCar, PaperMotor
 from lcc_rl.energy.fleet import Fleet, as_fleet, build_energy
 from lcc_rl.energy.fuel import CirclesFuel
-from lcc_rl.energy.motor import PaperMotor
 
 __all__ = [
     "CirclesFuel",

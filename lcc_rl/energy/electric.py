@@ -1,4 +1,4 @@
-"""Electric cars: losses of the drivetrain, and limits of what braking returns."""
+"""Electric cars: one with losses and limits of what braking returns, and the ALCC paper's."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.energy.base import EnergyModel, Grade
+from lcc_rl.functional.power import PAPER_VEHICLE, acceleration_loss, motor_power, path_power
 from lcc_rl.settings import NonNegative, Positive
 
 GRAVITY, AIR = 9.81, 1.2  # [m/s²], [kg/m³]
@@ -50,3 +51,25 @@ class ElectricCar(EnergyModel):
         taken = (-wheels).clamp(0.0, self.regeneration_limit) * fading
         driving = wheels.clamp(min=0.0) / self.efficiency
         return driving - taken * self.efficiency + self.auxiliary
+
+
+class PaperMotor(EnergyModel):
+    """Electric power of the ALCC paper's car (A2); braking returns 2.4 times its kinetic energy.
+
+    Steady power, what the motion stores and what accelerating loses add up to A2 exactly.
+    """
+
+    mass = PAPER_VEHICLE.mass
+    rotating_mass = PAPER_VEHICLE.rotating_mass
+
+    def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return the motor's power [W] (A2)."""
+        return motor_power(speed, acceleration)
+
+    def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return A2 without the part that the motion stores [W]."""
+        return path_power(speed, acceleration)
+
+    def acceleration_loss(self, speed: Tensor, acceleration: Tensor) -> Tensor:
+        """Return the part of A2 with a² [W]."""
+        return acceleration_loss(speed, acceleration)

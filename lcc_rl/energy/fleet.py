@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lcc_rl.config.nodes import build
 from lcc_rl.energy.base import EnergyModel
-from lcc_rl.energy.motor import PaperMotor
+from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
 
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
@@ -24,9 +24,6 @@ class Fleet:
         models: by the name of the class.
         shares: share of each class among the vehicles; None for equal shares.
         roles: shares among the vehicles of a role, where they differ.
-
-    Raises:
-        ConfigError: if there is no model, or the shares name an unknown one or are all zero.
     """
 
     def __init__(
@@ -119,12 +116,6 @@ def as_fleet(energy: EnergyModel | Fleet | None) -> Fleet:
 def build_energy(cfg: Any) -> Fleet:
     """Build the energy models that the node ``energy`` of a configuration describes.
 
-    A configuration of a release without the node has the ALCC paper's.
-
-    Raises:
-        ConfigError: naming the option at fault.
+    Without the node, it is the ALCC paper's.
     """
-    node = cfg.energy
-    if node is None:
-        return as_fleet(None)
-    return as_fleet(build(node, "energy", MEANT))
+    return as_fleet(cfg.energy and build(cfg.energy, "energy", MEANT))

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import settings
 from lcc_rl.envs.step import tick
-from lcc_rl.errors import ConfigError, require_whole
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
 
 MOST_SEED = 2**64 - 1  # of torch's generators
@@ -64,7 +64,8 @@ class Clock(EnvBase):
         if horizon < 1:
             raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
         batch = batch_shape(batch_size)
-        require_whole("", 0, MOST_SEED, seed=seed)
+        if seed not in range(MOST_SEED + 1):
+            raise ConfigError(f"seed must be a whole number from 0 to {MOST_SEED}, got {seed!r}")
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon
         self.generator = torch.Generator()

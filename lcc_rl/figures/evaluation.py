@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +25,12 @@ from lcc_rl.figures.drawing import (
     style,
 )
 from lcc_rl.figures.platoon import platoon_figures
-from lcc_rl.figures.policy_maps import policy_maps
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.intervals import Estimate, share_saved
-from lcc_rl.results.motion import RESPONSES
+from lcc_rl.results.means import Means
 from lcc_rl.results.runs import stored_config
-from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, paired, savings, worse_off
+from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, savings
 
 VEHICLES = {
     "leader": ("leader", INK),
@@ -45,8 +43,7 @@ def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
-        folder: holds config.yaml, episodes.parquet, steps.parquet and, if policies are to be
-            mapped, responses.parquet.
+        folder: holds config.yaml, episodes.parquet and steps.parquet.
         rows: what a row of episodes.parquet is of, ``episodes`` or ``vehicles``.
 
     Returns:
@@ -63,8 +60,6 @@ def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
-    if (folder / RESPONSES).is_file():
-        found = chain(found, policy_maps(read_parquet(folder / RESPONSES), steps, cfg))
     formats = cfg.get("figure_formats", ())
     return [
         save(figure, folder / "figures" / f"{in_file(stem)}.png", formats=formats)
@@ -82,7 +77,7 @@ def study_figures(
         steps: rows of steps.parquet; it may have none.
         cfg: the evaluation's configuration.
     """
-    names = list(dict.fromkeys(episodes["strategy"]))
+    means, names = Means.of(episodes), list(dict.fromkeys(episodes["strategy"]))
     cars = [name for name in names if name != "direct"]
     diagram = space_time(steps, [*names[:1], *names[-2:]], cfg) if len(steps) else None
     if diagram is not None:
@@ -93,10 +88,10 @@ def study_figures(
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
-            yield f"human_energy {name}", human_energy(episodes, name)
+            yield f"human_energy {name}", human_energy(means, name)
         for baseline in BASELINES:
             if baseline in names and baseline != name and name not in UNTRAINED:
-                figure = paired_improvement(episodes, name, baseline)
+                figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure
 
 
@@ -179,11 +174,11 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     return rows.rename(columns=lambda name: re.sub(r"^(cav|hdv)1_", r"\1_", name))
 
 
-def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
+def human_energy(means: Means, strategy: str) -> Figure:
     """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
     names = {"direct": "B: direct", strategy: f"A: behind {in_words(strategy)}"}
     column = "hdv_path_energy_kj"
-    figure, saving, share = _by_driver(episodes, column, names, "the human driver")
+    figure, saving, share = _by_driver(means, column, names, "the human driver")
     figure.suptitle(
         f"Human driver's path energy with and without the controlled car ahead "
         f"(n = {len(saving)} drivers)\nmean saving {share}",
@@ -192,29 +187,27 @@ def human_energy(episodes: pd.DataFrame, strategy: str) -> Figure:
     return figure
 
 
-def paired_improvement(episodes: pd.DataFrame, strategy: str, baseline: str) -> Figure:
+def paired_improvement(means: Means, strategy: str, baseline: str) -> Figure:
     """Path energy of all vehicles by driver and its saving against a baseline (Fig. 10)."""
     names = {name: in_words(name) for name in (baseline, strategy)}
     column = "total_path_energy_kj"
-    figure, saving, share = _by_driver(episodes, column, names, "all vehicles")
-    pairs = worse_off(paired(episodes, column), strategy, baseline)["pairs"]
+    figure, saving, share = _by_driver(means, column, names, "all vehicles")
     figure.suptitle(
         f"{names[strategy]} against {names[baseline]}: saving of path energy {share}\n"
         f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %; worse off: "
-        f"{int((saving < 0).sum())} of {len(saving)} drivers, "
-        f"{100 * pairs:.0f} % of (window, driver) pairs",
+        f"{int((saving < 0).sum())} of {len(saving)} drivers",
         fontsize=10,
     )
     return figure
 
 
 def _by_driver(
-    episodes: pd.DataFrame, column: str, names: dict[str, str], whose: str
+    means: Means, column: str, names: dict[str, str], whose: str
 ) -> tuple[Figure, pd.Series, str]:
     """Draw the energies of all drivers under a baseline and a strategy, and what each saves.
 
     Args:
-        episodes: rows of an evaluation.
+        means: of an evaluation.
         column: the energy.
         names: labels of the baseline and of the strategy, in this order.
         whose: energy, for the label of the axis.
@@ -223,7 +216,7 @@ def _by_driver(
         The figure, the share that each driver saves, and the mean saving in words.
     """
     baseline, strategy = names
-    energy = by_driver(episodes, column)[[baseline, strategy]].dropna()
+    energy = by_driver(means.drivers, column)[[baseline, strategy]].dropna()
     figure = new_figure(9.0, 3.8)
     left, right = figure.subplots(1, 2)
     bins = np.histogram_bin_edges(energy.to_numpy(), 30)
@@ -238,8 +231,8 @@ def _by_driver(
     against = " against ".join(label.split(":")[0] for label in (names[strategy], names[baseline]))
     _sorted_bars(right, saving, colour(strategy))
     style(right, "drivers, sorted", f"path energy saved\n{against} [%]")
-    found = savings(episodes, column, strategy, baseline)
-    return figure, saving, _with_interval(found, episodes, strategy)
+    found = savings(means.windows, column, strategy, baseline)
+    return figure, saving, _with_interval(found, means.windows, strategy)
 
 
 def _with_interval(found: Estimate, episodes: pd.DataFrame, strategy: str) -> str:

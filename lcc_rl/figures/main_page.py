@@ -54,7 +54,6 @@ HELD_TO = (
 # Files of figures, in the job's folder and without their ending, and their captions.
 RESULTS = {
     "evaluation/figures/overview": "A held-out episode, and the path energy of both cars",
-    "evaluation/figures/policy_map": "What the networks and a tuned rule do",
     "evaluation/figures/learning_curve": "The trainings: what they minimise, and their limit",
 }
 DRIVERS = {

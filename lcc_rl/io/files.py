@@ -22,8 +22,6 @@ from lcc_rl.io.memory import require_memory
 from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
-# Changes of a table from one schema version to the next, by the older version.
-MIGRATIONS: dict[int, Callable[[pd.DataFrame], pd.DataFrame]] = {}
 PROCESSOR = "lcc_rl.processor"  # in a table's metadata
 # The rows of a table, read; or, of many rows, files that are read when asked.
 Rows: TypeAlias = pd.DataFrame | ds.Dataset
@@ -99,13 +97,10 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
     """
     # As a table, as a data frame, and once more while it is checked.
     require_memory({f"reading {path}": 3 * _read(path, _unpacked_size)})
+    _schema(Path(path))
     table = _read(path, partial(pq.read_table, page_checksum_verification=True))
-    # Tables of other origin have no schema version and are read unchanged.
-    version = (table.schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
-    if version not in map(str, range(1, int(SCHEMA_VERSION) + 1)):
-        found = f"schema version {version[:20]!r}"
-        raise ResultsError(f"{path}: {found}; this package reads 1 to {SCHEMA_VERSION}")
-    return migrated(table.to_pandas(), int(version))
+    frame: pd.DataFrame = table.to_pandas()
+    return frame
 
 
 def as_rows(path: Path) -> Rows:
@@ -158,7 +153,7 @@ def as_dataset(
 
 
 def _schema(path: Path) -> pa.Schema:
-    """Return the columns of a table of the present schema version."""
+    """Return the columns of a table of the present schema version, or of other origin."""
     found: pa.Schema = _read(path, pq.read_schema)
     version = (found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
     if version != SCHEMA_VERSION:
@@ -193,13 +188,6 @@ def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
         return reader(path)
     except (pa.ArrowException, OSError) as error:
         raise ResultsError(f"{path}: not a readable parquet file: {error}") from error
-
-
-def migrated(frame: pd.DataFrame, version: int) -> pd.DataFrame:
-    """Convert a table of an older schema to the present one, version by version."""
-    for old in range(version, int(SCHEMA_VERSION)):
-        frame = MIGRATIONS[old](frame)
-    return frame
 
 
 def parquet_metadata(path: str | Path) -> dict[str, str]:

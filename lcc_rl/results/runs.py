@@ -23,7 +23,7 @@ log = logging.getLogger("lcc_rl")
 CONFIG = "config.yaml"
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
 # What no command of other settings may replace: results, and what a stopped run resumes from.
-KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "overrides.json", "blocks")
+KEPT = ("episodes.parquet", "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
 
 
@@ -50,13 +50,6 @@ def check_folder(cfg: BaseConfig, folder: Path) -> None:
             f"{folder} already holds {kept[0]} of other settings ({names}); choose another "
             "hydra.run.dir, or remove the folder"
         )
-
-
-def check_links(folder: Path) -> None:
-    """Refuse to resume in a folder that holds links, which could lead anywhere."""
-    link = next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None)
-    if link is not None:
-        raise ResultsError(f"{link}: a link, which may lead out of the folder; put the file there")
 
 
 def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:

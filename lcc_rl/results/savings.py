@@ -33,12 +33,14 @@ def paired(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
 
 def by_driver(episodes: pd.DataFrame, column: str) -> pd.DataFrame:
     """Return a column per strategy and a row per driver, the mean over profiles and seeds."""
-    return paired(episodes, column).groupby("driver_id").mean()
+    return episodes.pivot_table(
+        index="driver_id", columns="strategy", values=column, aggfunc="mean"
+    )
 
 
-def driver_savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.Series:
+def driver_savings(drivers: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.Series:
     """Return the share of a baseline's mean energy that a strategy saves, by driver."""
-    energy = by_driver(episodes, column)
+    energy = by_driver(drivers, column)
     return share_saved(energy[strategy], energy[baseline])
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import pandas as pd
 from rich.table import Table
 
 from lcc_rl.energy import Fleet
-from lcc_rl.errors import ConfigError, require_in, unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.results.savings import NOTHING, savings
 from lcc_rl.results.tables import strategies_side_by_side
 from lcc_rl.results.units import check_unit, per_distance
+from lcc_rl.settings import NonNegative, Settings
 
 # Scores by name: the column that is divided by the distance of all vehicles.
 PER_DISTANCE = {
@@ -32,36 +33,25 @@ LIMITED = (
 )
 
 
-@dataclass(frozen=True)
-class Task:
-    """What a task asks for.
-
-    Args:
-        name: of the task.
-        score: the quantity to minimise: ``energy``, ``net_energy`` or ``path_energy`` of all
-            vehicles over their distance, or a column of episodes.parquet.
-        unit: of an energy over a distance, see :mod:`lcc_rl.results.units`.
-        against: the strategy that the others are compared with.
-        limits: bounds by column: the largest value of ``max_…`` and the smallest of ``min_…`` in
-            any episode, and the largest mean of ``share_…`` over all episodes.
-
-    Raises:
-        ConfigError: if the score or the column of a limit is unknown, or a bound is no number.
-    """
+class Task(Settings):
+    """What a task asks for."""
 
     name: str
+    # What is minimised: energy, net_energy or path_energy of all vehicles over their distance, or
+    # a column of episodes.parquet.
     score: str = "net_energy"
-    unit: str = "kJ/km"
-    against: str = "human"
-    limits: Mapping[str, float] = field(default_factory=dict)
+    unit: str = "kJ/km"  # of an energy over a distance, see lcc_rl.results.units
+    against: str = "human"  # the strategy that the others are compared with
+    # Bounds by column: the largest value of max_… and the smallest of min_… in any episode, and
+    # the largest mean of share_… over all episodes.
+    limits: Mapping[str, NonNegative] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
+    def settled(self) -> None:
         if self.score not in (*PER_DISTANCE, *PLAIN):
             raise unknown_name("score (task.score)", self.score, (*PER_DISTANCE, *PLAIN))
-        for column, bound in self.limits.items():
+        for column in self.limits:
             if column not in LIMITED:
                 raise unknown_name("column of task.limits", column, LIMITED)
-            require_in("task.limits", "[0, inf)", **{column: bound})
 
     def among(self, strategies: Iterable[str]) -> Task:
         """Return the task for an evaluation of these strategies.

@@ -25,7 +25,7 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from lcc_rl.errors import ConfigError, ResultsError, require_in
+from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.states import survey
 
@@ -75,7 +75,7 @@ class SearchSweeper(Sweeper):
         seed: int,
         params: dict[str, Any],
     ) -> None:
-        require_in("hydra.sweeper", "[1, inf)", n_trials=n_trials, n_jobs=n_jobs)
+        require(min(n_trials, n_jobs) >= 1, "hydra.sweeper.n_trials and n_jobs must be positive")
         for direction in directions:
             if direction not in ("minimize", "maximize"):
                 words = "expected minimize or maximize"

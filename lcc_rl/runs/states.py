@@ -13,16 +13,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
-
-try:
-    import fcntl
-except ImportError:  # Windows: runs are not locked there
-    fcntl = None  # type: ignore[assignment]
 
 LOCK, ERROR, PROGRESS = ".lock", "error.txt", "progress.json"
 # The table that a run writes last: a training or evaluation, a calibration.
@@ -72,60 +68,38 @@ def claim(folder: Path) -> Iterator[None]:
         Busy: if another process holds the lock.
         ResultsError: if the folder cannot be written.
     """
-    path, made = folder / LOCK, False
+    made, lock = False, FileLock(folder / LOCK)
     try:
         made = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        file = _locked(path)
-    except BlockingIOError:
+        lock.acquire(timeout=0)
+    except Timeout:
         raise busy(folder) from None
-    except OSError as error:
+    except (OSError, NotImplementedError) as error:
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
     try:
         remove_leftovers(folder)
         yield
     finally:
         with suppress(OSError):
-            path.unlink()
-        os.close(file)
+            (folder / LOCK).unlink()
+        lock.release()
         if made:
             with suppress(OSError):  # it holds something
                 folder.rmdir()
 
 
-def _locked(path: Path) -> int:
-    while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Another process may have removed the file between the two calls.
-            if os.path.samestat(os.fstat(file), os.stat(path)):
-                return file
-        except FileNotFoundError:
-            pass
-        except OSError:
-            os.close(file)
-            raise
-        os.close(file)
-
-
 def is_claimed(folder: Path) -> bool:
     """Whether a process on this machine holds a run's folder."""
     try:
-        file = os.open(folder / LOCK, os.O_RDWR)
-    except OSError:
-        return False
-    try:
-        if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        return False
-    except BlockingIOError:
+        if (folder / LOCK).exists():
+            with FileLock(folder / LOCK, timeout=0):
+                return False
+    except Timeout:
         return True
-    except OSError:  # a file system without locks
+    except (OSError, NotImplementedError):  # a file system without locks, a name too long
         return False
-    finally:
-        os.close(file)
+    return False
 
 
 @contextmanager

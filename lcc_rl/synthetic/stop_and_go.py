@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from lcc_rl.errors import require_in
+from lcc_rl.settings import NonNegative, Positive, Settings, Share
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class StopAndGo:
+class StopAndGo(Settings):
     """Leaders that track a target speed which jumps, as in stop-and-go waves.
 
     Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of its
@@ -30,44 +27,21 @@ class StopAndGo:
     leaders of the synthetic pairs and those of 264 real pairs in the mean and quantiles of
     speed, acceleration and 30 s energy and in the
     autocorrelation of acceleration, for platoons of four vehicles.
-
-    Args:
-        mean_speed_mps: mean of the levels [m/s].
-        level_spread_mps: standard deviation of the levels over leaders [m/s].
-        wave_spread_mps: standard deviation of the waves [m/s].
-        wave_s: mean time that a wave holds [s].
-        ripple_spread_mps: standard deviation of the ripples [m/s].
-        ripple_s: mean time that a ripple holds [s].
-        response_s: time constant of the response to a jump [s].
-        acceleration_limit: largest acceleration [m/s²].
-        braking_limit: largest deceleration, positive [m/s²].
-        free_speed_mps: bound of level and wave together: the speed of free traffic, from which
-            waves only slow down [m/s]; None for no bound.
-        stop_share: share of the waves in which traffic stands, 0…1: the lowest ones.
-
-    Raises:
-        ConfigError: if a parameter is not positive (the spreads may be zero), naming it.
     """
 
-    mean_speed_mps: float = 5.21
-    level_spread_mps: float = 2.78
-    wave_spread_mps: float = 2.59
-    wave_s: float = 4.92
-    ripple_spread_mps: float = 1.32
-    ripple_s: float = 2.13
-    response_s: float = 0.99
-    acceleration_limit: float = 2.5
-    braking_limit: float = 3.5
-    free_speed_mps: float | None = None
-    stop_share: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_in("data.leader", "[0, 1)", stop_share=self.stop_share)
-        for name, value in vars(self).items():
-            if name == "stop_share" or (name == "free_speed_mps" and value is None):
-                continue
-            spread = name.endswith("spread_mps")
-            require_in("data.leader", "[0, inf)" if spread else "(0, inf)", **{name: value})
+    mean_speed_mps: Positive = 5.21  # mean of the levels [m/s]
+    level_spread_mps: NonNegative = 2.78  # standard deviation of the levels over leaders [m/s]
+    wave_spread_mps: NonNegative = 2.59  # standard deviation of the waves [m/s]
+    wave_s: Positive = 4.92  # mean time that a wave holds [s]
+    ripple_spread_mps: NonNegative = 1.32  # standard deviation of the ripples [m/s]
+    ripple_s: Positive = 2.13  # mean time that a ripple holds [s]
+    response_s: Positive = 0.99  # time constant of the response to a jump [s]
+    acceleration_limit: Positive = 2.5  # [m/s²]
+    braking_limit: Positive = 3.5  # [m/s²]
+    # Bound of level and wave together: the speed of free traffic, from which waves only slow
+    # down [m/s]; None: no bound.
+    free_speed_mps: Positive | None = None
+    stop_share: Share = 0.0  # of the waves, the lowest ones, in which traffic stands
 
     def drive(
         self, count: int, steps: int, time_step: float, generator: np.random.Generator

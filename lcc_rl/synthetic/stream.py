@@ -9,96 +9,71 @@ and calibration as the real files. Unlike there, the parameters of every driver 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import field, replace
 from datetime import UTC, datetime, timedelta
 from filecmp import cmp
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
-from typing import ClassVar
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
+from pydantic import Field, InstanceOf
 
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import LAST_SEED, ConfigError, require_in, require_whole
+from lcc_rl.errors import LARGEST_SIZE, LAST_SEED, ConfigError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.memory import require_memory
+from lcc_rl.settings import Count, Settings, Share, given_as
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 SAMPLE = 600  # bytes that a sample of a vehicle costs while the file is written and read back
+Duration = Annotated[float, Field(ge=1.0, le=36_000.0)]
+Range = Annotated[tuple[Duration, Duration], Field(strict=False)]
+Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 
 
-@dataclass(frozen=True)
-class StreamSource:
+class StreamSource(Settings):
     """Source of synthetic car-following episodes, written in the NGSIM layout and read back.
 
     The default size gives 270 pairs in three recordings; the I-80 data that the leader is fitted
     to hold 264 pairs in three recordings.
-
-    Args:
-        recordings: number of recordings; their leaders, drivers and vehicle ids are independent.
-        platoons: platoons per recording.
-        vehicles: vehicles per platoon, the stochastic leader included.
-        duration_s: range of the uniformly distributed time for which a platoon is recorded [s].
-        seed: seed of all randomness; the same seed gives the same file, byte for byte.
-        noise: the executed acceleration of a driver is a(1 + ξ), ξ ~ U(0, noise) (A18).
-        leader: the stochastic leader; by default the one fitted to I-80.
-        drivers: the population; by default the shipped I-80 drivers.
-        criteria: what counts as car following; by default that of the real files.
-        keep: new path under which the file is kept, compressed where it ends in ``.gz``; by
-            default a temporary file is used.
-
-    Raises:
-        ConfigError: if an argument is out of range, naming it.
     """
 
-    WRITES: ClassVar = ("keep",)  # settings that name a place to write
+    WRITES = ("keep",)  # settings that name a place to write
 
-    recordings: int = 3
-    platoons: int = 30
-    vehicles: int = 4
-    duration_s: tuple[float, float] = (60.0, 90.0)
-    seed: int = 0
-    noise: float = 0.05
-    leader: StopAndGo | None = None
-    drivers: DriverPopulation | None = None
-    criteria: Criteria | None = None
-    keep: str | None = None
+    recordings: Count = 3  # their leaders, drivers and vehicle ids are independent
+    platoons: Count = 30  # per recording, one after another
+    # Per platoon, the stochastic leader included.
+    vehicles: Annotated[int, Field(ge=2, le=LARGEST_SIZE)] = 4
+    duration_s: Range = (60.0, 90.0)  # of how long a platoon is seen [s]
+    seed: Seed = 0  # of the data; the run's own seed leaves them alone
+    noise: Share = 0.05  # drivers execute a(1 + ξ), ξ ~ U(0, noise) (A18)
+    leader: given_as(StopAndGo) = field(default_factory=StopAndGo)  # type: ignore[valid-type]
+    drivers: InstanceOf[DriverPopulation] | None = None  # None: the shipped I-80 drivers
+    # What counts as car following; the default is that of real files.
+    criteria: given_as(Criteria) = field(default_factory=Criteria)  # type: ignore[valid-type]
+    # A new .csv or .csv.gz file to write the stream to, never over another; None: no file.
+    keep: Annotated[str, Field(pattern=r"\.csv(\.gz)?$")] | None = None
 
-    def __post_init__(self) -> None:
-        require_whole("data", 0, LAST_SEED, seed=self.seed)
-        for name, least in (("recordings", 1), ("platoons", 1), ("vehicles", 2)):
-            require_whole("data", least, **{name: getattr(self, name)})
-        try:
-            low, high = map(float, self.duration_s)
-        except (TypeError, ValueError):
-            low = high = float("nan")
-        if not 1.0 <= low <= high <= 36_000.0:
-            raise ConfigError(
-                "stream: 'duration_s' must be two numbers, a range in 1…36000 s, "
-                f"got {self.duration_s!r}"
-            )
-        if self.keep is not None and not str(self.keep).endswith((".csv", ".csv.gz")):
-            raise ConfigError(f"data.keep must name a .csv or .csv.gz file, got {self.keep!r}")
-        require_in("data", "[0, 1)", noise=self.noise)
-        count = self.recordings * self.platoons * self.vehicles
-        size = f"data: recordings × platoons × vehicles = {count}, up to {high:g} s each,"
-        require_memory({size: count * high / FRAME * SAMPLE})
+    def settled(self) -> None:
+        low, high = self.duration_s
+        if low > high:
+            raise ConfigError(f"data.duration_s must be a range, got {low:g} to {high:g} s")
 
     def generate(self) -> Stream:
-        """Simulate all recordings.
-
-        Raises:
-            DataError: if the shipped drivers cannot be read.
-        """
+        """Simulate all recordings."""
+        count, longest = self.recordings * self.platoons * self.vehicles, self.duration_s[1]
+        size = f"data: recordings × platoons × vehicles = {count}, up to {longest:g} s each,"
+        require_memory({size: count * longest / FRAME * SAMPLE})
         made = [
             self.drive(recording_name(index), np.random.default_rng([self.seed, index]))
             for index in range(self.recordings)
@@ -110,8 +85,8 @@ class StreamSource:
         """Simulate one recording; vehicle ids count from 1, platoon by platoon, front to back."""
         low, high = (round(value / FRAME) for value in self.duration_s)
         seen = generator.integers(low, high + 1, self.platoons)
-        leader, drivers = self.leader or StopAndGo(), self.drivers or bootstrap()
-        made = drive_platoons(leader, drivers, self.vehicles, seen, self.noise, generator)
+        drivers = self.drivers or bootstrap()
+        made = drive_platoons(self.leader, drivers, self.vehicles, seen, self.noise, generator)
         return Stream(made.samples.assign(recording=name), made.truth.assign(recording=name))
 
     def write(self, path: str | Path) -> Stream:
@@ -119,9 +94,6 @@ class StreamSource:
 
         The parameters of the drivers are written beside the file: ``stream_truth.parquet`` for
         ``stream.csv``.
-
-        Raises:
-            DataError: if the shipped drivers cannot be read.
             ResultsError: if a file cannot be written.
         """
         stream = self.generate()

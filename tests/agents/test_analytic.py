@@ -13,7 +13,7 @@ from helpers import POPULATION, REWARD, TERMS, compose, make_agent, slow_but, st
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.gradient import GradientTrainer
-from lcc_rl.config import identity, load
+from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
@@ -126,29 +126,6 @@ def test_the_value_is_fitted_to_returns_of_all_lengths(every) -> None:
     assert float(loss) == pytest.approx(float(torch.stack(errors).square().mean()), rel=1e-5)
 
 
-def test_a_removed_term_is_not_optimised(tmp_path) -> None:
-    names = {term.name for term, _ in make(tmp_path).objective.terms}
-    assert names == {
-        "safety",
-        "efficiency",
-        "cav_energy",
-        "hdv_energy",
-        "collision",
-        "smoothness",
-    }
-    trainer = make(tmp_path, "~reward.terms.efficiency", "reward.terms.safety.weight=3")
-    factors = {term.name: factor for term, factor in trainer.objective.terms}
-    assert "efficiency" not in factors
-    assert factors["safety"] == 3.0
-
-
-def test_what_no_segment_sees_is_said(tmp_path, caplog) -> None:
-    make(tmp_path, *WHOLE)
-    assert not caplog.records
-    make(tmp_path, *WHOLE, "training.segment=10")
-    assert "use training.segment=20" in caplog.text
-
-
 def test_divergence_is_named(tmp_path) -> None:
     trainer = make(tmp_path)
     with torch.no_grad():
@@ -157,12 +134,6 @@ def test_divergence_is_named(tmp_path) -> None:
         Diverged, match=r"weight module.* became no number in iteration 1 of 5; .*learning_rate"
     ):
         trainer.run()
-
-
-def test_its_length_comes_with_it_and_can_be_overridden() -> None:
-    assert load("train", ["agent=analytic"]).training.environments == 256
-    assert load("train", ["agent=analytic", "training.episodes=512"]).training.episodes == 512
-    assert load("train").training.environments == 20
 
 
 # Through a second only a price that begins early can be felt; the loss holds the learned value of

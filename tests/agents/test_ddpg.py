@@ -11,9 +11,6 @@ from tensordict import TensorDict
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.off_policy import leaves
-from lcc_rl.config import load
-from lcc_rl.io.tensors import read_torch
-from lcc_rl.results.policies import save_policy
 
 
 def transitions(count: int, seed: int) -> TensorDict:
@@ -97,42 +94,6 @@ def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
                 torch.testing.assert_close(tensor.detach(), value.detach(), rtol=0.0, atol=close)
 
 
-def test_batches_of_all_sizes_are_learned_from() -> None:
-    agents = [agent(fused=fused) for fused in (True, False)]
-    for step, size in enumerate((8, 64, 8)):
-        fused, plain = (one.update(transitions(size, step)) for one in agents)
-        for name in plain:
-            torch.testing.assert_close(fused[name], plain[name], rtol=1e-4, atol=1e-6)
-
-
-def test_networks_that_learn_at_two_rates_do_so_where_one_rate_is_nearly_zero() -> None:
-    for slow in ("actor", "value"):
-        rates = {"actor_lr": 1e-3, "critic_lr": 1e-3}
-        learner = agent(**{**rates, "actor_lr" if slow == "actor" else "critic_lr": 1e-30})
-        before = deepcopy(learner.loss.state_dict())
-        learner.update(transitions(64, 0))
-        for name, value in learner.loss.state_dict().items():
-            if name.startswith(("actor_network", "value_network")):
-                assert torch.equal(value, before[name]) == name.startswith(slow), name
-
-
-def test_a_policys_file_holds_its_weights_only(tmp_path) -> None:
-    learner = agent()
-    save_policy(learner.policy.state_dict(), load("train"), tmp_path / "policy.pt")
-    found = read_torch(tmp_path / "policy.pt")["weights"]
-    for name, weight in learner.policy.state_dict().items():
-        assert torch.equal(found[name], weight)
-        assert found[name].untyped_storage().nbytes() == 4 * weight.numel()
-
-
-def test_the_policy_acts_with_the_weights_that_the_fused_update_moves() -> None:
-    learner = agent()
-    batch = transitions(64, 0)
-    before = learner.policy(batch.clone())["action"]
-    learner.update(batch)
-    assert not torch.equal(before, learner.policy(batch.clone())["action"])
-
-
 def test_a_restored_agent_goes_on_bit_for_bit() -> None:
     first, second = agent(), agent()
     first.update(transitions(64, 0))
@@ -174,13 +135,3 @@ def test_without_mask_a_value_is_expected_after_a_collision(fused: bool) -> None
     assert ends.any()
     assert value(False, batch) == value(True, alive) != value(True, batch)
     assert torch.equal(batch["next", "terminated"], ends)  # the caller's batch is left alone
-
-
-def test_a_restored_agent_keeps_count_of_its_target_steps() -> None:
-    settings = {"tau": 1.0, "target_every": {"actor": 3, "critic": 5}}
-    first, second = agent(**settings), agent(**settings)
-    for step in range(4):
-        first.update(transitions(64, step))
-    second.load_state_dict(deepcopy(first.state_dict()))
-    for step in range(4, 9):
-        assert first.update(transitions(64, step)) == second.update(transitions(64, step))

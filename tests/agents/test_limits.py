@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import compose, make_agent
 from test_analytic import make
 
 from lcc_rl.agents.limits import Limits
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
 
@@ -36,42 +34,6 @@ def test_a_price_is_resumed() -> None:
     assert two.logarithms == one.logarithms
 
 
-@pytest.mark.parametrize(
-    ("largest", "words"),
-    [
-        ({"saftey": 0.0}, "agent.limits.saftey: there is no agent.surrogates.saftey"),
-        ({"smoothness": 0.0}, "agent.limits.smoothness: Smoothness has no limit to keep"),
-    ],
-)
-def test_what_is_no_limit_is_refused(largest, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        Limits(largest, 0.1, KNOWN)
-
-
-def test_a_limit_of_a_term_without_weight_is_refused() -> None:
-    known = {"efficiency": SmoothEfficiency(weight=0.0)}
-    with pytest.raises(ConfigError, match="weight is 0, which no price can change"):
-        Limits({"efficiency": 0.01}, 0.1, known)
-    assert not Limits({"efficiency": None}, 0.1, known).largest
-
-
-def test_a_limit_that_is_null_is_a_fixed_price() -> None:
-    agent = make_agent(
-        compose("alcc", "agent=analytic", "surrogates@agent=limits", "agent.limits.safety=null")
-    )
-    assert set(agent.objective.limits.largest) == {"efficiency"}
-
-
-def test_where_a_limit_is_missed() -> None:
-    def column(*values: float) -> torch.Tensor:
-        return torch.tensor(values).unsqueeze(-1)
-
-    gap, speed = column(26.0, 24.0, 4.0), column(10.0, 10.0, 0.5)
-    assert SmoothEfficiency().missed(gap, speed).flatten().tolist() == [True, False, False]
-    relative = column(-7.0, -5.0, 1.0)
-    assert SmoothSafety().missed(gap, relative).flatten().tolist() == [True, False, False]
-
-
 def test_the_record_says_shares_and_prices(tmp_path) -> None:
     trainer = make(
         tmp_path, "surrogates@agent=limits", "training.episodes=32", "agent.limit_rate=0.5"
@@ -97,11 +59,3 @@ def test_path_energy_is_a2_without_what_the_motion_stores() -> None:
     assert torch.allclose(term.reward(speed, acceleration), -expected * 0.1 / 20000.0)
     # Braking is never paid for.
     assert (term.reward(speed, -3.0 * acceleration) < 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"), [({"of": "all"}, "of must be"), ({"scale": 0.0}, "scale")]
-)
-def test_settings_of_path_energy(settings, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        PathEnergy(**settings)

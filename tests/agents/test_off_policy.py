@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import pandas as pd
 import pytest
 import torch
@@ -15,7 +13,6 @@ from torchrl.objectives import SoftUpdate
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.off_policy import leaves
 from lcc_rl.agents.replay import Trainer, draws
-from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 
@@ -130,22 +127,6 @@ def test_batches_are_drawn_as_torchrls_buffer_draws_them(filled) -> None:
     for one, found in zip(expected, draws(buffer, generator), strict=False):
         for key in found.keys(True, True):
             assert torch.equal(found.get(key), one.get(key)), key
-
-
-def test_small_numbers_count_as_zero_within_and_as_themselves_after() -> None:
-    small = torch.tensor([1e-39])
-    for inside in (True, False):
-        with denormals_flushed() if inside else nullcontext():
-            flushed = float(small * 1.0) == 0.0
-        assert flushed == (inside and torch.set_flush_denormal(False))
-
-
-@EACH
-def test_an_update_leaves_the_global_generator_alone(agent) -> None:
-    made = make_agent(compose("alcc", f"agent={agent}", *SMALL))
-    before = torch.random.get_rng_state()
-    made.update(batch())
-    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 @EACH

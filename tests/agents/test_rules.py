@@ -9,7 +9,6 @@ from helpers import compose, make_agent
 
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.commands import evaluation, training
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, idm_acceleration
 from lcc_rl.functional.rules import linear_acc
 from lcc_rl.pieces import Observation
@@ -38,12 +37,6 @@ def test_the_rules_are_those_of_the_equations(state) -> None:
     assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
 
 
-def test_linear_acc_cruises_at_its_desired_speed() -> None:
-    assert linear_acc(torch.tensor(20.0), torch.tensor(500.0), 9.0, 20.0, 1.5, 2.0, 0.1, 0.5) == 0
-    following = linear_acc(torch.tensor(10.0), torch.tensor(17.0), 0.0, 25.0, 1.5, 2.0, 0.1, 0.5)
-    assert float(following) == 0.0
-
-
 @pytest.mark.parametrize("kind", ["idm", "acc"])
 def test_a_residual_begins_at_the_rule_and_leaves_it_alone(kind) -> None:
     rule, residual = policy(kind), policy(f"residual_{kind}")
@@ -53,33 +46,6 @@ def test_a_residual_begins_at_the_rule_and_leaves_it_alone(kind) -> None:
     graded = {name for name, entry in residual.named_parameters() if entry.grad is not None}
     assert graded
     assert all(name.startswith("network.") for name in graded)
-
-
-def test_constants_stay_positive() -> None:
-    rule = policy("acc")
-    with torch.no_grad():
-        rule.logarithms -= 50.0
-    assert all(value > 0.0 for value in rule.constants().values())
-    assert policy("acc", constants={"time_gap": 0.7}).constants()["time_gap"] == pytest.approx(0.7)
-
-
-@pytest.mark.parametrize(
-    ("kind", "constants", "words"),
-    [
-        ("idn", None, "unknown agent.policy 'idn'.*Did you mean 'idm'"),
-        ("idm", {"timegap": 1.0}, "unknown constant of the rule 'timegap'.*'time_gap'"),
-        ("network", {"time_gap": 1.0}, "agent.constants belong to a rule"),
-    ],
-)
-def test_what_no_rule_has_is_refused(kind, constants, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        policy(kind, constants=constants)
-
-
-def test_a_rule_must_see_what_it_needs() -> None:
-    words = "a rule needs self.gap, which observation.scales does not name"
-    with pytest.raises(ConfigError, match=words):
-        make_policy("idm", Observation(scales={"self": {"speed": 0.1}}).bind(), (8,), 0, None, 3.0)
 
 
 def test_the_agent_learns_the_constants_alone() -> None:

@@ -10,13 +10,11 @@ import torch
 from helpers import ACTION, POPULATION, compose, make_agent, small_env, string, wavy_profiles
 
 from lcc_rl.agents.loop import episode_statistics
-from lcc_rl.agents.off_policy import Exploration
 from lcc_rl.agents.replay import Trainer, transitions
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
-from lcc_rl.errors import Diverged, Interrupted, ResultsError
+from lcc_rl.errors import Interrupted, ResultsError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.io.tensors import write_torch
 
 SMALL = (
     "training.episodes=20",
@@ -119,30 +117,6 @@ def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
     assert all(torch.equal(value, best[key]) for key, value in trainer.best["weights"].items())
 
 
-@pytest.mark.slow
-def test_a_literal_training_resumes_bit_for_bit(tmp_path) -> None:
-    whole = make(tmp_path / "whole", *LITERAL)
-    expected = whole.run()
-    first = make(tmp_path / "parts", *LITERAL)
-    iterate = first._iterate
-
-    def dies(collector):
-        if first.iteration == 13:
-            raise MemoryError
-        return iterate(collector)
-
-    first._iterate = dies
-    with pytest.raises(MemoryError):
-        first.run()
-    second = make(tmp_path / "parts", *LITERAL)
-    second.load()
-    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
-    assert torch.equal(weights(second), weights(whole))
-    assert second.best["iteration"] == whole.best["iteration"]
-    kept = whole.best["weights"]
-    assert all(torch.equal(value, kept[key]) for key, value in second.best["weights"].items())
-
-
 def test_sigint_saves_and_says_how_to_go_on(tmp_path) -> None:
     expected = make(tmp_path / "whole").run()
     before = signal.getsignal(signal.SIGINT)
@@ -170,20 +144,6 @@ def test_a_checkpoint_of_another_configuration_is_refused(tmp_path) -> None:
         make(tmp_path, "agent.gamma=0.8").load()
 
 
-@pytest.mark.parametrize("damage", ["missing", "truncated", "pickle"])
-def test_damaged_checkpoints(tmp_path, damage) -> None:
-    trainer = make(tmp_path)
-    path = tmp_path / "checkpoint.pt"
-    if damage == "truncated":
-        trainer.run()
-        path.write_bytes(path.read_bytes()[:1000])
-    if damage == "pickle":
-        # Anything but tensors and containers would have to run code to load.
-        write_torch({"identity": Exploration()}, path)
-    with pytest.raises(ResultsError, match=r"checkpoint\.pt"):
-        trainer.load()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("vehicles", ["automated human", "(automated human)*2"])
 def test_torchrls_collector_gives_the_same_rows(tmp_path, vehicles) -> None:
@@ -207,25 +167,6 @@ def test_every_vehicles_transition_is_learned_from() -> None:
     done = data["next", "done"].unsqueeze(-2).expand(3, 10, 2, 1)
     assert torch.equal(rows["next", "done"].view(3, 10, 2, 1), done)
     assert done[:, -1].all()
-
-
-def test_divergence_stops_with_the_quantity_named(tmp_path) -> None:
-    trainer = make(tmp_path, "agent.critic_lr=1e9", "training.episodes=400")
-    with pytest.raises(Diverged, match=r"\w+ became (nan|-?inf) in iteration 1 of 100"):
-        trainer.run()
-
-
-def test_exploration_decays_linearly() -> None:
-    schedule = Exploration(initial=0.4, final=0.1, decay_share=0.5)
-    assert [round(schedule.sigma(x), 6) for x in (0.0, 0.25, 0.5, 1.0)] == [0.4, 0.25, 0.1, 0.1]
-
-
-def test_update_ratio_is_as_stated(tmp_path) -> None:
-    rows = make(tmp_path, "agent.updates_per_transition=0.25").run()
-    # 4 environments × 20 steps = 80 transitions per iteration, a quarter of it updates; the first
-    # iteration already fills the batch of 32.
-    assert rows["updates"].diff().dropna().eq(20).all()
-    assert rows["transitions"].iloc[-1] == 400
 
 
 def test_statistics_leave_out_what_follows_a_collision(tmp_path) -> None:

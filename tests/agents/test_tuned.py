@@ -11,7 +11,6 @@ from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.tuned import SearchLoop
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
-from lcc_rl.errors import ConfigError
 
 pytest.importorskip("cmaes")
 SMALL = ("agent=tuned", "agent.candidates=4", "training.environments=8", "training.episodes=96")
@@ -67,9 +66,3 @@ def test_it_finds_better_constants(tmp_path) -> None:
     loop.run()
     loop.objective.limits.logarithms = dict.fromkeys(loop.objective.limits.logarithms, 0.0)
     assert cost() < 0.9 * before
-
-
-def test_a_large_network_is_refused() -> None:
-    words = "agent.policy=network has .* weights, a search can tune 500"
-    with pytest.raises(ConfigError, match=words):
-        make_agent(compose("alcc", "agent=tuned", "agent.policy=network", "agent.hidden=[64,64]"))

@@ -45,7 +45,7 @@ def run(finished, tmp_path) -> Path:
         ("train data=ngsim data.path=nowhere.csv", "nowhere.csv"),
         ("train resume=nowhere", "nowhere"),
         ("evaluate variant=alcc policy=nowhere", "nowhere"),
-        ("pipeline variants=[]", "variants is empty"),
+        ("pipeline variants=[]", "variants"),
         ("pipeline variant=idm", "variant=idm has no effect on lcc-rl run"),
         (f"pipeline {' '.join(NO_AGENT)} data.recordings=1", "split.by=vehicle"),
         (f"train -m variant=idm {' '.join(LISTS)}", "at most 100000 runs"),
@@ -85,7 +85,7 @@ def test_a_finished_run_is_not_written_over(run, tmp_path, entry) -> None:
     assert content(run) == before
 
 
-@pytest.mark.parametrize("kept", ["checkpoint.pt", "overrides.json"])
+@pytest.mark.parametrize("kept", ["checkpoint.pt", "command.txt"])
 def test_nor_is_a_stopped_training_or_a_stopped_pipeline(run, tmp_path, kept) -> None:
     (run / "episodes.parquet").rename(run / kept)
     before = content(run)

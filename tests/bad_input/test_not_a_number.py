@@ -13,7 +13,7 @@ from helpers import ACTION, compose, network, single_env, small_env
 from platoons import env_of, hcfs, ramps
 
 from lcc_rl.commands import evaluation, training
-from lcc_rl.drivers.fit import fit
+from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.errors import DataError, Diverged
@@ -162,4 +162,4 @@ def test_a_calibration_without_any_fit_names_the_episode() -> None:
     still = still.assign(episode=7, gap_m=5.0, follower_position_m=0.0, leader_position_m=10.0)
     observed = observe(still.assign(leader_length_m=5.0), Selection(min_mean_speed_mps=0.0))
     with pytest.raises(DataError, match=r"episode 7 .*no local parameters .* finite speed_rmspe"):
-        fit(observed, genetic=GeneticSettings(population=4, generations=1))
+        Calibrator(local_genetic=GeneticSettings(population=4, generations=1))(observed)

@@ -144,39 +144,6 @@ def test_each_criterion_removes_its_candidates_in_order(tmp_path: Path) -> None:
     assert "removed 1: speeds of at least 0" in str(report)
 
 
-def test_limits_can_be_lifted(tmp_path: Path) -> None:
-    free = Criteria(min_duration_s=0.5, min_gap_m=None, max_gap_m=None, passenger_cars_only=False)
-    episodes, report = extracted(tmp_path, population(), free)
-    assert episodes["follower_id"].unique().tolist() == [11, 21, 31, 41, 61, 71]
-    assert list(report.removed) == ["min_duration_s: 0.5", "speeds of at least 0"]
-
-
-def test_durations_are_inclusive(tmp_path: Path) -> None:
-    rows = pair(range(151))  # 15.0 s
-    assert (
-        extracted(tmp_path, rows, Criteria(min_duration_s=15.0, max_duration_s=15.0))[1].kept == 1
-    )
-    with pytest.raises(DataError, match=r"'min_duration_s: 15.1'"):
-        extracted(tmp_path, rows, Criteria(min_duration_s=15.1))
-    with pytest.raises(DataError, match=r"'max_duration_s: 14.9'"):
-        extracted(tmp_path, rows, Criteria(min_duration_s=14.0, max_duration_s=14.9))
-
-
-def test_without_classes_all_vehicles_stay_and_it_is_said(tmp_path: Path) -> None:
-    rows = [[*row[:10], "0", *row[11:]] for row in pair()]
-    _, report = extracted(tmp_path, rows)
-    assert report.kept == 1
-    assert "passenger_cars_only" not in report.removed
-    assert "nothing to filter on" in str(report)
-
-
-def test_leaders_that_are_never_seen_are_counted(tmp_path: Path) -> None:
-    _, report = extracted(tmp_path, pair() + [cells(5, k, Preceding=99) for k in range(20)])
-    assert "20 samples that name a preceding vehicle that is not seen" in str(report)
-    with pytest.raises(DataError, match=r"no vehicle follows another .* of 2 samples 1 name"):
-        extracted(tmp_path, [cells(7, 1, Preceding=5), cells(7, 2)])
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -211,11 +178,3 @@ def test_all_real_pairs_are_recovered(shared_data: Path) -> None:
             tolerance = tolerances.get(name, 0.02)
             np.testing.assert_allclose(episode[name], other[name], atol=tolerance, rtol=0)
     assert not expected
-
-
-def test_real_file_without_classes_and_lengths(shared_data: Path) -> None:
-    trajectories = read_ngsim(shared_data / "i80_coifman_li_2017_native.txt.gz")
-    episodes, report = extract(trajectories, Criteria(min_duration_s=5.0))
-    assert report.kept == episodes["episode"].nunique() > 1000
-    assert "nothing to filter on" in str(report)
-    validate_episodes(episodes, "Coifman and Li")

@@ -21,11 +21,10 @@ from lcc_rl.data.leaders import (
     from_trajectories,
     hashed,
     stretch,
-    varying,
 )
-from lcc_rl.data.profiles import Split, from_records, join, leader_profiles, resample
+from lcc_rl.data.profiles import Split, join, leader_profiles
 from lcc_rl.data.sources import NgsimSource
-from lcc_rl.data.speed_records import read_drives, read_speed_record, shipped_cycles
+from lcc_rl.data.speed_records import read_speed_record, shipped_cycles
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.random import choose, stream_id
@@ -68,15 +67,6 @@ def test_shipped_cycles_are_the_published_ones() -> None:
         time, own = read_speed_record(name)
         assert time[-1] == duration
         assert np.trapezoid(own, time) / 1e3 == pytest.approx(kilometres, rel=0.01)
-
-
-def test_interpolation_is_monotone_and_keeps_the_samples() -> None:
-    time, own = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.0, 0.0, 3.0, 3.0, 1.0])
-    got = resample(time, own, 0.2).numpy()
-    np.testing.assert_allclose(got[::5], own, atol=1e-6)
-    assert got.min() >= 0.0
-    assert got.max() <= 3.0 + 1e-6
-    assert (np.diff(got[5:11]) >= 0).all()
 
 
 def test_a_stretch_of_any_rate_and_format(tmp_path) -> None:
@@ -152,62 +142,12 @@ def test_a_drive_is_on_the_same_side_in_every_file(table, tmp_path) -> None:
     assert [round(hashed(name), 4) for name in ("a", "b")] == [0.5319, 0.5969]
 
 
-def test_tuning_leaves_the_evaluation_out(table) -> None:
-    usual, tuning = (DriveLeaders(path=table, tuning=x).load(0.1, 300) for x in (False, True))
-    assert names_of(tuning.training) | names_of(tuning.windows) == names_of(usual.training)
-    assert not names_of(tuning.training) & names_of(tuning.windows)
-    everything = DriveLeaders(path=table, evaluation_share=1.0).load(0.1, 300)
-    assert (len(everything.training), names_of(everything.windows)) == (0, set(NAMES))
-
-
-def test_drives_of_one_day_are_on_one_side(tmp_path) -> None:
-    names = [f"2021-03-{day:02d}_{car}" for day in range(1, 13) for car in range(3)]
-    drives(names).to_parquet(tmp_path / "days.parquet")
-    leaders = DriveLeaders(path=str(tmp_path / "days.parquet"), together="[^_]+").load(0.1, 300)
-    sides = names_of(leaders.training), names_of(leaders.windows)
-    assert sides[0] | sides[1] == set(names)
-    days = [{name.split("_")[0] for name in side} for side in sides]
-    assert not days[0] & days[1]
-    assert len(sides[1]) == 3 * len(days[1]) > 0
-
-
 def test_fast_windows_are_left_out(table) -> None:
     every, slow = (DriveLeaders(path=table, fastest=x).load(0.1, 100) for x in (None, 20.0))
     means = [float(every.windows.record(i).mean()) for i in range(len(every.windows))]
     kept = [name for name, mean in zip(every.windows.names, means, strict=True) if mean <= 20]
     assert 0 < len(kept) < len(means)
     assert list(slow.windows.names) == kept
-
-
-def test_other_columns_units_steps_and_separators(tmp_path) -> None:
-    path = tmp_path / "other.csv"
-    # Rows of different records alternate; ids stay text.
-    frame = drives(seconds=30.0, step=0.5).sort_values("time_s", kind="stable")
-    frame = frame.assign(drive=frame["drive"].str[6:].str.zfill(2), t=1000 * frame["time_s"])
-    frame.assign(v=3.6 * frame["speed_mps"]).to_csv(path, index=False, sep=";", decimal=",")
-    columns = {"drive": "drive", "time": "t", "speed": "v"}
-    units = {"time": "ms", "speed": "km/h"}
-    found, report = read_drives(str(path), columns, 0.1, units=units)
-    assert found.names == tuple(f"{number:02d}" for number in range(12))
-    expected = drives(["drive 7"], 29.6)["speed_mps"].to_numpy()
-    np.testing.assert_allclose(found.record(7), expected[: len(found.record(7))], atol=0.02)
-    assert any("separated by semicolons" in line for line in report)
-    assert any("decimal comma" in line for line in report)
-
-
-def test_of_a_single_record_the_end_is_held_out(tmp_path) -> None:
-    path = tmp_path / "record.csv"
-    drives(["x"], 300.0).drop(columns="drive").to_csv(path, index=False)
-    single = {"path": str(path), "columns": {"drive": None}}
-    found = DriveLeaders(**single).load(0.1, 300)
-    whole = resample(*read_speed_record(str(path)), 0.1)
-    torch.testing.assert_close(found.training.record(0), whole[:2000])
-    assert found.windows.names[0] == "record+200s+0s"
-    torch.testing.assert_close(found.windows.record(0), whole[2000:2301])
-    tuned = DriveLeaders(**single, tuning=True).load(0.1, 300)
-    assert tuned.training.lengths.tolist() == [1333]
-    with pytest.raises(DataError, match=r"record, has 1999 steps .*lower scenario\.horizon"):
-        DriveLeaders(**single).load(0.1, 5000)
 
 
 @pytest.mark.parametrize(
@@ -286,12 +226,6 @@ def test_windows_do_not_overlap_and_keep_what_follows_them() -> None:
     assert torch.equal(both.select([4]).reach, both.reach[[4]])
 
 
-def test_records_without_variation_are_left_out() -> None:
-    still, moving = torch.full((9,), 5.0), torch.tensor([5.0, 6.0, 5.0, 6.5])
-    profiles = from_records([still, moving], ["a", "b"], ["a", "b"], 0.2)
-    assert varying(profiles, 2.0).names == ("b",)
-
-
 def test_records_are_drawn_by_their_weights() -> None:
     weights = torch.tensor([1.0, 2.0, 0.5, 4.0], dtype=torch.float64)
     profiles, seed = wavy_profiles(4), torch.arange(40_000).unsqueeze(-1)
@@ -329,16 +263,6 @@ def test_impossible_mixtures() -> None:
     ):
         with pytest.raises(ConfigError, match=words):
             Mixture(**settings)
-
-
-@pytest.mark.parametrize("variant", ["alcc", "deadbeat"])
-def test_a_mixture_from_the_command_line(variant, table) -> None:
-    said = [f"variant={variant}", "leader=mixture", "+leader@leader.highway=drives"]
-    said += [f"leader.highway.path={table}", "data.platoons=6", "data.duration_s=[62,70]"]
-    inputs = load_inputs(load("train", [*said, "evaluation.profiles=3", "scenario.horizon=70"]))
-    counts = [inputs.evaluation.sources.count(x) for x in ("traffic", "cycles", "highway")]
-    assert counts == [3, 3, 3]
-    assert not set(inputs.training.names) & names_of(inputs.evaluation)
 
 
 # -- real files ------------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 from ngsim_text import (
     OFFICIAL,
-    PORTAL,
     START_MS,
     cells,
     csv_text,
@@ -23,7 +22,6 @@ from lcc_rl.data import ngsim
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.trajectories import Trajectories
-from lcc_rl.errors import DataError
 
 FOOT = 0.3048
 TYPES = (
@@ -88,16 +86,6 @@ def test_every_layout_gives_the_same_samples(tmp_path: Path, layout: str) -> Non
     ]
 
 
-def test_thousands_separators_are_numbers(tmp_path: Path) -> None:
-    rows = [cells(1234, 5678, Preceding=1_000_000), cells(1234, 5679)]
-    text = portal_text(rows)
-    assert '"1,234","5,678"' in text
-    samples = read(tmp_path, text).samples
-    assert samples["vehicle"].tolist() == [1234, 1234]
-    assert samples["frame"].tolist() == [5678, 5679]
-    assert samples["preceding"].tolist() == [1_000_000, 0]
-
-
 def test_files_larger_than_a_block_lose_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,28 +99,6 @@ def test_files_larger_than_a_block_lose_no_row(
         assert read_back.samples["position_m"].iloc[-1] == pytest.approx(690 * FOOT)
 
 
-def test_error_in_a_later_block_names_the_line_of_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ngsim, "BLOCK_BYTES", 10_000)
-    rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
-    rows[800] = cells(1, 0, v_Vel="fast")
-    with pytest.raises(DataError, match=r"file\.csv: line 802, column 'v_Vel' holds 'fast'"):
-        read(tmp_path, csv_text(rows))
-
-
-def test_blank_cells_where_nothing_needs_them(tmp_path: Path) -> None:
-    needed = ["Vehicle_ID", "Frame_ID", "Local_Y", "v_Length", "v_Vel", "v_Acc", "Lane_ID"]
-    free = dict.fromkeys(set(OFFICIAL.split(",")) - set(needed), "")
-    read_back = read(tmp_path, csv_text([cells(7, k, **free) for k in (1, 2)]))
-    assert read_back.samples["preceding"].tolist() == [0, 0]
-    assert read_back.samples["vehicle_class"].tolist() == [0, 0]
-    assert read_back.samples["recording"].unique().tolist() == ["file#1"]
-    assert "v_Class is all zero or blank: nothing to filter vehicle classes on" in str(
-        read_back.report
-    )
-
-
 def test_headways_are_derived_where_blank_or_zero(tmp_path: Path) -> None:
     rows = pair(range(4))
     for row, headway in zip(rows, ["60", "0", "", "61"], strict=False):
@@ -143,20 +109,6 @@ def test_headways_are_derived_where_blank_or_zero(tmp_path: Path) -> None:
     assert headway.loc[7].to_numpy() == pytest.approx([60, 60, 60, 61])
     assert np.isnan(headway.loc[5, 1])
     assert (report.headways_given, report.headways_derived, report.headways_unknown) == (2, 2, 1)
-
-
-def test_headways_are_derived_within_a_recording_only(tmp_path: Path) -> None:
-    later = START_MS + 900_000
-    first, second = pair(range(3), Space_Headway=0), pair(range(3), Space_Headway=0)
-    for row in second:
-        row[3] = str(later + 100 * int(row[1]))
-        row[5] = str(float(row[5]) + (100 if row[0] == "9" else 0))
-    read_back = read(tmp_path, csv_text(first + second))
-    samples = read_back.samples
-    follower = samples[samples["vehicle"] == 7]
-    assert (follower["space_headway_m"] / FOOT).to_numpy() == pytest.approx([60] * 3 + [160] * 3)
-    assert list(read_back.report.recordings.values()) == [6, 6]
-    assert samples["segment"].nunique() == 4
 
 
 def test_a_missing_frame_splits_a_trajectory(tmp_path: Path) -> None:
@@ -175,14 +127,6 @@ def test_duplicates_are_dropped_and_counted_by_kind(tmp_path: Path) -> None:
     }
     assert (read_back.samples["position_m"] / FOOT).to_numpy() == pytest.approx([10, 20])
     assert "dropped 1 rows: conflicting duplicate" in str(read_back.report)
-
-
-def test_ids_far_apart(tmp_path: Path) -> None:
-    big = 2**53
-    rows = [cells(big, 2**31 - 1, Local_Y=2), cells(3, 2**31 - 1, Local_Y=1, Preceding=big)]
-    samples = read(tmp_path, csv_text(rows)).samples
-    assert samples["vehicle"].tolist() == [3, big]
-    assert np.isfinite(samples["space_headway_m"].iloc[0])
 
 
 def clocked(starts: list[int], frames: int = 40) -> str:
@@ -208,17 +152,6 @@ def test_recordings_survive_jitter_and_truncation(tmp_path: Path) -> None:
     assert list(read(tmp_path, csv_text(rows)).report.recordings.values()) == [300, 300]
 
 
-def test_a_recording_is_named_by_its_commonest_clock(tmp_path: Path) -> None:
-    name = "2005-04-13T22:58:55Z"
-    text = clocked([START_MS, START_MS, START_MS + 3000, START_MS - 3000])
-    assert list(read(tmp_path, text).report.recordings) == [name]
-
-
-def test_a_clock_in_seconds_tells_recordings_apart(tmp_path: Path) -> None:
-    report = read(tmp_path, clocked([1163018600, 1163030300])).report
-    assert list(report.recordings) == ["2006-11-08T20:43:20Z", "2006-11-08T23:58:20Z"]
-
-
 @pytest.mark.parametrize("clock", ["0", "", "1.11343E+12", "12345"])
 def test_without_a_clock_a_file_is_a_recording(tmp_path: Path, clock: str) -> None:
     text = csv_text([cells(7, k, Global_Time=clock) for k in range(4000)])
@@ -227,13 +160,6 @@ def test_without_a_clock_a_file_is_a_recording(tmp_path: Path, clock: str) -> No
     both = read_ngsim([tmp_path / "file.csv", tmp_path / "other.txt.gz"])
     assert both.report.recordings == {"file#1": 4000, "other#1": 4000}
     assert "Global_Time does not tell the recording of 4,000 rows" in str(both.report)
-
-
-def test_rows_without_a_clock_join_the_only_recording(tmp_path: Path) -> None:
-    rows = [cells(7, 1), cells(7, 2, Global_Time=""), cells(7, 3)]
-    report = read(tmp_path, csv_text(rows)).report
-    assert report.recordings == {"2005-04-13T22:58:55Z": 3}
-    assert report.segments == 1
 
 
 def test_parts_of_a_recording_in_two_files_join(tmp_path: Path) -> None:
@@ -255,12 +181,6 @@ def mixed() -> str:
 def test_locations_are_recordings_of_their_own(tmp_path: Path) -> None:
     time = "2005-04-13T22:58:55Z"
     assert read(tmp_path, mixed()).report.recordings == {f"i-80@{time}": 10, f"us-101@{time}": 6}
-
-
-def test_location_filter_counts_what_it_drops(tmp_path: Path) -> None:
-    report = read(tmp_path, mixed(), location="US-101").report
-    assert report.recordings == {"us-101@2005-04-13T22:58:55Z": 6}
-    assert (report.rows_read, report.dropped) == (16, {"other location": 10})
 
 
 def test_written_layout_is_the_official_one(tmp_path: Path) -> None:
@@ -311,8 +231,3 @@ def test_real_portal_file(shared_data: Path) -> None:
     row = read_back.samples.query("vehicle == 1308 and frame == 7261").iloc[0]
     assert row["preceding"] == 1289
     assert row["space_headway_m"] == pytest.approx(30.44 * FOOT)
-
-
-def test_portal_header_is_the_real_one(shared_data: Path) -> None:
-    with gzip.open(shared_data / "ngsim_portal_peachtree_10000.csv.gz", "rt") as file:
-        assert file.readline().strip("\ufeff\n") == PORTAL

@@ -48,16 +48,6 @@ def test_an_implausible_episode_is_left_out_and_many_are_refused(
     assert lenient.load().episodes["episode"].nunique() == 15
 
 
-def test_a_change_between_episodes_is_none_and_thresholds_can_be_raised(tmp_path: Path) -> None:
-    frame = pairs()
-    frame["leader_speed_mps"] = np.where(frame["episode"] % 2, 5.0, 30.0)
-    write_episodes(frame, tmp_path / "a.parquet")
-    assert len(EpisodesSource(path=str(tmp_path / "a.parquet")).load().episodes) == len(frame)
-    (tmp_path / "leader.csv").write_text("time_s,speed_mps\n0,5\n15,6\n30,7\n")
-    time, _ = read_speed_record(str(tmp_path / "leader.csv"), Plausible(max_step=20.0))
-    assert time.tolist() == [0.0, 15.0, 30.0]
-
-
 def wavy(seconds: float = 60.0) -> pd.DataFrame:
     """Three episodes whose gap is the integral of the relative speed, with other offsets."""
     time = np.arange(0.0, seconds, 0.1)

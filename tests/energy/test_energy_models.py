@@ -11,7 +11,6 @@ from scipy.interpolate import PchipInterpolator
 
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, PaperMotor
 from lcc_rl.energy.fuel import coefficients
-from lcc_rl.functional.power import motor_power
 
 POINTS = Path(__file__).parent / "circles_fuel_check_points.csv"
 MODELS: dict[str, EnergyModel] = {
@@ -90,27 +89,6 @@ def test_power_has_a_finite_gradient_everywhere(name) -> None:
     for function in (MODELS[name].power, MODELS[name].smooth_power, MODELS[name].path_power):
         found = torch.autograd.grad(function(speed, acceleration).sum(), (speed, acceleration))
         assert all(part.isfinite().all() for part in found)
-
-
-def test_the_bridge_over_the_fuel_cut_is_narrow() -> None:
-    model = CirclesFuel(vehicle="midBase")
-    speed = torch.full((2,), 20.0)
-    far = torch.tensor([-2.0, 0.5])  # a width or more from the cut at −0.26 m/s²
-    torch.testing.assert_close(
-        model.smooth_power(speed, far), model.power(speed, far), atol=30.0, rtol=1e-3
-    )
-    near = torch.linspace(-0.4, -0.1, 301)
-    smooth = model.smooth_power(torch.full((301,), 20.0), near)
-    exact = model.power(torch.full((301,), 20.0), near)
-    assert exact.diff().abs().max() > 5e3
-    assert smooth.diff().abs().max() < 0.1 * exact.diff().abs().max()
-
-
-def test_the_motor_of_the_paper_is_unchanged() -> None:
-    speed, acceleration = torch.rand(2, 100).mul(20.0)
-    torch.testing.assert_close(
-        PaperMotor().power(speed, acceleration), motor_power(speed, acceleration), rtol=0, atol=0
-    )
 
 
 def shipped_cycle(name: str) -> torch.Tensor:

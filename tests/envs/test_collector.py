@@ -66,19 +66,6 @@ def test_transitions_are_those_of_torchrls_collector(view) -> None:
     ours.shutdown()
 
 
-@pytest.mark.parametrize("size", [1, 3, 8])
-def test_resets_of_so_many_episodes_at_once_are_the_same(size) -> None:
-    # As when compiled, where the number of episodes that end is filled up or divided.
-    wanted = StringCollector(environment("two"), policy(), frames_per_batch=8 * 120, keys=KEYS)
-    ours = StringCollector(environment("two"), policy(), frames_per_batch=8 * 120, keys=KEYS)
-    ours.rows = size
-    one, two = wanted.collect(), ours.collect()
-    assert one["next", "terminated"].any()
-    assert one["next", "done"].sum(0).max() > 1  # more than one at the same step
-    for key in one.keys(True, True):
-        assert torch.equal(one[key], two[key]), key
-
-
 @pytest.mark.parametrize("batch", [(), (2, 3)])
 def test_any_batch_of_episodes(batch) -> None:
     def played(make):
@@ -126,34 +113,8 @@ def test_an_environment_may_be_made_by_a_function_and_its_state_restored() -> No
     assert torch.equal(segments(two), expected)
 
 
-def test_holds_what_is_asked_for() -> None:
-    segment = first(small_env("alcc", 2), frames_per_batch=10)
-    assert ("vehicles", "gap") in segment.keys(True)
-    assert ("vehicles", "speed") not in segment.keys(True)
-    assert "human" not in segment
-
-
 def first(env, **settings):
     return next(iter(StringCollector(env, policy(), keys=KEYS, **settings)))
-
-
-def test_without_a_compiler_one_line_and_the_plain_step(monkeypatch, caplog) -> None:
-    from torch._inductor.exc import InductorError
-
-    def broken(function, **settings):
-        def fail(state):
-            raise InductorError(RuntimeError("no C++ compiler"), None)
-
-        return fail
-
-    expected = first(small_env("alcc", 2), frames_per_batch=10)
-    monkeypatch.setattr("lcc_rl.envs.compiled.compile", broken)
-    caplog.set_level("INFO", "lcc_rl")
-    segment = first(small_env("alcc", 2), frames_per_batch=10, compiled=True)
-    assert torch.equal(
-        segment["next", "automated", "reward"], expected["next", "automated", "reward"]
-    )
-    assert ["not compiling" in line for line in caplog.messages] == [True]
 
 
 @pytest.mark.slow
@@ -193,21 +154,6 @@ def test_compiled_replaces_the_episodes_that_end() -> None:
         torch.testing.assert_close(
             compiled[key][:, same], plain[key][:, same], rtol=1e-3, atol=1e-3, msg=str(key)
         )
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_compiled_collectors_of_one_process_do_not_share_their_graphs() -> None:
-    def gaps(margin: float, compiled: bool):
-        env = small_env("alcc", 4, [f"scenario.controllers.automated.max_acceleration={margin}"])
-        collector = StringCollector(
-            env, policy(), frames_per_batch=40, keys=[("vehicles", "gap")], compiled=compiled
-        )
-        return collector.collect()["vehicles", "gap"]
-
-    # What differs is a setting of a piece, which is not compared before a graph is used.
-    for margin in (3.0, 1.0):
-        torch.testing.assert_close(gaps(margin, True), gaps(margin, False), rtol=1e-4, atol=1e-4)
 
 
 class Shifted(TensorDictModuleBase):

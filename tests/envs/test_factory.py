@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import (
     ACTION,
-    OBSERVATION,
     POPULATION,
     REWARD,
     TERMS,
     VARIANTS,
     compose,
-    followers,
     network,
     small_env,
     steady,
@@ -24,14 +20,10 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
-from lcc_rl.data.episodes import write_episodes
-from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.envs import build_env, load_inputs
+from lcc_rl.envs import build_env
 from lcc_rl.envs.step import Step, closure, entries, pieces_of
-from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.power import motor_power
-from lcc_rl.synthetic.stream import StreamSource
 
 T = 0.1
 
@@ -46,15 +38,6 @@ def play(env, actions):
 @pytest.mark.parametrize("batch_size", [(), 3])
 def test_specs(variant, batch_size) -> None:
     check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
-
-
-@pytest.mark.parametrize("count", [1, 4])
-def test_number_of_vehicles_is_a_dimension(count) -> None:
-    env = small_env("alcc", 3, [followers(count)])
-    check_env_specs(env)
-    data = env.rollout(5)
-    assert data["vehicles", "speed"].shape == (3, 5, count + 1, 1)
-    assert data[OBSERVATION].shape == (3, 5, 1, 7)
 
 
 def test_rollout_follows_the_equations() -> None:
@@ -94,13 +77,6 @@ def test_initial_state() -> None:
     torch.testing.assert_close(gap[:, 1:], expected)
 
 
-def test_training_starts_at_many_gaps() -> None:
-    td = small_env("alcc", 200).reset()
-    factor = td["vehicles", "gap"][:, 0] / (2.0 + 1.5 * td["vehicles", "speed"][:, 0])
-    assert 0.1 <= factor.min() < 0.2
-    assert 1.4 < factor.max() <= 1.5 + 1e-5
-
-
 def test_leader_plays_the_profile_that_is_asked_for() -> None:
     env, profiles = small_env("alcc", 2), wavy_profiles()
     given = TensorDict(
@@ -117,15 +93,6 @@ def test_leader_plays_the_profile_that_is_asked_for() -> None:
     assert torch.equal(data["next", "leader", "speed"].squeeze(-1), expected)
     drawn = POPULATION.time_gap[torch.tensor([5, 9])]
     assert torch.equal(data["human", "desired_time_gap"][:, 0].flatten(), drawn)
-
-
-def test_one_profile_for_every_episode() -> None:
-    env = small_env("alcc", 16, ["scenario.pieces.leader.profile=2"])
-    td = env.reset()
-    assert (td["leader", "profile"] == 2).all()
-    assert td["leader", "start"].unique().numel() > 1
-    with pytest.raises(ConfigError, match=r"profile must lie in 0…3"):
-        small_env("alcc", 1, ["scenario.pieces.leader.profile=4"])
 
 
 def test_same_seed_same_episodes_and_other_seed_others() -> None:
@@ -221,16 +188,6 @@ def test_gradient_from_energies_to_actions_matches_finite_differences() -> None:
         torch.testing.assert_close(gradient[step, 1, 0, 0], difference, rtol=1e-2, atol=1e-3)
 
 
-def test_compiled_step_agrees_with_eager() -> None:
-    env = small_env("alcc", 4)
-    piece = next(piece for piece in env.transform if type(piece).__name__ == "IDM")
-    compiled = torch.compile(piece.compute, fullgraph=True, backend="aot_eager")
-    data = env.rollout(5)
-    # Steps and episodes side by side: the seed of each broadcasts over its vehicles.
-    found = [data.reshape(-1).get(key) for key in piece.in_keys]
-    torch.testing.assert_close(piece.compute(*found), compiled(*found), rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own
 def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
@@ -248,53 +205,3 @@ def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
         # Until the first collision; what follows depends on rounding.
         running = ~runs[0]["terminated"].cumsum(1).bool().unsqueeze(-1)
         assert (difference * running).max() < 1e-3 * runs[0][key].abs().max(), key
-
-
-def test_idm_in_the_automated_vehicles_place_follows_well() -> None:
-    env = small_env("idm", 16, ["scenario.horizon=300"])
-    with torch.no_grad():
-        data = env.rollout(300, break_when_any_done=False)
-    assert (data["next", "vehicles", "gap"][..., 0, :] > 0.5).all()
-    assert not data["next", "terminated"].any()
-    # It really follows: after the start, its time gap stays near 1.2 s, not at the limits.
-    assert data["next", "vehicles", "time_gap"][:, 100:, 0].median() < 2.5
-
-
-def test_sampled_idm_draws_drivers_per_episode() -> None:
-    own = [f"scenario.controllers.automated.{name}=null" for name in ("desired_speed", "time_gap")]
-    env = small_env("idm", 64, own)
-    same = torch.zeros(64, 1, dtype=torch.int64)
-    td = env.reset(TensorDict({("leader", "profile"): same, ("leader", "start"): same}, [64]))
-    command = env.step(td)["next", "vehicles", "command"][:, 0]
-    assert command.unique().numel() > 10
-
-
-def test_profile_shorter_than_the_horizon() -> None:
-    cfg = compose("alcc", "scenario.horizon=1000")
-    with pytest.raises(DataError, match="shorter than the horizon"):
-        build_env(cfg, wavy_profiles(), POPULATION, 2)
-
-
-def test_the_runs_of_a_sweep_share_the_data_while_its_files_stay_the_same(
-    tmp_path, monkeypatch
-) -> None:
-    path = tmp_path / "pairs.parquet"
-    stream = StreamSource(2, 3, 3, (35.0, 45.0))
-    write_episodes(stream.load().episodes, path)
-    cfg = compose("alcc", "data=episodes", f"data.path={path}", "evaluation.profiles=2")
-    read: list[str] = []
-    load = EpisodesSource.load
-    monkeypatch.setattr(EpisodesSource, "load", lambda own: (read.append(own.path), load(own))[1])
-    alone = [load_inputs(cfg) for _ in range(2)]
-    assert len(read) == 2
-    monkeypatch.setattr("lcc_rl.envs.inputs.is_sweep", lambda: True)
-    shared = [load_inputs(cfg) for _ in range(2)]
-    assert len(read) == 3
-    for inputs in shared:
-        assert inputs.training.names == alone[0].training.names
-        assert inputs.report == alone[0].report
-    # Another file under the same name is another input.
-    write_episodes(replace(stream, seed=1).load().episodes, path)
-    changed = load_inputs(cfg)
-    assert len(read) == 4
-    assert changed.report != alone[0].report

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
@@ -50,14 +49,6 @@ def test_entries_equal_those_of_a_rollout(variant, more) -> None:
     for key in [*WANTED, *observed, ("done",), ("terminated",), OBSERVATION]:
         assert torch.equal(got.get(("next", *key)), expected.get(("next", *key))), key
     assert torch.equal(got[ACTION], expected[ACTION])
-
-
-def test_what_nothing_depends_on_is_left_out() -> None:
-    env = small_env("alcc", 4)
-    names = {type(p).__name__ for p in DifferentiableRollout(env, WANTED).after}
-    assert "DriverEstimator" not in names
-    assert not any("estimate" in key for key in DifferentiableRollout(env, WANTED).carried)
-    assert ("human", "estimate") in DifferentiableRollout(env, WANTED, OBSERVED).carried
 
 
 def total_power(env: TransformedEnv, network, seed: int = 0) -> torch.Tensor:
@@ -113,29 +104,6 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
             assert data["next", "terminated"].any()
         sum(data["next"].get(key).mean() for key in WANTED).backward()
         assert all(torch.isfinite(weight.grad).all() for weight in network.parameters())
-
-
-def test_without_a_compiler_the_plain_step_is_used(monkeypatch, caplog) -> None:
-    unrolled = DifferentiableRollout(small_env("alcc", 4), WANTED)
-    network = make_actor(7, 1, (8,), 0).module
-    _, expected = unrolled.play(unrolled.start(), network, 3)
-
-    def no_compiler(function, **settings):
-        def fail(state, action):
-            raise torch._dynamo.exc.TorchDynamoException("no C++ compiler found\nmore")
-
-        return fail
-
-    monkeypatch.setattr("lcc_rl.envs.compiled.compile", no_compiler)
-    fallback = DifferentiableRollout(small_env("alcc", 4), WANTED, compiled=True)
-    with caplog.at_level(logging.INFO):
-        _, record = fallback.play(fallback.start(), network, 3)
-    assert "not compiling the simulator: no C++ compiler found" in caplog.text
-    assert all(
-        torch.equal(a, b)
-        for x, y in zip(record, expected, strict=True)
-        for a, b in zip(x, y, strict=True)
-    )
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ from helpers import (
     string,
     wavy_profiles,
 )
-from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
 
@@ -31,12 +30,10 @@ from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.pieces import (
     Action,
-    Controller,
     Feature,
     NGSIMLeader,
     Places,
     StringMotion,
-    TimeGap,
     TimeGapStart,
     TimeToCollision,
 )
@@ -84,17 +81,6 @@ def test_specs_of_the_single_agent_view(variant, batch_size) -> None:
     assert data["observation"].shape[:-1] == (*shape, 3)
     assert data["next", "reward"].shape == (*shape, 3, 1)
     assert OBSERVATION not in data.keys(True)
-
-
-def test_the_single_agent_view_shows_the_same_numbers() -> None:
-    group, single = small_env("alcc", 3, seed=5), single_env("alcc", 3, seed=5)
-    one = group.rollout(20, lambda td: td.set(ACTION, torch.full((3, 1, 1), 0.2)))
-    two = single.rollout(20, lambda td: td.set("action", torch.full((3, 1), 0.2)))
-    assert torch.equal(one[OBSERVATION].squeeze(-2), two["observation"])
-    assert torch.equal(one["next", *REWARD].squeeze(-2), two["next", "reward"])
-    for name, term in two["next", "reward_terms"].items():
-        assert torch.equal(one["next", "automated", "reward_terms", name].squeeze(-2), term)
-    assert torch.equal(one["next", "vehicles", "gap"], two["next", "vehicles", "gap"])
 
 
 def test_who_may_ask_for_the_single_agent_view(monkeypatch) -> None:
@@ -187,19 +173,6 @@ class Broken(Feature):
         return gap + torch.zeros(3, 1)
 
 
-class Whole(Controller):
-    """Commands whole numbers."""
-
-    reads = ("self.gap",)
-
-    def command(self, gap: Tensor) -> Tensor:
-        return gap.long()
-
-
-def test_what_fits_is_accepted() -> None:
-    check(TimeGap().bind(WORLD))
-
-
 @pytest.mark.parametrize(
     ("piece", "words"),
     [
@@ -224,15 +197,6 @@ def test_a_piece_that_does_not_fit_is_refused(piece, words) -> None:
         check(piece)
 
 
-def test_a_command_of_another_type_is_refused() -> None:
-    made = pieces()
-    made[2] = Whole().bind(WORLD)
-    with pytest.raises(
-        ConfigError, match=r"Whole writes command\.automated as \[4, 1\] torch.int6"
-    ):
-        check_pieces(made, 20, {})
-
-
 @pytest.mark.parametrize(
     ("variant", "overrides", "words"),
     [
@@ -251,11 +215,3 @@ def test_a_command_of_another_type_is_refused() -> None:
 def test_a_configuration_that_does_not_fit_is_refused(variant, overrides, words) -> None:
     with pytest.raises(ConfigError, match=words):
         small_env(variant, 2, overrides)
-
-
-def test_reset_options_are_in_the_state_spec() -> None:
-    env = small_env("alcc", 2)
-    keys = set(env.full_state_spec.keys(True, True))
-    assert {("leader", "profile"), ("leader", "start"), ("human", "driver")} <= keys
-    td = env.reset(TensorDict({("human", "driver"): torch.tensor([[[3]], [[4]]])}, [2]))
-    assert td["human", "driver"].flatten().tolist() == [3, 4]

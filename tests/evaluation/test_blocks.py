@@ -8,18 +8,16 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import torch
 from commands import run_command, tiny
-from helpers import ACTION, POPULATION, compose, network, slow_but, wavy_profiles
+from helpers import POPULATION, compose, network, slow_but, wavy_profiles
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation
 from lcc_rl.config.schemas import EvaluateConfig
-from lcc_rl.envs import Inputs, build_env
-from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
+from lcc_rl.envs import Inputs
+from lcc_rl.errors import Interrupted, ResultsError
 from lcc_rl.evaluation.blocks import BLOCKS, Store
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
-from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.tables import summary
@@ -67,11 +65,6 @@ def test_blocks_hold_every_episode_once_and_shards_every_block_once(batch, repea
     assert all(parts)
 
 
-def test_more_shards_than_blocks_are_refused() -> None:
-    with pytest.raises(ConfigError, match="the 20 episodes are 3 blocks"):
-        Plan(4, 249, 5, 7, 1, 4)
-
-
 # -- repeats --------------------------------------------------------------------------------------
 
 
@@ -90,15 +83,6 @@ def test_repeats_draw_other_noise_and_the_first_is_the_only_one_of_before() -> N
 
 
 # -- resuming -------------------------------------------------------------------------------------
-
-
-def test_blocks_are_rows_of_one_table(whole, tmp_path) -> None:
-    assert not (whole / BLOCKS).exists()
-    rows = read_parquet(whole / "episodes.parquet")
-    at_once = evaluation.run(settings(), tmp_path, quiet=True)
-    order = ["strategy", "profile_id", "driver_id"]
-    one, two = (x.sort_values(order, ignore_index=True) for x in (rows, at_once))
-    pd.testing.assert_frame_equal(one, two, rtol=1e-5, atol=1e-5)
 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -145,15 +129,6 @@ def test_a_damaged_block_and_one_of_other_weights_are_played_again(
     write_parquet(read_parquet(kept[1]).assign(collided=True), kept[1], {"lcc_rl.block": "other"})
     evaluation.run(settings(BLOCK), tmp_path, quiet=True)
     same(tmp_path, whole)
-
-
-def test_a_stopped_evaluation_of_other_settings_is_left_alone(tmp_path, monkeypatch) -> None:
-    with monkeypatch.context() as patched:
-        stop_after(patched, 2)
-        with pytest.raises(Interrupted):
-            evaluation.run(settings(BLOCK), tmp_path, quiet=True)
-    with pytest.raises(ResultsError, match="already holds blocks of other settings"):
-        evaluation.run(settings(BLOCK, "evaluation.seed=3"), tmp_path, quiet=True)
 
 
 # -- shards ---------------------------------------------------------------------------------------
@@ -234,22 +209,3 @@ def test_a_compiled_evaluation_differs_by_rounding() -> None:
     tables = [evaluate(strategy, inputs, 3, 20, 1, 2, compiled=fast) for fast in (False, True)]
     for plain, fast in zip(*tables, strict=True):
         pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-@COMPILER
-def test_a_compiled_step_names_what_is_not_a_number() -> None:
-    cfg = compose("alcc", "agent.hidden=[8]")
-    env, good = build_env(cfg, PROFILES, POPULATION, 4, nominal=True), network(cfg)
-
-    def policy(td):
-        late = td["episode", "step"].unsqueeze(-1) == 5
-        action = good(td).get(ACTION)
-        return td.set(ACTION, torch.where(late, math.nan, action))
-
-    policy.in_keys = [*good.in_keys, ("episode", "step")]
-    player = Player(env, policy, [("vehicles", "gap")], "strategy x", compiled=True)
-    words = "strategy x: automated.action is nan at step 6 of episode 0"
-    ids = torch.arange(4)
-    with pytest.raises(Diverged, match=words):
-        player.play(reset_options(env, ids, ids, 1, 249))

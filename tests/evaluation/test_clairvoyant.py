@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import pandas as pd
 import pytest
-import torch
 from helpers import POPULATION, compose, wavy_profiles
-from tensordict import TensorDict
 
 from lcc_rl.envs import Inputs
-from lcc_rl.evaluation.clairvoyant import clairvoyant, misses, path_energy
+from lcc_rl.evaluation.clairvoyant import clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, trained
-from lcc_rl.functional.pattern import parse_string
 from lcc_rl.results.policies import load_policy
 
 STEPS = 60
@@ -54,31 +51,6 @@ def test_who_knows_the_profile_saves() -> None:
     assert told[-1][1] == pytest.approx(after[BOTH].sum(axis=1).mean(), rel=0.01)
 
 
-def moment(gap: float, relative_speed: float, speed: float) -> TensorDict:
-    """One episode of one step, the automated vehicle as given, a driver at rest far behind it."""
-    time_gap = gap / max(speed, 1.0)
-    own = {"gap": gap, "relative_speed": relative_speed, "time_gap": time_gap, "speed": speed}
-    behind = {"gap": 100.0, "relative_speed": 0.0, "time_gap": 100.0, "speed": 0.0}
-    entries = {key: torch.tensor([own[key], behind[key]]).view(1, 1, 2, 1) for key in own}
-    one = {"vehicles": entries}
-    return TensorDict({**one, "next": one}, batch_size=[1, 1])
-
-
-@pytest.mark.parametrize(
-    ("gap", "relative_speed", "speed", "missed"),
-    [
-        (10.0, 0.0, 5.0, 0.0),
-        (10.0, -2.0, 5.0, 0.0),  # 5 s to collision
-        (10.0, -3.0, 5.0, (2.12 + 0.3 * 2.12**2)),  # 4.04·3 − 10
-        (15.0, 0.0, 5.0, 15.0 - 12.5 / 1.01 + 0.3 * (15.0 - 12.5 / 1.01) ** 2),
-        (0.3, 0.0, 5.0, 2.0),  # 10·(0.5 − 0.3)
-    ],
-)
-def test_misses(gap, relative_speed, speed, missed) -> None:
-    found = misses(moment(gap, relative_speed, speed), parse_string("automated human"))
-    assert float(found) == pytest.approx(missed, abs=1e-4)
-
-
 @pytest.mark.slow
 def test_without_regard_the_car_alone_saves() -> None:
     start = learned()
@@ -87,12 +59,6 @@ def test_without_regard_the_car_alone_saves() -> None:
     assert alone["strategy"].unique().tolist() == ["clairvoyant own"]
     assert alone["cav_path_energy_kj"].mean() < both["cav_path_energy_kj"].mean()
     assert alone["total_path_energy_kj"].mean() > both["total_path_energy_kj"].mean()
-
-
-def test_path_energy_at_constant_speed() -> None:
-    # 0.1 s of A2 at 5 and 0 m/s, without acceleration.
-    watts = 110.3 + 422.9 * 5 - 0.0279 * 25 + 0.3557 * 125 + 110.3
-    assert float(path_energy(moment(10.0, 0.0, 5.0), 0.1)) == pytest.approx(watts * 1e-4)
 
 
 @pytest.mark.slow

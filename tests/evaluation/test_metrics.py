@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
-from lcc_rl.functional.safety import NEVER
 from lcc_rl.results.scores import LARGEST, LEAST, LIMITED, SHARE
 
 ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
@@ -56,15 +55,6 @@ def test_safety() -> None:
     assert named | {"share_leader_faster", "share_ttc_unpromised"} == set(LIMITED)
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
-
-
-def test_a_gap_that_never_closes_has_no_least_ttc() -> None:
-    series = dict.fromkeys(("time_gap", "gap", "jerk"), torch.ones(2, 1, 1, 1))
-    series["ttc"] = torch.full((2, 1, 1, 1), NEVER)
-    series["speed"] = torch.ones(3, 1, 1, 1)
-    measures = safety_measures(series, torch.ones(2, 1, 1, 1, dtype=torch.bool), 0.1)
-    assert measures["min_ttc_s"].isnan().all()
-    assert measures["share_ttc_unsafe"] == 0.0
 
 
 def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> None:

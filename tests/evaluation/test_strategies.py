@@ -13,14 +13,11 @@ from lcc_rl.agents.rules import ACCRule, IDMRule
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
-    BASELINES,
-    DIRECT,
     TUNED,
     Strategy,
     baseline,
     check_distinct,
     named_apart,
-    rules,
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.rules import idm_acc, linear_acc
@@ -41,11 +38,6 @@ def test_a_tuned_baseline_keeps_the_filter_and_has_constants_for_it(name) -> Non
     assert human.filters.get(AUTOMATED) is None
 
 
-def test_constants_tuned_behind_the_filter_need_it() -> None:
-    with pytest.raises(ConfigError, match="acc_filtered"):
-        baseline(compose("alcc"), "acc_filtered")
-
-
 @pytest.mark.parametrize(
     ("piece", "rule", "law"), [(IDMACC, IDMRule, idm_acc), (LinearACC, ACCRule, linear_acc)]
 )
@@ -57,13 +49,6 @@ def test_a_controller_commands_what_the_rule_of_an_agent_does(piece, rule, law) 
     constants = rule.START.values()
     assert torch.equal(command, law(speed, gap, relative_speed, *constants).clamp(-3.0, 3.0))
     assert command.min() == -3.0
-
-
-def test_rules_have_names() -> None:
-    assert {DIRECT, *BASELINES, "follower_stopper", "pi_saturation", "acc", "mpc_far"} <= set(
-        rules()
-    )
-    assert not {"action", "hcfs"} & set(rules())
 
 
 def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
@@ -95,11 +80,3 @@ def test_a_policy_of_other_settings_is_refused(variant, words, expected) -> None
     check_policy(cfg, compose("alcc"))
     with pytest.raises(ConfigError, match=expected):
         check_policy(cfg, compose(variant, *words))
-
-
-def test_observed_entries_in_another_order_are_refused() -> None:
-    own, cfg = compose("alcc"), compose("alcc")
-    cfg.policy, scales = "p.pt", cfg.observation["scales"]
-    cfg.observation["scales"] = dict(reversed(scales.items()))
-    with pytest.raises(ConfigError, match="order of scales"):
-        check_policy(cfg, own)

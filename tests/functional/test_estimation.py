@@ -78,18 +78,6 @@ def test_recovers_the_driver_without_noise() -> None:
     assert error.median() < 0.02
 
 
-def test_standing_still_teaches_nothing() -> None:
-    population = bootstrap()
-    start = prior(population.desired_speed, population.time_gap)
-    belief = Belief(start.estimate[None], start.covariance[None])
-    zero = torch.zeros(1, 1)
-    _, after = predict_and_update(
-        zero, zero + 1.5, zero, zero, belief, population.constants, T, 0.05
-    )
-    assert torch.equal(after.estimate, belief.estimate)
-    assert torch.equal(after.covariance, belief.covariance)
-
-
 @pytest.mark.parametrize(("v", "s", "rate"), [(4.0, 12.0, 0.5), (2.0, 4.0, -3.0), (0.0, 3.0, 0.0)])
 def test_population_mean_is_the_mean_over_drivers(v: float, s: float, rate: float) -> None:
     population = bootstrap()

@@ -30,17 +30,6 @@ def test_desired_gap_never_below_s0_a4() -> None:
     torch.testing.assert_close(got, t(0.9275))
 
 
-def test_other_exponent() -> None:
-    # δ = 2, free road: 1 − (10/20)² − (17/1000)² = 0.749711
-    known = IDMConstants(exponent=2.0)
-    got = idm_acceleration(t(10.0), t(1000.0), t(0.0), t(20.0), t(1.5), known)
-    torch.testing.assert_close(got, t(0.749711))
-
-
-def test_limits() -> None:
-    assert idm_acceleration(t(10.0), t(0.0), t(10.0), t(20.0), t(1.5), KNOWN).item() == -8.0
-
-
 def test_equilibrium_gap_is_equilibrium_and_capped() -> None:
     speed, v0, time_gap = t(5.0, 19.9, 25.0), t(20.0, 20.0, 20.0), t(1.2, 1.2, 1.2)
     gap = equilibrium_gap(speed, v0, time_gap, KNOWN)
@@ -70,12 +59,3 @@ def test_string_with_long_time_gap_damps_a_disturbance() -> None:
         dips.append(15.0 - leader.min().item())
     assert dips == sorted(dips, reverse=True)
     assert dips[-1] < 0.8 * dips[0]
-
-
-def test_noise_scales_the_executed_acceleration() -> None:
-    leader = torch.full((3, 1), 10.0, dtype=torch.float64)
-    quiet = simulate_follower(leader, t(9.0), t(30.0), t(20.0), t(1.2), KNOWN, 0.1)[2]
-    noisy = simulate_follower(
-        leader, t(9.0), t(30.0), t(20.0), t(1.2), KNOWN, 0.1, noise=lambda step: t(0.05)
-    )[2]
-    torch.testing.assert_close(noisy[0], quiet[0] * 1.05)

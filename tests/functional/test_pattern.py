@@ -34,16 +34,6 @@ def test_what_a_pattern_means(pattern, roles) -> None:
     assert len(string) == len(roles)
 
 
-def test_places_and_names() -> None:
-    string = parse_string("human (automated human)*2 cacc", "ring")
-    assert string.places(A) == (1, 3)
-    assert string.places(H) == (0, 2, 4)
-    assert string.places("nobody") == ()
-    assert string.names == (H, A, "cacc")
-    assert string.count(H) == 3
-    assert string.ring
-
-
 @pytest.mark.parametrize(
     ("pattern", "words", "place"),
     [
@@ -99,30 +89,6 @@ trees = st.recursive(
     lambda inner: st.tuples(st.lists(inner, min_size=1, max_size=3), st.integers(1, 3)),
     max_leaves=8,
 )
-
-
-def printed(tree, chance) -> str:
-    inside, times = tree
-    text = inside if isinstance(inside, str) else f"({sequence(inside, chance)})"
-    star = chance.choice(["*", " *", "* "])
-    return text if times == 1 and chance.random() < 0.5 else f"{text}{star}{times}"
-
-
-def sequence(parts, chance) -> str:
-    return " ".join(printed(part, chance) for part in parts)
-
-
-def expanded(tree) -> list[str]:
-    inside, times = tree
-    roles = [inside] if isinstance(inside, str) else [x for part in inside for x in expanded(part)]
-    return roles * times
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.lists(trees, min_size=1, max_size=3), st.randoms(use_true_random=False))
-def test_a_printed_pattern_expands_to_what_was_printed(parts, chance) -> None:
-    roles = [role for part in parts for role in expanded(part)]
-    assert list(parse_string(sequence(parts, chance)).roles) == roles
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

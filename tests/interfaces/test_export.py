@@ -12,13 +12,8 @@ from helpers import small_env
 import lcc_rl
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy, main
-from lcc_rl.pieces import Action, Observation
-from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
-
-KEYS = [("vehicles", name) for name in ("speed", "gap", "acceleration")]
 
 
 @pytest.fixture(scope="module")
@@ -29,13 +24,6 @@ def module() -> ExportedPolicy:
 def states(module: ExportedPolicy, count: int = 256) -> torch.Tensor:
     chance = torch.Generator().manual_seed(0)
     return 20.0 * torch.rand(count, len(module.names), generator=chance)
-
-
-def test_inputs_are_measurements_with_units(module) -> None:
-    units = {item.name: item.unit for item in module.inputs()}
-    assert units["self.gap"] == "m"
-    assert units["ahead.acceleration"] == "m/s²"
-    assert not any("relative" in name for name in units)
 
 
 def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
@@ -76,18 +64,6 @@ def test_the_filter_is_inside(module) -> None:
     assert torch.isfinite(module(torch.full_like(state, torch.nan))).all()
 
 
-def test_with_nobody_behind_the_relative_speed_is_zero_as_in_the_environment() -> None:
-    string = VehicleString(("automated", "human"), drawn=True)
-    scales = {"self": {"speed": 1.0}, "behind": {"speed": 1.0, "relative_speed": 0.1}}
-    network = torch.nn.Linear(4, 1, bias=False)
-    network.weight.data = torch.tensor([[0.0, 0.0, 1.0, 0.0]])
-    observation = Observation(scales=scales).bind(World(string))
-    exported = ExportedPolicy(network, observation, Action(max_acceleration=1.0), None)
-    assert exported.names == ["self.speed", "behind.speed", "behind.present"]
-    state = torch.tensor([[10.0, 0.0, 0.0], [10.0, 8.0, 1.0]])
-    torch.testing.assert_close(exported(state), torch.tensor([[0.0], [0.2]]))
-
-
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_path) -> None:
     path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.pt2")
@@ -111,11 +87,6 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
     about = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])
     assert about["filter"] is True
     assert [item["name"] for item in about["inputs"]] == module.names
-
-
-def test_a_policy_with_memory_names_every_moment() -> None:
-    names = exported_policy("pretrained/i24-follow5").names
-    assert any(name.startswith("memory.entries.") for name in names)
 
 
 @pytest.mark.parametrize(

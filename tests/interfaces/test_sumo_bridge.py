@@ -131,14 +131,6 @@ def test_with_nobody_ahead_in_sight_sumo_drives(tmp_path) -> None:
     assert not bridge.command()
 
 
-def test_with_nobody_behind_a_policy_believes_in_one_at_its_own_speed_and_gap(tmp_path) -> None:
-    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
-    seen = Bridge("pretrained/alcc", "own")._measured("own")
-    assert seen is not None
-    assert seen.present == 0.0
-    assert (seen.speed_behind, seen.gap_behind) == (seen.speed, seen.gap) == (10.0, 15.0)
-
-
 def test_a_command_is_executed_beyond_what_sumo_thinks_safe(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
     hard = {"_target_": "lcc_rl.pieces.ConstantAcceleration", "acceleration": 3.0}

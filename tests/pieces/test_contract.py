@@ -17,7 +17,6 @@ import torch
 from helpers import (
     ACTION,
     MIXED,
-    OBSERVATION,
     POPULATION,
     REWARD,
     TERMS,
@@ -408,24 +407,6 @@ def test_in_a_replay_buffer_of_transitions(road, name) -> None:
 
 
 @each_piece
-def test_keys_are_nested_and_survive_flattening(road, name) -> None:
-    piece, data = made(road)[name], played(road)
-    part = moment(piece, data)
-    stored = without_results(piece, part).flatten_keys(".").unflatten_keys(".")
-    assert_results_equal(piece, piece(stored), part)
-
-
-@each_piece
-def test_keeps_no_state(road, name) -> None:
-    piece, data = made(road)[name], played(road)
-    part = moment(piece, data)
-    before = {key: value.clone() for key, value in piece.state_dict().items()}
-    first, second = (piece(without_results(piece, part)) for _ in range(2))
-    assert_results_equal(piece, first, second)
-    assert all(torch.equal(value, before[key]) for key, value in piece.state_dict().items())
-
-
-@each_piece
 def test_written_specs_match_what_is_written(road, name) -> None:
     piece, reached = made(road)[name], played(road)[:, 3]["next"]
     specs = piece.written_specs(reached.batch_size, None)
@@ -445,17 +426,6 @@ def test_constants_keep_their_value(road) -> None:
             assert torch.equal(data[key], data["next", *key]), key
             checked += 1
     assert checked >= 7
-
-
-def test_reward_pieces_read_the_state_reached() -> None:
-    data = played("open")
-    piece = made("open")["EfficiencyReward"]
-    key = (*TERMS, "efficiency")
-    got = piece(data.exclude(("next", *key)).clone())
-    expected = -(data["next", "vehicles", "time_gap"][..., [1, 5], :] >= 2.5).float()
-    assert torch.equal(got["next", *key], expected)
-    assert key not in got.keys(True)
-    assert not torch.equal(data["vehicles", "time_gap"], data["next", "vehicles", "time_gap"])
 
 
 # -- a term of one's own ---------------------------------------------------------------------------
@@ -529,27 +499,6 @@ def test_a_policy_offline_equals_online(name) -> None:
     torch.testing.assert_close(got[ACTION], data[ACTION], rtol=1e-6, atol=1e-6)
     assert torch.equal(also[ACTION], got[ACTION])
     assert data[ACTION].std() > 0 or name == "ConstantAcceleration"
-
-
-@EACH_POLICY
-def test_a_policy_by_keyword_and_without_batch(name) -> None:
-    policy, data = driven(name, ())
-    entries = {"_".join(key): data[key] for key in policy.in_keys if key != ACTION}
-    with torch.no_grad():
-        got = policy(**entries)
-        single = policy(data[4].exclude(ACTION).clone())
-    got = got[-1] if isinstance(got, tuple) else got
-    torch.testing.assert_close(got, data[ACTION], rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(single[ACTION], data[4][ACTION], rtol=1e-6, atol=1e-6)
-
-
-def test_a_network_by_keyword() -> None:
-    actor = make_actor(6, 1, (8,), 0)
-    seen = driven("network")[1][OBSERVATION]
-    with torch.no_grad():
-        assert torch.equal(
-            actor(observation=seen), shared_policy(actor)(automated_observation=seen)
-        )
 
 
 @pytest.mark.parametrize("variant", ["cacc", "deadbeat"])

@@ -13,8 +13,6 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.pieces import CalibratedDrivers
-from lcc_rl.pieces.world import World
 
 MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
 EACH = pytest.mark.parametrize("model", list(MODELS))
@@ -58,13 +56,6 @@ def test_drivers_start_at_their_equilibrium_and_stay(model) -> None:
     cap = "scenario.start.human.cap_time_gap=100"
     data = rolled(human(MODELS[model], QUIET, cap), steady(), batch=64, seed=3)
     assert data["next", "command", "human"].abs().max() < 1e-3
-
-
-def test_calibrated_drivers_start_at_their_own_equilibrium() -> None:
-    cfg = human("calibrated", QUIET, "scenario.start.human.cap_time_gap=100")
-    data = rolled(cfg, steady(), MIXED, batch=32)
-    assert data["next", "command", "human"].abs().max() < 1e-3
-    assert set(data["human", "driver"].flatten().tolist()) == set(range(8))
 
 
 @EACH
@@ -127,16 +118,6 @@ def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:
         torch.testing.assert_close(command[chosen], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_gradient_through_a_mixture_is_finite() -> None:
-    piece = CalibratedDrivers().bind(World(population=MIXED))
-    shape = (8, 1, 1)
-    motion = [torch.full(shape, x, requires_grad=True) for x in (10.0, 15.0, 1.0)]
-    driver = torch.arange(8).view(shape)
-    own = (MIXED.desired_speed[driver], MIXED.time_gap[driver])
-    piece.acceleration(*motion, *own, driver).sum().backward()
-    assert all(x.grad.isfinite().all() for x in motion)
-
-
 def test_calibrated_idm_drivers_are_those_of_the_idm() -> None:
     by_idm = rolled(human("human"))
     by_table = rolled(human("calibrated"))
@@ -159,9 +140,3 @@ def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:
         "scenario.horizon=20",
     )
     check_env_specs(build_env(cfg, steady(), POPULATION, 2))
-
-
-def test_a_population_keeps_models_when_drivers_are_selected() -> None:
-    chosen = MIXED.select(torch.tensor([3, 1]))
-    assert chosen.models == ("gipps", "ovm")
-    assert chosen.parameters()["sensitivity"].isnan().tolist() == [True, False]

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from helpers import ACTION, OBSERVATION, compose, network, small_env, steady, wavy_profiles
+from helpers import OBSERVATION, small_env, steady, wavy_profiles
 
 from lcc_rl.pieces import LeaderPreview
 from lcc_rl.pieces.world import World
@@ -37,13 +37,6 @@ def test_differences_are_taken_in_equal_parts() -> None:
     difference = data["memory", "entries"] - present.repeat_interleave(2, -1)
     assert torch.allclose(data[OBSERVATION][..., -4:], 0.5 * difference, atol=1e-5)
     assert difference.abs().max() > 0.1
-
-
-def test_a_delayed_preview_is_an_older_one() -> None:
-    late = ["scenario.pieces.preview.horizons=[0.5]", "scenario.pieces.preview.delay=0.2"]
-    data = played("+knowledge=preview", *late)
-    leader = data["leader", "speed"][0, :, 0]
-    assert torch.equal(data["preview", "speed"][0, :-3, 0, 0], leader[3:])
 
 
 def test_beyond_the_record_its_last_speed_stands() -> None:
@@ -91,21 +84,6 @@ def test_filtered_memory_is_the_exponential_average() -> None:
     for speed in leader[1:].tolist():
         expected.append(expected[-1] + share * (speed - expected[-1]))
     assert torch.allclose(average, torch.tensor(expected), atol=1e-4)
-
-
-def test_plain_values_on_request() -> None:
-    data = played("+knowledge=preview", "observation.relative_to.preview=null")
-    assert torch.allclose(data[OBSERVATION][..., -5:], 0.5 * data["preview", "speed"])
-
-
-@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac", "analytic"])
-@pytest.mark.parametrize("knowledge", ["memory", "preview"])
-@pytest.mark.parametrize("variant", ["alcc", "reference"])
-def test_every_agent_can_use_it(agent, knowledge, variant) -> None:
-    overrides = [f"agent={agent}", f"+knowledge={knowledge}"]
-    env = small_env(variant, 3, overrides)
-    policy = network(compose(variant, *overrides))
-    assert env.rollout(5, policy)[ACTION].shape == (3, 5, 1, 1)
 
 
 def test_every_vehicle_of_a_string_remembers_what_it_saw() -> None:

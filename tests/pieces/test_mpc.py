@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from copy import deepcopy
 
 import numpy as np
@@ -11,39 +10,15 @@ import torch
 from helpers import POPULATION, compose, wavy_profiles
 from scipy.optimize import minimize
 
-from lcc_rl.commands.checks import check_settings
-from lcc_rl.commands.evaluation import run
-from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records
 from lcc_rl.envs import build_env
-from lcc_rl.errors import ConfigError
 from lcc_rl.functional.kinematics import advance_gap
 from lcc_rl.functional.mpc import MPCSettings
 from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces import MPC
 
 AUTO = "scenario.controllers.automated"
-DRIVEN = (f"controller@{AUTO}=mpc", "agent=none")
 PLACE = f"controller@{AUTO}"
-
-
-def test_without_the_extra_one_error_says_how_to_install_it(monkeypatch, tmp_path) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        "lcc_rl.pieces.mpc.find_spec", lambda name: None if name == "osqp" else found(name)
-    )
-    expected = r"^controller=mpc needs osqp: pip install -e '\.\[mpc\]', or '<wheel>\[mpc\]' where"
-    with pytest.raises(ConfigError, match=expected):
-        MPC().bind()
-    # Before any data are read: there is no such file.
-    for words in (["compare=[mpc]"], ["evaluation.baselines=[mpc]"], [f"{PLACE}=mpc"]):
-        more = ["variant=idm", "data=ngsim", "data.path=nowhere.csv", *words]
-        with pytest.raises(ConfigError, match=expected):
-            run(load("evaluate", more), tmp_path, quiet=True)
-    # Before a training, not after it.
-    cfg = load("train", ["evaluation.baselines=[mpc]", "data=ngsim", "data.path=nowhere.csv"])
-    with pytest.raises(ConfigError, match=expected):
-        check_settings(cfg, tmp_path)
 
 
 def rows(count: int = 64, seed: int = 0) -> tuple[torch.Tensor, ...]:

@@ -11,7 +11,6 @@ from lcc_rl.pieces import (
     EnergyReward,
     SafetyReward,
     SpacingReward,
-    TotalReward,
     parse_string,
 )
 from lcc_rl.pieces.world import World
@@ -55,10 +54,6 @@ def test_spacing() -> None:
     torch.testing.assert_close(got.detach(), t(-0.02, -0.005, 0.0))
     got.sum().backward()
     torch.testing.assert_close(error.grad, t(-0.02, 0.01, 0.0))
-
-
-def test_weights() -> None:
-    torch.testing.assert_close(EfficiencyReward(weight=0.5).bind().compute(t(3.0)), t(-0.5))
 
 
 # -- many automated vehicles -------------------------------------------------------------------
@@ -121,7 +116,3 @@ def test_who_pays_for_a_collision(hit, behind, pays) -> None:
     entries = {("vehicles", "gap"): gaps}
     got = term.compute(*(entries[key] for key in term.in_keys))
     torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))
-
-
-def test_sum() -> None:
-    torch.testing.assert_close(TotalReward(terms=["a", "b"]).compute(t(1.0), t(-3.0)), t(-2.0))

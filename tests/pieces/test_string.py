@@ -5,24 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import ACTION, POPULATION, REWARD, composed, small_env, string, wavy_profiles
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from lcc_rl.envs import build_env
-from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import driven_by
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.rules import follower_stopper_speed
-from lcc_rl.functional.string import advance_string, selector
+from lcc_rl.functional.string import advance_string
 from lcc_rl.pieces import (
     Collision,
     FollowerStopper,
     Observation,
     PISaturation,
-    StringMotion,
-    TimeGapStart,
     parse_string,
 )
 from lcc_rl.pieces.sections import Sections
@@ -78,13 +73,6 @@ def test_the_first_one_sees_the_leader_and_the_last_one_nobody_behind() -> None:
     assert seen("automated", names) == [[[100.0]], [[0.0]], [[0.0]]]
 
 
-def test_several_vehicles_behind_nearest_first() -> None:
-    assert seen("automated*3 human", ["behind.speed", "behind.present"], behind=2) == [
-        [[2.0, 3.0], [3.0, 4.0], [4.0, 0.0]],
-        [[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]],
-    ]
-
-
 def test_a_ring_wraps() -> None:
     names = ["ahead.speed", "behind.speed", "behind.present"]
     assert seen("automated human automated", names, "ring") == [
@@ -123,24 +111,9 @@ def test_an_entry_says_whether_somebody_is_behind_only_where_that_may_differ() -
     torch.testing.assert_close(got, expected)
 
 
-@pytest.mark.parametrize("name", ["speed", "self", "next.self", "a.b.c", "next.a.b.c"])
-def test_a_name_has_a_view_and_an_entry(name) -> None:
-    with pytest.raises(ConfigError, match=r"expected a name such as self\.gap"):
-        Views(parse_string("automated"), "automated", [name])
-
-
-@pytest.mark.parametrize(
-    "places", [(), (0,), (2, 3, 4), (1, 3, 5), (0, 1, 4, 5, 9), (3, 2, 1), (5, 0, 2)]
-)
-def test_blocks_select_the_places_in_order(places) -> None:
-    entry = torch.arange(10.0).view(1, 10, 1)
-    assert selector(places, entry.shape[-2])(entry).flatten().tolist() == list(map(float, places))
-
-
 # -- drawn places ----------------------------------------------------------------------------------
 
 FIXED = parse_string("human automated human*2 automated")
-DRAWN = VehicleString(FIXED.roles, drawn=True)
 
 
 @pytest.mark.parametrize("ring", [False, True])
@@ -155,31 +128,6 @@ def test_sections_sum_the_same_of_fixed_and_drawn_places(ring, of) -> None:
     expected = [[1100.0], [1.0 if ring else 0.0]]
     assert one.sum(entry)[0].tolist() == expected
     assert two.sum(entry, *(index[key[0]] for key in two.keys))[0].tolist() == expected
-
-
-@settings(max_examples=50, deadline=None, derandomize=True)
-@given(st.lists(st.sampled_from(["automated", "human", "cacc"]), min_size=1, max_size=9), st.data())
-def test_sections_equal_a_plain_loop(roles, data) -> None:
-    ring, drawn = data.draw(st.booleans()), data.draw(st.booleans())
-    of = data.draw(st.sampled_from(["vehicles", *dict.fromkeys(roles)]))
-    if "automated" not in roles or of == "automated":
-        return
-    own = VehicleString(tuple(roles), drawn=drawn, ring=ring)
-    values = [float(2**place) for place in range(len(roles))]
-    expected = []
-    for place in own.places("automated"):
-        total, at = 0.0, place + 1
-        while ring or at < len(roles):
-            at %= len(roles)
-            if roles[at] == "automated":
-                break
-            total += values[at] if of in ("vehicles", roles[at]) else 0.0
-            at += 1
-        expected.append([total])
-    entry = torch.tensor([v for v, r in zip(values, roles, strict=True) if of in ("vehicles", r)])
-    sections = Sections(own, of)
-    indices = [torch.tensor([own.places(key[0])]) for key in sections.keys]
-    assert sections.sum(entry.view(1, -1, 1), *indices)[0].tolist() == expected
 
 
 def test_fixed_and_drawn_places_give_the_same_numbers() -> None:
@@ -262,17 +210,6 @@ def test_contact_of_any_two_vehicles_ends_the_episode() -> None:
     done, terminated = Collision().compute(running, running, gap)
     assert terminated.flatten().tolist() == [False, True, True]
     assert torch.equal(done, terminated)
-
-
-def test_a_start_for_every_role_and_room_on_the_ring() -> None:
-    pair = World(parse_string("automated human"))
-    with pytest.raises(ConfigError, match=r"scenario\.start lacks human"):
-        StringMotion(start={"automated": TimeGapStart()}).bind(pair)
-    ring = World(parse_string("human*10", "ring"))
-    with pytest.raises(ConfigError, match=r"too short for 10 vehicles of 5\.0 m: it must"):
-        StringMotion(circumference=50.0).bind(ring)
-    with pytest.raises(ConfigError, match=r"needs scenario\.circumference"):
-        StringMotion().bind(ring)
 
 
 # -- rules -----------------------------------------------------------------------------------------

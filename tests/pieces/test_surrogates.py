@@ -21,11 +21,6 @@ def test_safety_is_the_literal_term_where_the_bends_are_far() -> None:
     assert torch.allclose(smooth, SafetyReward().reward(gap, relative), atol=2e-3)
 
 
-def test_safety_costs_nothing_where_it_is_safe() -> None:
-    gap, relative = column(20.0, 10.0, 3.0), column(0.0, 2.0, 0.5)
-    assert not SmoothSafety().reward(gap, relative).any()
-
-
 @pytest.mark.parametrize(("gap", "closing"), [(8.0, 3.0), (1.2, 1.0), (0.5, 1.0), (-3.0, 2.0)])
 def test_safety_always_leads_back(gap: float, closing: float) -> None:
     distance, relative = column(gap), column(-closing)

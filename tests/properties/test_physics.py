@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from lcc_rl.data.profiles import from_records
 from lcc_rl.envs import build_env
 from lcc_rl.evaluation.metrics import energy_measures
 from lcc_rl.functional.idm import (
@@ -20,7 +19,7 @@ from lcc_rl.functional.idm import (
     idm_acceleration,
     simulate_follower,
 )
-from lcc_rl.functional.power import motor_power, traction_force
+from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.string import entries_ahead
 
 QUICK = settings(
@@ -99,34 +98,6 @@ def test_a_larger_batch_does_not_change_a_member(numbers, given_actions) -> None
         rtol=1e-5,
         atol=1e-5,
     )
-
-
-@QUICK
-@given(st.integers(1, 100), actions)
-def test_a_profile_shifted_in_time_plays_the_same(shift, given_actions) -> None:
-    whole = wavy_profiles(1, 400)
-    record = whole.record(0)
-    shifted = from_records([record[shift:]], ["x"], ["x"], STEP)
-    late, early = some_choices([4]), some_choices([4])
-    late["leader", "start"] = torch.tensor([[shift]])
-    early["leader", "start"] = torch.tensor([[0]])
-    one = played(1, given_actions, late, whole)
-    two = played(1, given_actions, early, shifted)
-    assert torch.equal(one["next", *OBSERVATION], two["next", *OBSERVATION])
-
-
-@QUICK
-@given(st.lists(st.floats(0.5, 30.0), min_size=3, max_size=40))
-def test_net_energy_of_the_traction_force_is_the_work_of_the_resistances(speeds) -> None:
-    """A1's account: what the wheels do beyond kinetic energy goes into rolling and drag."""
-    speed = torch.tensor(speeds, dtype=torch.float64).view(-1, 1, 1)
-    middle, acceleration = (speed[1:] + speed[:-1]) / 2, speed.diff(dim=0) / STEP
-    power = traction_force(middle, acceleration) * middle
-    alive = torch.ones(len(speeds) - 1, 1, 1, dtype=torch.bool)
-    measures = energy_measures(power, speed, alive, STEP)
-    resistance = traction_force(middle, torch.zeros_like(middle)) * middle
-    work = float(resistance.sum()) * STEP / 1e3
-    assert measures["net_energy_kj"].item() == pytest.approx(work, rel=1e-9, abs=1e-9)
 
 
 @QUICK

@@ -16,9 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from table_text import long_table, openacc_text
 
-from lcc_rl.config import identity, load
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.episodes import COLUMNS, read_episodes, validate_episodes
+from lcc_rl.data.episodes import COLUMNS, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource
@@ -27,8 +26,6 @@ from lcc_rl.data.speed_records import read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError, LccError
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.io.tensors import read_torch
-from lcc_rl.results.runs import load_config, save_config
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
 FUZZ = settings(
@@ -50,12 +47,6 @@ def native_file() -> list[str]:
         for k, line in enumerate(NATIVE)
         for f in range(30)
     ]
-
-
-def test_the_file_that_is_mutated_is_valid(tmp_path) -> None:
-    path = tmp_path / "a.txt"
-    path.write_text("\n".join(native_file()) + "\n")
-    assert read_ngsim([str(path)]).report.lines()
 
 
 def refused(read: Callable[[], object]) -> str | None:
@@ -133,12 +124,6 @@ LAYOUTS = ("by gap", "by lane", "openacc", "episodes", "record")
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_tables_that_are_mutated_are_valid(tmp_path, layout) -> None:
-    (tmp_path / "a.csv").write_text(text_of(layout))
-    assert len(rows_of(tmp_path / "a.csv", layout)) >= 5
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
 @FUZZ
 @given(
     st.lists(st.tuples(st.integers(0, 99), st.integers(0, 17), words), min_size=1, max_size=6),
@@ -158,25 +143,6 @@ def test_a_mutated_table_is_read_or_refused_by_name(tmp_path, layout, changes, s
         return
     assert np.isfinite(found[0].select_dtypes("number").to_numpy()).all()
     assert (found[0]["leader_speed_mps"] >= 0).all()
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-@FUZZ
-@given(st.binary(max_size=400), st.sampled_from(["a.csv", "a.csv.gz", "a.parquet"]))
-def test_any_bytes_are_no_trajectories(tmp_path, layout, content, name) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(DataError, match=r"a\."):
-        rows_of(tmp_path / name, layout)
-
-
-@FUZZ
-@given(st.binary(max_size=400))
-def test_any_bytes_are_no_table_and_no_policy(tmp_path, content) -> None:
-    path = tmp_path / "x"
-    path.write_bytes(content)
-    for read in (read_parquet, read_torch, read_episodes):
-        with pytest.raises(LccError, match="x: "):
-            read(path)
 
 
 def pair_table() -> pd.DataFrame:
@@ -207,13 +173,6 @@ def test_a_mutated_episode_table_is_accepted_or_refused_by_name(column, row, val
     assert checked["time_s"].diff().dropna().gt(0).all()
 
 
-def test_a_negative_gap_is_refused() -> None:
-    frame = pair_table()
-    frame.loc[3, "gap_m"] = -0.5
-    with pytest.raises(DataError, match=r"row 4, column 'gap_m' holds -0\.5"):
-        validate_episodes(frame, "table")
-
-
 values = st.recursive(
     st.none()
     | st.booleans()
@@ -226,21 +185,6 @@ values = st.recursive(
     ),
     max_leaves=8,
 )
-
-
-@settings(max_examples=8, deadline=None, derandomize=True)
-@given(
-    st.integers(0, 2**31),
-    st.floats(0.01, 0.99),
-    st.floats(1e-8, 1e-1),
-    st.sampled_from(["alcc", "reference"]),
-)
-def test_a_run_is_itself_after_its_file(tmp_path_factory, seed, gamma, rate, variant) -> None:
-    folder = tmp_path_factory.mktemp("run")
-    words = [f"seed={seed}", f"agent.gamma={gamma}", f"agent.actor_lr={rate}"]
-    cfg = load("train", [f"variant={variant}", *words])
-    save_config(cfg, folder)
-    assert identity(load_config(folder)) == identity(cfg)
 
 
 @pytest.mark.parametrize("place", [0.2, 0.5, 0.8])

@@ -72,13 +72,3 @@ def test_one_vehicle_of_22_ends_a_wave() -> None:
     speed = speeds(300.0, 260.0, *HANDOVER, noisy, early)
     assert spread(speed, 190.0, 200.0).mean() > 1.5
     assert spread(speed, 290.0, 300.0).mean() < 0.1 * spread(speed, 190.0, 200.0).mean()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("circumference", [230.0, 260.0])
-def test_one_vehicle_of_22_ends_the_wave_for_good(circumference) -> None:
-    without = spread(speeds(600.0, circumference), 590.0, 600.0)
-    held = speeds(600.0, circumference, *HANDOVER)
-    assert spread(held, 250.0, 300.0).mean() > 1.5
-    assert (spread(held, 590.0, 600.0) < 0.1 * without).all()
-    assert (spread(held, 590.0, 600.0) < 0.1).all()

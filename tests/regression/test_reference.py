@@ -1,6 +1,7 @@
-"""What the string of vehicles computes equals what the two former worlds computed.
+"""Rollouts, policies, evaluations and trainings equal those recorded at commit 7a6769e.
 
-The reference was recorded by ``record_reference.py`` from the release before the redesign.
+There, two separate environments computed them; ``tests/regression/record_reference.py`` of commit
+91b908f recorded them, and reference/commands.json holds the overrides that give them today.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import pandas as pd
 import pytest
 import torch
 from helpers import slow_but
-from renames import PLATOON_POLICY, renamed
 from tensordict import TensorDict
 
 from lcc_rl.agents.actor import shared_policy
@@ -30,6 +30,7 @@ from lcc_rl.results.policies import load_policy
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS = json.loads((REFERENCE / "commands.json").read_text())
 CASES = COMMANDS["rollouts"]
+PLATOON_POLICY = REFERENCE / "ddpg.pt"  # that shipped then
 STEPS = 40
 # Where a division and a product by the largest acceleration have gone, or a network acts, whose
 # products are rounded by the processor and by where its weights lie in memory; 40 steps of a
@@ -89,7 +90,7 @@ def shipped_then(name: str):
 
 def roll(name: str) -> dict[str, torch.Tensor]:
     """Play a case; every entry by its name, ``[batch, time, …]``."""
-    cfg = load("train", renamed(CASES[name]["overrides"]))
+    cfg = load("train", CASES[name]["overrides"])
     policy = policy_of(cfg, CASES[name]["driver"])
     env = build_env(deployed(cfg), recorded_profiles(), bootstrap(), 3, 0)
     moments, steps = [], []
@@ -193,7 +194,8 @@ def compare_tables(found: pd.DataFrame, reference: pd.DataFrame, tolerance: floa
 
 @pytest.mark.parametrize("name", slow_but(["alcc"], sorted(COMMANDS["evaluation"])))
 def test_evaluations(name, tmp_path) -> None:
-    cfg = load("evaluate", renamed(COMMANDS["evaluation"][name]["overrides"]))
+    words = COMMANDS["evaluation"][name]
+    cfg = load("evaluate", [word.replace("<ddpg.pt>", f"'{PLATOON_POLICY}'") for word in words])
     evaluation.run(cfg, tmp_path, quiet=True)
     for table in ("episodes", "steps"):
         path = REFERENCE / "evaluation" / f"{name}_{table}.parquet"
@@ -206,15 +208,10 @@ def test_evaluations(name, tmp_path) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    slow_but(
-        ["alcc_ddpg", "alcc_analytic", "ddpg"],
-        ["alcc_ddpg", "alcc_td3", "alcc_sac", "alcc_analytic", "own_energy", "ddpg"],
-    ),
+    slow_but(["alcc_ddpg", "alcc_analytic", "ddpg"], sorted(COMMANDS["training"])),
 )
 def test_trainings(name, tmp_path) -> None:
-    # Recorded when the value was learned at every moment.
-    more = ["agent.value_every=1"] if name == "alcc_analytic" else []
-    cfg = load("train", [*renamed(COMMANDS["training"][name]["overrides"]), *more])
+    cfg = load("train", COMMANDS["training"][name])
     training.run(cfg, tmp_path, quiet=True)
     rows = pd.read_parquet(tmp_path / "training.parquet")
     reference = pd.read_parquet(REFERENCE / "training" / f"{name}.parquet")

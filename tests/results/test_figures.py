@@ -7,30 +7,30 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from commands import tiny
 from helpers import POPULATION
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
-from study_frames import episodes, training
+from study_frames import episodes, training, windows
 
-from lcc_rl.commands import evaluation
+from lcc_rl.commands import evaluation, maps
 from lcc_rl.config import load
 from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.drivers.population import load_drivers
-from lcc_rl.errors import DataError
 from lcc_rl.evaluation.responses import responses
 from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
-from lcc_rl.figures.drawing import colour, in_file, save
+from lcc_rl.figures.drawing import colour, save
 from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
 from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
-from lcc_rl.figures.training import learning_curve, training_figure
-from lcc_rl.io.files import write_parquet
+from lcc_rl.figures.training import learning_curve
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.means import Means
+from lcc_rl.results.motion import RESPONSES
 from lcc_rl.results.policies import load_policy
 from lcc_rl.studies.alcc import figures as alcc
 
@@ -64,7 +64,7 @@ def steps() -> pd.DataFrame:
 
 
 def parts(column: str, *values: object, **size: int) -> pd.DataFrame:
-    return pd.concat([episodes(**size).assign(**{column: value}) for value in values])
+    return pd.concat([windows(**size).assign(**{column: value}) for value in values])
 
 
 def drivers() -> pd.DataFrame:
@@ -77,26 +77,21 @@ FIGURES = {
     "reward_terms": (lambda: alcc.reward_terms(training()), ["HDV energy", "n = 2 seeds"]),
     "sample_episode": (lambda: run_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
     "human_energy": (
-        lambda: run_figures.human_energy(episodes(), "reference"),
+        lambda: run_figures.human_energy(Means.of(episodes()), "reference"),
         ["n = 3 drivers", "+17.5 %", "kJ"],
     ),
     "improvement": (
-        lambda: run_figures.paired_improvement(episodes(), "alcc", "reference"),
-        ["1 of 3 drivers", "33 % of (window, driver) pairs", "over windows and seeds"],
+        lambda: run_figures.paired_improvement(Means.of(episodes()), "alcc", "reference"),
+        ["1 of 3 drivers", "over windows and seeds"],
     ),
     "distributions": (lambda: alcc.distributions(episodes()), ["n = 3 drivers", "75.0"]),
     "generalization": (
-        lambda: alcc.generalization_figure(episodes()),
+        lambda: alcc.generalization_figure(windows()),
         ["paper, 4 profiles", "n = 2", "mean of 2 seeds", "human driver"],
     ),
     "ablations": (
         lambda: alcc.comparison_figure(parts("ablation", "none", "no_safety")),
         ["no safety", "n = 2 seeds"],
-    ),
-    "followers": (lambda: alcc.followers_figure(parts("followers", 1, 5)), ["2 seeds"]),
-    "single": (
-        lambda: alcc.single_profile_figure(parts("study_profile", 3, 12, profiles=1)),
-        ["profile 12", "idm", "kJ"],
     ),
     "calibration": (
         lambda: calibration_figure(drivers()),
@@ -118,43 +113,16 @@ def test_a_figure_draws_and_says_what_it_shows(name, tmp_path) -> None:
     assert b"<svg" in (tmp_path / f"{name}.svg").read_bytes()[:1000]
 
 
-def test_what_cannot_be_drawn_is_named() -> None:
-    for wrong, words in ((drivers().drop(columns="rmspe"), "rmspe"), (drivers()[:0], "no drivers")):
-        with pytest.raises(DataError, match=words):
-            calibration_figure(wrong)
-    assert in_file("pi_saturation ../x: y") == "pi_saturation_.._x__y"
-
-
 def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
     frame = episodes()
     frame = frame[(frame["training_seed"] != 1).fillna(True) & (frame["profile_id"] == 0)]
     for figure in (
-        run_figures.paired_improvement(frame, "alcc", "reference"),
-        run_figures.human_energy(frame, "alcc"),
-        alcc.generalization_figure(frame),
+        run_figures.paired_improvement(Means.of(frame), "alcc", "reference"),
+        run_figures.human_energy(Means.of(frame), "alcc"),
+        alcc.generalization_figure(Means.of(frame).windows),
     ):
         assert "1 training seed" in (found := texts(figure)) or "1 seed" in found
         assert "95 %" not in found
-
-
-def test_lines_hold_the_rows_of_one_seed_and_the_shorter_curve() -> None:
-    (line,) = (
-        line.get_ydata()
-        for line in run_figures.sample_episode(steps(), "alcc").axes[0].lines
-        if line.get_label() == "controlled car"
-    )
-    assert np.asarray(line).tolist() == [6.0] * 5  # seed 1, once
-    frame = training()
-    figure = learning_curve(frame[(frame["seed"] != 1) | (frame["iteration"] <= 12)])
-    assert len(figure.axes[0].lines[0].get_xdata()) == 12
-
-
-def test_of_a_training_with_limits_the_shares_are_shown_with_the_limit() -> None:
-    frame = training().assign(loss_actor=3.0, share_efficiency=0.02)
-    figure = training_figure(frame.assign(**{"agent.limits.efficiency": 0.01}))
-    assert "limit 1 %" in texts(figure)
-    assert figure.axes[1].lines[0].get_ydata() == pytest.approx(2.0)
-    assert len(training_figure(training()).axes) == 1
 
 
 def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tmp_path) -> None:
@@ -167,7 +135,8 @@ def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tm
     for axis in figure.axes:  # the legend covers no data
         assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0
     image = pixels(
-        run_figures.paired_improvement(episodes(), "alcc", "reference"), tmp_path / "y.png"
+        run_figures.paired_improvement(Means.of(episodes()), "alcc", "reference"),
+        tmp_path / "y.png",
     )
     assert count(image, colour("alcc"), 0.8) > 300
     assert count(image, colour("reference"), 0.45) > 50
@@ -315,16 +284,7 @@ def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     evaluation.run(cfg, tmp_path)
     drawn = [path.name.rpartition(".") for path in (tmp_path / "figures").iterdir()]
     stems = {kind: {stem for stem, _, own in drawn if own == kind} for kind in ("png", "svg")}
-    assert {"policy_map", "overview", "improvement_alcc_vs_idm"} <= stems["png"]
+    assert {"overview", "improvement_alcc_vs_idm"} <= stems["png"]
     assert stems["png"] == stems["svg"]
-
-
-def test_figures_of_a_run_with_pieces_of_ones_own_need_no_trust(tmp_path) -> None:
-    write_parquet(episodes(), tmp_path / "episodes.parquet")
-    both = pd.concat([steps(), steps().assign(strategy="reference")])
-    write_parquet(both, tmp_path / "steps.parquet")
-    scenario = {**RING, "road": "open", "string": "automated human"}
-    scenario["pieces"] = {"mine": {"_target_": "not_installed.Mine"}}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"scenario": scenario}))
-    names = {path.name for path in run_figures.write_figures(tmp_path)}
-    assert {"overview.png", "episode_alcc.png", "improvement_reference_vs_idm.png"} <= names
+    assert [path.name for path in maps.run(tmp_path)] == ["policy_map.png"]
+    assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm tuned"}

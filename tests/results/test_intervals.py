@@ -4,9 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lcc_rl.errors import ResultsError
 from lcc_rl.results.fronts import ENERGY, SHARE, energy_at, points, saving_at
-from lcc_rl.results.intervals import band, mean, saving, share_saved
+from lcc_rl.results.intervals import mean, saving, share_saved
 from lcc_rl.results.savings import per_window, savings
 
 NETWORK, RULE = ("alcc", "network"), ("alcc", "idm")
@@ -79,12 +78,6 @@ def test_rows_and_their_means_by_window_save_alike() -> None:
     assert np.isfinite(whole.low)
 
 
-def test_band_holds_the_mean_of_every_point() -> None:
-    curves = np.random.default_rng(0).normal(size=(7, 5)) + np.arange(7)[:, None]
-    low, high = band(curves)
-    assert ((curves.min(1) <= low) & (low < curves.mean(1)) & (curves.mean(1) < high)).all()
-
-
 def test_less_drawn_is_saved_also_where_the_baseline_gains() -> None:
     assert share_saved(90.0, 100.0) == pytest.approx(0.1)
     assert share_saved(-110.0, -100.0) == pytest.approx(0.1)  # recuperates more
@@ -118,10 +111,3 @@ def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     assert table.loc[("idm", 0.02), SHARE] == pytest.approx(0.01)
     nothing = saving_at(fronts(0.0, 2.0), NETWORK, RULE, 0.012)
     assert -0.03 < nothing.low < 0.0 < nothing.high < 0.03
-
-
-def test_a_front_that_lacks_a_training_is_named() -> None:
-    rows = fronts()
-    gone = rows[(rows["policy"] != "idm") | (rows["limit"] != 0.02) | (rows["profile_id"] > 1)]
-    with pytest.raises(ResultsError, match="alcc idm: 102 rows; expected every window and seed"):
-        saving_at(gone, NETWORK, RULE, 0.012)

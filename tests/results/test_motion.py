@@ -10,13 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from matplotlib.animation import FFMpegWriter
 from matplotlib.colors import to_rgb
 from PIL import Image
 
 from lcc_rl.commands import animate as command
-from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.figures.animation import COLOURS, LARGEST, animate, frames, page
+from lcc_rl.errors import ResultsError
+from lcc_rl.figures.animation import COLOURS, LARGEST, animate, page
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes, visited
 
@@ -124,15 +123,6 @@ def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
         assert near.sum() > 30, role
 
 
-def test_a_long_episode_plays_faster_and_an_mp4_is_one(tmp_path, monkeypatch) -> None:
-    assert "4.0 × as fast" in next(frames(drifting(seconds=60.0), "long"))._suptitle.get_text()
-    if FFMpegWriter.isAvailable():
-        assert animate(drifting(), "x", tmp_path / "x.mp4").read_bytes()[4:8] == b"ftyp"
-    monkeypatch.setattr(FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
-    with pytest.raises(ConfigError, match="ffmpeg"):
-        animate(drifting(), "x", tmp_path / "y.mp4")
-
-
 @pytest.fixture
 def run_folder(tmp_path):
     """An evaluation's folder with two strategies, two sample episodes each."""
@@ -161,19 +151,3 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     job.mkdir()
     run_folder.rename(job / "evaluation")
     assert command.run(job).parent == job / "evaluation" / "figures"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--strategy", "alccc"], "'alccc'"),
-        (["--episode", "2"], "from 0 to 1, got 2"),
-        (["--out", "x.avi"], "'.avi'"),
-        (["--start", "9"], "from 0.5 to 2 s"),
-    ],
-)
-def test_mistakes_are_named(words, said, run_folder) -> None:
-    with pytest.raises(ConfigError, match=re.escape(said)):
-        command.main([str(run_folder), *words])
-    with pytest.raises(ConfigError, match="not a run folder"):
-        command.run(run_folder / "nothing")

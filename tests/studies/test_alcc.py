@@ -9,12 +9,11 @@ import pytest
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.studies.alcc import report, study
-from lcc_rl.studies.alcc.settings import PRECISE, followers_change, followers_study
 
 
 def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> None:
     own = study.Study(tmp_path, "paper_alcc", 1)
-    main = as_plain(own.runs(tmp_path)[0].compose())
+    main = as_plain(own.runs(tmp_path, study.MAIN)[0].compose())
     seen = []
     for name, change in study.ABLATIONS.items():
         runs = own.runs(tmp_path, change)
@@ -32,30 +31,13 @@ def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> No
     assert cfg.training.episodes == 3000
 
 
-def test_followers_learn_with_the_analytic_agent_unless_another_is_asked_for(tmp_path) -> None:
-    given = ("agent.batch_size=64", "training.episodes=40", "scenario.horizon=40")
-    own = study.Study(tmp_path, "quickstart", 1, given)
-    change = followers_change(own.overrides, 5)
-    cfg = followers_study(own).runs(tmp_path, change)[0].compose()
-    assert (cfg.scenario.horizon, cfg.training.episodes) == (40, 30720)
-    assert cfg.scenario.string == "automated human*5"
-    assert change.evaluation == ("evaluation.profiles=null",)
-    own = study.Study(tmp_path, "quickstart", 1, ("agent=td3", "evaluation.profiles=3", *given))
-    change = followers_change(own.overrides, 1)
-    assert change.overrides == (*PRECISE[1:], "scenario.string='automated human*1'")
-    assert change.evaluation == ()
-    cfg = followers_study(own).runs(tmp_path, change)[0].compose()
-    assert (cfg.agent["batch_size"], cfg.training.episodes) == (64, 40)
-
-
 @pytest.mark.parametrize(
     ("settings", "parts", "words"),
     [
-        ({"seeds": 0}, None, "seeds must be at least 1"),
-        ({"ablations": ("no_safty",)}, None, "no_safety"),
+        ({"seeds": 0}, ("main", "ablations"), "seeds must be at least 1"),
+        ({"ablations": ("no_safty",)}, ("main", "ablations"), "no_safety"),
         ({"ablations": ("mine:reward.terms.safty.weight=0",)}, ["ablations"], "safty"),
-        ({"overrides": ("+filter=cbf",)}, None, "not both"),
-        ({"overrides": ("sede=1",)}, None, "sede"),
+        ({"overrides": ("sede=1",)}, ("main", "ablations"), "sede"),
         ({}, ["ablation"], "ablations"),
     ],
 )
@@ -72,5 +54,5 @@ def test_a_folder_without_an_evaluation_has_no_page(tmp_path) -> None:
 
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
-    run = study.Study(folder, "smoke", 1).runs(folder / "train")[0]
+    run = study.Study(folder, "smoke", 1).runs(folder / "train", study.MAIN)[0]
     assert Path(run.compose().data["path"]) == folder / "trajectories.parquet"

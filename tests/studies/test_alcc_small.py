@@ -21,7 +21,6 @@ from lcc_rl.studies.runner import FAILED, FINISHED, FOREIGN, Outcome, Run
 
 pytestmark = [pytest.mark.xdist_group("small_study"), pytest.mark.slow]
 
-SPEEDS = (0, 8)  # of the filter
 TINY = (
     *("data.platoons=4", "data.recordings=2", "scenario.horizon=20", "evaluation.drivers=2"),
     *("training.episodes=8", "agent.batch_size=64", "agent.hidden=[16,16]"),
@@ -47,11 +46,9 @@ def in_this_process(runs: Sequence[Run], jobs: int) -> list[Outcome]:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick() -> Iterator[None]:
-    """Train in this process, with two filters only."""
+    """Train in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "_start", in_this_process)
-        for module in (alcc, report):
-            patch.setattr(module, "FILTERS", SPEEDS)
         yield
 
 
@@ -59,13 +56,12 @@ def quick() -> Iterator[None]:
 def study(quick, tmp_path_factory) -> alcc.Study:
     """Every part of the study; two seeds in the main one."""
     folder = tmp_path_factory.mktemp("alcc") / "a study, its folder"
-    one = alcc.Study(folder, "smoke", 1, TINY, ablations=("late:agent.tau=0.01",), profiles=1)
+    one = alcc.Study(folder, "smoke", 1, TINY, ablations=("late:agent.tau=0.01",))
     outcomes = alcc.run(one, ["ablations"])
     assert "late" in report.write_results(folder).read_text()  # a part alone has a page
     two = replace(one, seeds=2)
-    outcomes += alcc.run(replace(one, followers=(1, 2)), ["single", "followers"])
-    outcomes += alcc.run(two, ["main", "filter"], "typed")
-    assert [outcome.status for outcome in outcomes] == [FINISHED] * (2 + 2 + 5 + 6)
+    outcomes += alcc.run(two, ["main"], "typed")
+    assert [outcome.status for outcome in outcomes] == [FINISHED] * (2 + 6)
     report.write_results(folder)
     return two
 
@@ -86,24 +82,10 @@ def test_every_part_is_evaluated_and_on_the_page(study) -> None:
     learned = {"alcc": 2, "own_energy": 2, "reference": 2}
     assert counts.to_dict() == {**learned, **dict.fromkeys(UNTRAINED, 0)}
     tables = {p.stem: read_parquet(p) for p in (study.folder / "tables").iterdir()}
-    filtered = tables["filter"]
-    assert len(filtered) == 3 + 4 * len(SPEEDS)
-    own = filtered[filtered["filter"] == "full_speed_0"]
-    assert set(own["strategy"]) == {"alcc", "reference", "own_energy", "cbf"}
-    assert not own["total_energy_kj"].isin(filtered["total_energy_kj"][:3]).any()
-    assert tables["followers"][["followers", "strategy"]].to_numpy().tolist() == [
-        [number, name] for number in (1, 2) for name in ("alcc", "own_energy", "reference")
-    ]
-    assert not (study.folder / "followers" / "2" / "reference").exists()  # that of 1 is taken
     assert set(tables["ablations"]["ablation"]) == {report.ITSELF, "late"}
-    (folder,) = (study.folder / "single").iterdir()
-    once = read_parquet(folder / "evaluation" / "episodes.parquet")
-    assert once["profile_id"].nunique() == 1
     html = (study.folder / "report.html").read_text()
     for words in (
         "Table IV",
-        "One profile",
-        "A filter",
         "late",
         "seed_1",
         "Configuration",
@@ -114,7 +96,7 @@ def test_every_part_is_evaluated_and_on_the_page(study) -> None:
 
 def test_finished_runs_are_skipped_and_the_page_needs_the_parquet_files_only(copied) -> None:
     before = {p: p.stat().st_mtime_ns for p in copied.folder.rglob("episodes.parquet")}
-    assert {outcome.status for outcome in alcc.run(copied, ["main", "filter"])} == {FINISHED}
+    assert {outcome.status for outcome in alcc.run(copied, ["main"])} == {FINISHED}
     assert before == {p: p.stat().st_mtime_ns for p in copied.folder.rglob("episodes.parquet")}
     tables = {p: read_parquet(p) for p in (copied.folder / "tables").iterdir()}
     for path in (*copied.folder.rglob("*.pt"), *tables):

@@ -8,8 +8,6 @@ import entries as tool
 import pytest
 from equations import EQUATIONS, LAST, numbers_in
 
-from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.pieces.entries import ENTRIES
 
 # One process for all: to make the environments takes longer than to look at them.
@@ -36,12 +34,6 @@ def test_page_is_up_to_date(environments, monkeypatch, tmp_path, capsys) -> None
     assert "python tools/entries.py" in capsys.readouterr().err
     assert tool.main([]) == 0
     assert tool.main(["--check"]) == 0
-
-
-def test_two_shapes_of_an_entry_are_refused(environments) -> None:
-    env, string = environments[0]
-    with pytest.raises(ConfigError, match="two shapes"):
-        tool.collect([(env, string), (env, VehicleString((*string.roles, "human")))])
 
 
 def test_every_equation_is_listed_once() -> None:

@@ -136,13 +136,6 @@ def test_a_wrong_answer_never_becomes_the_file(portal, tmp_path, spoil, message)
     assert ids(output) == list(range(1, 26))
 
 
-def test_an_existing_file_is_kept(portal, tmp_path) -> None:
-    (tmp_path / "i80.csv").write_text("mine")
-    with pytest.raises(ConfigError, match="exists already"):
-        run(portal, tmp_path / "i80.csv")
-    assert (tmp_path / "i80.csv").read_text() == "mine"
-
-
 def test_without_pooch_one_line_names_the_extra(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pooch", None)
     with pytest.raises(ConfigError, match=r"needs pooch: pip install -e '\.\[fetch\]'"):

@@ -46,6 +46,6 @@ def test_means_per_window_and_per_driver(tmp_path) -> None:
     # A human of 50 kJ, 2 more for each driver's number, 10 more on the second profile.
     assert own["hdv_energy_kj"].tolist() == [52.0, 62.0]
     assert own["min_gap_m"].tolist() == [1.0, 1.0]  # the least of the drivers, not their mean
-    own = drivers[(drivers["strategy"] == "reference") & (drivers["training_seed"] == 1)]
+    own = drivers[drivers["strategy"] == "reference"]
     assert own["hdv_energy_kj"].tolist() == [55.0, 57.0, 59.0]
-    assert own["cav_energy_kj"].tolist() == [90.0] * 3
+    assert own["cav_energy_kj"].tolist() == [85.0] * 3

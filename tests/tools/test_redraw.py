@@ -32,9 +32,10 @@ def test_everything_is_drawn_again_and_the_page_is_the_same(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_the_page_of_hcfs_holds_the_tables_that_are_kept(tmp_path) -> None:
-    shutil.copytree(ROOT / redraw.REFERENCE / "hcfs", tmp_path / "hcfs")
-    page = Path(shutil.copy(ROOT / "docs" / "hcfs.md", tmp_path))
-    _, report = redraw.redraw_hcfs(tmp_path, tmp_path)
-    assert page.read_text() == (ROOT / "docs" / "hcfs.md").read_text()
-    assert report.read_text().count("<img ") == 13  # speeds, jerk, two of switching; learning
+@pytest.mark.parametrize(("name", "pictures"), [("alcc", 12), ("hcfs", 13)])
+def test_the_page_of_a_study_holds_the_tables_that_are_kept(tmp_path, name, pictures) -> None:
+    shutil.copytree(ROOT / redraw.REFERENCE / name, tmp_path / name)
+    page = Path(shutil.copy(ROOT / "docs" / f"{name}.md", tmp_path))
+    _, report = redraw.redraw_study(name, tmp_path, tmp_path)
+    assert page.read_text() == (ROOT / "docs" / f"{name}.md").read_text()
+    assert report.read_text().count("<img ") == pictures

@@ -13,7 +13,7 @@ from scipy.optimize import differential_evolution
 
 from benchmarks.harness import Row, Run, agree, alternate, rows_of, stream
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.drivers.fit import fit
+from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import Observed, observe
 from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants
@@ -115,7 +115,7 @@ def ours(found: dict[str, Any], observed: Observed, device: str) -> Run:
     """Return the fit of every driver at once."""
 
     def run() -> None:
-        drivers = fit(observed, device=device).drivers.set_index("episode")
+        drivers = Calibrator()(observed, device=device).drivers.set_index("episode")
         found[OURS] = drivers.loc[observed.identity["episode"]]
 
     return run

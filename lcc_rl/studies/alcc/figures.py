@@ -25,7 +25,7 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.training import draw_curves
 from lcc_rl.functional.power import motor_power
-from lcc_rl.results.savings import UNTRAINED, by_driver, per_seed, savings
+from lcc_rl.results.savings import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 from lcc_rl.studies.alcc.tables import comparison
 
@@ -90,18 +90,18 @@ def reward_terms(training: pd.DataFrame) -> Figure:
     return figure
 
 
-def distributions(episodes: pd.DataFrame) -> Figure:
+def distributions(drivers: pd.DataFrame) -> Figure:
     """Path energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
 
     A driver's value is its mean over the held-out profiles and seeds. Boxes span the quartiles,
     whiskers the 5th to 95th percentile; a diamond marks the mean.
     """
-    names = list(dict.fromkeys(episodes["strategy"]))
+    names = list(dict.fromkeys(drivers["strategy"]))
     figure = new_figure(9.0, 0.9 + 0.62 * len(names))
     axes = figure.subplots(1, 2)
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
     for axis, (vehicle, title) in zip(axes, titles.items(), strict=True):
-        energy = by_driver(episodes, f"{vehicle}_path_energy_kj")
+        energy = by_driver(drivers, f"{vehicle}_path_energy_kj")
         for place, name in enumerate(names):
             if name in energy:
                 _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
@@ -126,23 +126,23 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
 
 
 def generalization_figure(
-    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+    windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> Figure:
     """Path energy of both vehicles on every held-out profile, and its saving (Fig. 12)."""
-    table = generalization(episodes, strategy, baseline).sort_values("path_saving_pct")
+    table = generalization(windows, strategy, baseline).sort_values("path_saving_pct")
     figure = new_figure(9.0, 6.5)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
-    _energies_by_profile(above, episodes, table["profile_id"].tolist(), (baseline, strategy))
+    _energies_by_profile(above, windows, table["profile_id"].tolist(), (baseline, strategy))
     values, places = table["path_saving_pct"].to_numpy(float), np.arange(len(table))
     whiskers(below, places, table, "path_saving_pct", colour(strategy), upright=True)
-    seeds = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
+    seeds = windows.loc[windows["strategy"] == strategy, "training_seed"].nunique()
     sure = f"mean of {seeds} seeds, 95 % interval" if seeds > 1 else "1 seed (no interval)"
     below.plot(places, values, "o", color=colour(strategy), label=f"this study, {sure}")
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
     label = "paper, 4 profiles, energy as drawn"
     below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
     below.axhline(0.0, color=INK, lw=0.8)
-    together = 100 * savings(episodes, "total_path_energy_kj", strategy, baseline).value
+    together = 100 * savings(windows, "total_path_energy_kj", strategy, baseline).value
     line = f"all profiles together {together:+.1f} %"
     below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
@@ -157,13 +157,13 @@ def generalization_figure(
 
 
 def _energies_by_profile(
-    axis: Axes, episodes: pd.DataFrame, order: list[object], names: tuple[str, str]
+    axis: Axes, windows: pd.DataFrame, order: list[object], names: tuple[str, str]
 ) -> None:
     """Draw the path energy of car and human driver on every profile under two strategies."""
     places = np.arange(len(order))
     columns = ["cav_path_energy_kj", "hdv_path_energy_kj"]
     for name, offset in zip(names, (-0.21, 0.21), strict=True):
-        rows = episodes[episodes["strategy"] == name].groupby("profile_id")[columns].mean()
+        rows = windows[windows["strategy"] == name].groupby("profile_id")[columns].mean()
         car, human = (rows.loc[order, column].to_numpy(float) for column in columns)
         axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{in_words(name)}: car")
         label = f"{in_words(name)}: human driver"
@@ -188,21 +188,20 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
             axis.annotate(f"{value:+.0f} % {mark}", (place, end), va=side, **look)
 
 
-def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
+def comparison_figure(windows: pd.DataFrame) -> Figure:
     """Energy, safety and efficiency under each change of the study (no counterpart).
 
     Args:
-        episodes: rows of the evaluations; those of the study itself come first.
-        by: the column that names the change.
+        windows: rows of the evaluations; those of the study itself come first.
     """
-    table = comparison(episodes, by)
-    names, strategies = (list(dict.fromkeys(table[name])) for name in (by, "strategy"))
+    table = comparison(windows)
+    names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
     figure = new_figure(10.0, 1.3 + 0.42 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
             part, hue = table[table["strategy"] == strategy], colour(strategy)
-            rows = [names.index(name) + offset for name in part[by]]
+            rows = [names.index(name) + offset for name in part["ablation"]]
             whiskers(axis, rows, part, column, hue)
             axis.plot(part[column], rows, "o", color=hue, ms=5, label=in_words(strategy))
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
@@ -215,69 +214,6 @@ def comparison_figure(episodes: pd.DataFrame, by: str = "ablation") -> Figure:
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
     seeds = _how_many(table["seeds"])
     footnote(figure, f"n = {seeds}; lines: 95 % interval; dashed: the study's limit")
-    return figure
-
-
-def followers_figure(episodes: pd.DataFrame) -> Figure:
-    """Energy saved against the number of human drivers behind (no counterpart).
-
-    Args:
-        episodes: rows of the evaluations of all trained strategies, with the column
-            ``followers``.
-    """
-    table = comparison(episodes, "followers")
-    table = table[table["strategy"] != "reference"]
-    column = "path_saving_against_reference_pct"
-    figure = new_figure(6.5, 3.8)
-    axis = figure.subplots()
-    names = list(dict.fromkeys(table["strategy"]))
-    for name, offset in zip(names, _abreast(len(names), 0.06), strict=True):
-        part = table[table["strategy"] == name]
-        label = f"{in_words(name)}, {_how_many(part['seeds'])}"
-        places = part["followers"].to_numpy(float) + offset
-        axis.plot(places, part[column], "o-", color=colour(name), label=label)
-        whiskers(axis, places, part, column, colour(name), upright=True)
-    axis.axhline(0.0, color=INK, lw=0.8)
-    legend_above(axis)
-    words = "path energy saved\nagainst reference [%]"
-    style(axis, "human drivers behind the controlled car (lines: 95 % interval)", words)
-    return figure
-
-
-def single_profile_figure(episodes: pd.DataFrame) -> Figure:
-    """Total energy of every seed trained and evaluated on one profile (no counterpart).
-
-    Args:
-        episodes: rows of the evaluations, with the column ``study_profile``.
-    """
-    groups = dict(iter(episodes.groupby("study_profile", sort=True)))
-    figure = new_figure(max(7.5, 1.8 + 1.9 * len(groups)), 4.2)
-    axis = figure.subplots()
-    labels, legend = [], {}
-    for place, (profile, part) in enumerate(groups.items()):
-        energy = per_seed(part, "total_energy_kj")
-        human, hue = float(energy["idm"].mean()), colour("idm")
-        axis.hlines(human, place - 0.36, place + 0.36, color=hue, lw=2.5)
-        legend["idm (human driver)"] = axis.plot([], [], "-", color=hue)[0]
-        learned = sorted((name for name in energy if name not in UNTRAINED), reverse=True)
-        for number, strategy in enumerate(learned):
-            values, hue = energy[strategy].to_numpy(float), colour(strategy)
-            centre = place - 0.16 + 0.32 * number
-            jitter = centre + _abreast(len(values), 0.1)
-            axis.plot(jitter, values, "o", color=hue, ms=5, alpha=0.6, mew=0)
-            axis.hlines(values.mean(), centre - 0.14, centre + 0.14, color=hue, lw=2)
-            legend[f"{in_words(strategy)}: seeds and mean"] = axis.plot([], [], "o", color=hue)[0]
-        label = f"profile {profile!s}\n"
-        if {"alcc", "reference"} <= set(energy):
-            # Not a percentage: in a jam a profile's energy can be near zero.
-            gain = energy["alcc"].mean() - energy["reference"].mean()
-            label += f"alcc {gain:+.1f} kJ\nagainst reference"
-        labels.append(label)
-    axis.set_xticks(range(len(groups)), labels, fontsize=9)
-    axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-    style(axis, "profile used for training and evaluation", "total energy [kJ per episode]")
-    look: dict[str, Any] = {"loc": "outside upper center", "frameon": False, "ncols": 3}
-    figure.legend(legend.values(), legend.keys(), **look)
     return figure
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.results.intervals import share_saved
+from lcc_rl.results.means import Means
 from lcc_rl.results.savings import KINDS, by_driver, driver_savings, per_seed, savings
 
 PAPER, OURS = "paper", "this study"
@@ -36,11 +37,15 @@ PAPER_HUMAN = {
 
 
 def table_iv(
-    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+    drivers: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
     """Energies behind the mean, best and worst driver (Table IV of the paper).
 
     The best driver is the one with the largest saving of total energy over profiles and seeds.
+
+    Args:
+        drivers: of :class:`lcc_rl.results.means.Means`.
+        strategy, baseline: the controllers that are compared.
 
     Returns:
         Rows for both controllers and each driver, this study's and the paper's: CAV, HDV and
@@ -48,11 +53,11 @@ def table_iv(
         drawn.
     """
     columns = [f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in KINDS.values()]
-    energies = {column: by_driver(episodes, column) for column in columns}
-    saved = driver_savings(episodes, "total_energy_kj", strategy, baseline)
-    drivers: dict[str, Any] = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
+    energies = {column: by_driver(drivers, column) for column in columns}
+    saved = driver_savings(drivers, "total_energy_kj", strategy, baseline)
+    chosen: dict[str, Any] = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
     rows = []
-    for label, driver in drivers.items():
+    for label, driver in chosen.items():
         own = {x: t.mean() if driver is None else t.loc[driver] for x, t in energies.items()}
         for name in (baseline, strategy):
             row: dict[str, object] = {"driver": label, "strategy": name, "from": OURS}
@@ -71,14 +76,12 @@ def table_iv(
     return _with_its_decimals(rows)
 
 
-def holistic(
-    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
-) -> pd.DataFrame:
+def holistic(means: Means, strategy: str = "alcc", baseline: str = "reference") -> pd.DataFrame:
     """Saving of the total energy per driver beside the paper's (Fig. 10): one row each."""
     rows = []
     for kind, column in KINDS.items():
-        found = savings(episodes, f"total_{column}", strategy, baseline)
-        saved = 100.0 * driver_savings(episodes, f"total_{column}", strategy, baseline)
+        found = savings(means.windows, f"total_{column}", strategy, baseline)
+        saved = 100.0 * driver_savings(means.drivers, f"total_{column}", strategy, baseline)
         row = {"from": f"{OURS}, {NAMES[kind]}", **found.columns("mean_saving_pct", 100.0)}
         row |= {"best_driver_pct": saved.max(), "worst_driver_pct": saved.min()}
         row |= {"drivers_worse_off": f"{int((saved < 0).sum())} of {len(saved)}"}
@@ -90,7 +93,7 @@ def holistic(
 
 
 def generalization(
-    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+    windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
     """Energies and savings on every held-out profile (Fig. 12).
 
@@ -101,7 +104,7 @@ def generalization(
     """
     path = "total_path_energy_kj"
     rows = []
-    for profile, part in episodes.groupby("profile_id", sort=True):
+    for profile, part in windows.groupby("profile_id", sort=True):
         row: dict[str, object] = {"profile_id": profile, "profile": part["profile"].iloc[0]}
         energy = per_seed(part, path)
         row |= {f"{name}_path_energy_kj": energy[name].mean() for name in (baseline, strategy)}
@@ -114,7 +117,7 @@ def generalization(
 
 
 def generalization_row(
-    episodes: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
+    windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
     """Distribution of the savings over held-out profiles, beside the paper's four profiles.
 
@@ -123,10 +126,10 @@ def generalization_row(
         ``together_pct``, the saving of the energy of all profiles, and the least, median and
         largest of a profile.
     """
-    table = generalization(episodes, strategy, baseline)
+    table = generalization(windows, strategy, baseline)
     rows = []
     for kind, column in KINDS.items():
-        together = savings(episodes, f"total_{column}", strategy, baseline)
+        together = savings(windows, f"total_{column}", strategy, baseline)
         row = {"from": f"{OURS}, {NAMES[kind]}", **together.columns("together_pct", 100.0)}
         rows.append(row | _spread(table[f"{kind}saving_pct"]))
     return pd.DataFrame([*rows, {"from": PAPER, **_spread(pd.Series(PAPER_GENERALIZATION))}])
@@ -137,7 +140,7 @@ def _spread(values: pd.Series) -> dict[str, float]:
     return {"profiles": len(values), **ends, "profiles_with_saving": int((values > 0).sum())}
 
 
-def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
+def human_energy(means: Means) -> pd.DataFrame:
     """Human driver's energy behind a controlled car (A) and directly behind the leader (B; Fig. 9).
 
     Returns:
@@ -145,10 +148,10 @@ def human_energy(episodes: pd.DataFrame) -> pd.DataFrame:
         interval over windows and seeds, and the least and largest saving of a driver.
     """
     rows: list[dict[str, object]] = []
-    for strategy in per_seed(episodes, "total_energy_kj"):
+    for strategy in per_seed(means.windows, "total_energy_kj"):
         for kind, column in KINDS.items():
-            found = savings(episodes, f"hdv_{column}", strategy, "direct")
-            energy = by_driver(episodes, f"hdv_{column}")
+            found = savings(means.windows, f"hdv_{column}", strategy, "direct")
+            energy = by_driver(means.drivers, f"hdv_{column}")
             saved = 100.0 * share_saved(energy[strategy], energy["direct"])
             rows.append(
                 {

@@ -3,44 +3,161 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from lcc_rl.commands import evaluation
-from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, root_key
+from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, known_settings, root_key
 from lcc_rl.config import load
-from lcc_rl.config.schemas import PipelineConfig, StudyConfig
-from lcc_rl.data.episodes import read_episodes
-from lcc_rl.data.profiles import leader_profiles
-from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.studies.alcc.settings import (
-    ABLATIONS,
-    CONTROL,
-    DRIVERS,
-    FILTERS,
-    MAIN,
-    OF_DDPG,
-    SMOKE,
-    Change,
-    Study,
-    chosen_ablation,
-    followers_change,
-    followers_study,
+from lcc_rl.config.schemas import PipelineConfig
+from lcc_rl.errors import unknown_name
+from lcc_rl.runs.sweeps import key_of
+from lcc_rl.studies.runner import (
+    EPISODES,
+    FINISHED,
+    BaseStudy,
+    Outcome,
+    Run,
+    differences,
+    note,
+    note_problems,
+    quoted,
+    run_all,
+    up_to_date,
 )
-from lcc_rl.studies.runner import FINISHED, Outcome, note, note_problems, run_all, up_to_date
 
 log = logging.getLogger("lcc_rl")
 
+DRIVERS = Path("calibration/drivers.parquet")
+ROWS = f"*/seed_*/{EPISODES}"
+PARTS = ("main", "ablations")
+OF_CALIBRATION = ("data", "calibration")  # overrides that only the calibration takes
+# Overrides that the calibration does not take.
+OF_TRAINING = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
+VARIANTS = ("alcc", "reference")
+CONTROL = "own_energy"  # weighs its own energy as much as alcc weighs that of all
+GAMMAS = (0.9, 0.95, 0.99, 0.995)
+RECIPES = ("quickstart", "paper_alcc")  # length and batches of DDPG's training
+SMOKE = "smoke"
+OF_DDPG = ("short_training", *(f"recipe_{name}" for name in RECIPES))
 
-def run(study: Study, parts: Sequence[str] | None = None, command: str = "") -> list[Outcome]:
+
+@dataclass(frozen=True)
+class Change:
+    """The overrides, variants and recipes of one series of trainings."""
+
+    overrides: tuple[str, ...] = ()
+    variants: tuple[str, ...] = VARIANTS
+    recipes: tuple[str, ...] = ()
+
+
+# One profile for training, the usual held-out recordings for evaluation.
+ONE_PROFILE = (
+    "split=single",
+    "split.held_out={_target_: lcc_rl.data.profiles.Split, by: recording, evaluation_share: 0.34}",
+)
+MAIN = Change(variants=(*VARIANTS, CONTROL))
+ABLATIONS = {
+    "no_safety": Change(("reward.terms.safety.weight=0",)),
+    "no_efficiency": Change(("reward.terms.efficiency.weight=0",)),
+    "no_cav_energy": Change(("reward.terms.cav_energy.weight=0",)),
+    "no_hdv_energy": Change(("reward.terms.hdv_energy.weight=0",), ("alcc",)),
+    "true_acceleration": Change(("reward.terms.hdv_energy.power=vehicles.power",), ("alcc",)),
+    "population_mean": Change(("scenario.pieces.estimator.learning_time=null",), ("alcc",)),
+    "no_recuperation": Change(("scenario.pieces.power.recuperation=false",)),
+    "one_training_profile": Change((*ONE_PROFILE, "scenario.pieces.leader.start=first")),
+    "constant_rate": Change(("agent.final_lr_fraction=1.0",)),
+    "short_training": Change(("training.episodes=320",)),
+    **{f"recipe_{name}": Change(recipes=(name,)) for name in RECIPES},
+    **{f"gamma_{gamma:g}": Change((f"agent.gamma={gamma:g}",)) for gamma in GAMMAS},
+}
+
+
+def chosen_ablation(item: str) -> tuple[str, Change]:
+    """Return the name and the change of an item of ``--ablations``: a name or ``name:override``."""
+    name, _, override = item.partition(":")
+    if override:
+        return name, Change((override,))
+    if name not in ABLATIONS:
+        raise unknown_name("ablation", name, ABLATIONS)
+    return name, ABLATIONS[name]
+
+
+def chooses_agent(overrides: Iterable[str]) -> bool:
+    """Whether overrides choose an agent other than the recipe's."""
+    return any(key_of(item) == "agent" for item in overrides)
+
+
+@dataclass(frozen=True)
+class Study(BaseStudy):
+    """The settings of the ALCC study.
+
+    Attributes:
+        ablations: names of :data:`ABLATIONS` or further ones as ``name:override``, e.g.
+            ``early:reward.terms.safety.threshold=6``; None for all.
+    """
+
+    recipe: str | None = "paper_alcc"
+    ablations: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for item in self.ablations or ():
+            chosen_ablation(item)
+
+    def settings(
+        self, entry: str, variant: str, *own: str, recipes: Sequence[str] = ()
+    ) -> list[str]:
+        """Return the overrides of a run: recipe, the study's inputs, the user's, its own."""
+        given = {root_key(item) for item in self.overrides}
+        data = f"data.path={quoted(self.folder / TRAJECTORIES)}"
+        drivers = f"drivers.path={quoted(self.folder / DRIVERS)}"
+        shared = [
+            item
+            for item in self.overrides
+            if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
+        ]
+        return [
+            f"experiment=[{','.join([*filter(None, [self.recipe]), *recipes])}]",
+            f"variant={variant}",
+            "data=episodes",
+            data,
+            *(() if "drivers" in given else ("drivers=calibrated", drivers)),
+            *known_settings(shared, entry),
+            *own,
+        ]
+
+    def runs(self, folder: Path, change: Change, seeds: Iterable[int] | None = None) -> list[Run]:
+        """Return a training per seed and variant, all variants of a seed first."""
+        numbers = range(self.seeds) if seeds is None else seeds
+        own, recipes = change.overrides, change.recipes
+        return [
+            Run(
+                folder / variant / f"seed_{seed}",
+                tuple(self.settings("train", variant, f"seed={seed}", *own, recipes=recipes)),
+            )
+            for seed in numbers
+            for variant in change.variants
+        ]
+
+    def earlier(self, folder: Path, change: Change) -> list[Outcome]:
+        """Return finished trainings of further seeds with the same settings."""
+        found = {int(path.parent.name.removeprefix("seed_")) for path in folder.glob(ROWS)}
+        runs = self.runs(folder, change, sorted(found - set(range(self.seeds))))
+        return [
+            Outcome(run, FINISHED)
+            for run in runs
+            if run.finished and not differences(run, run.compose(), self.accept)
+        ]
+
+
+def run(study: Study, parts: Sequence[str] = PARTS, command: str = "") -> list[Outcome]:
     """Calibrate, train and evaluate; finished runs are skipped.
 
     Args:
         study: the settings.
-        parts: names of :data:`PARTS`; all by default. ``filter`` trains what ``main`` trains.
+        parts: some of :data:`PARTS`.
         command: the command line, stored in the folder's notes.
 
     Returns:
@@ -49,148 +166,57 @@ def run(study: Study, parts: Sequence[str] | None = None, command: str = "") -> 
     Raises:
         LccError: one clear error for wrong settings, data or files.
     """
-    parts = list(PARTS) if parts is None else parts
-    wanted = check(study, parts)
+    series = _series(study, parts)
+    for folder, change in series.items():  # before any work
+        study.runs(folder, change)[0].compose()
+    calibration = _calibration(study)
     if command:
         note(study.folder, "alcc", command)
-    calibrate(study)
-    outcomes: dict[Path, Outcome] = {}  # main and filter share their trainings
-    for name, part in PARTS.items():
-        if name in parts:
-            outcomes |= {outcome.run.folder: outcome for outcome in part(study, wanted)}
-    note_problems(study.folder, list(outcomes.values()))
-    return list(outcomes.values())
+    if not ((study.folder / DRIVERS).exists() and (study.folder / TRAJECTORIES).exists()):
+        calibrate_once(calibration, study.folder)
+    outcomes = []
+    for folder, change in series.items():
+        trained = run_all(study.runs(folder, change), study.jobs, study.accept)
+        settings = study.settings("evaluate", "alcc", *change.overrides, recipes=change.recipes)
+        evaluated = study.folder if change is MAIN else folder
+        found = trained + study.earlier(folder, change)
+        _evaluate(settings, found, evaluated / "evaluation")
+        outcomes += trained
+    note_problems(study.folder, outcomes)
+    return outcomes
 
 
-def check(study: Study, parts: Sequence[str]) -> StudyConfig:
-    """Check settings before any work, and return the configuration of a main training."""
+def _series(study: Study, parts: Sequence[str]) -> dict[Path, Change]:
+    """Return the series of trainings of the parts by their folders."""
     for part in parts:
         if part not in PARTS:
             raise unknown_name("part", part, PARTS)
-    _calibration(study)
-    wanted = study.runs(study.folder / "train")[0].compose()
-    if "filter" in parts and any(root_key(item) == "filter" for item in study.overrides):
-        raise ConfigError(
-            "the part filter puts +filter=cbf on trained policies: give the override "
-            "or that part (--parts), not both"
-        )
-    if "followers" in parts:
-        change = followers_change(study.overrides, 1)
-        followers_study(study).runs(study.folder, change)[0].compose()
+    found = {study.folder / "train": MAIN} if "main" in parts else {}
     if "ablations" in parts:
-        for _, change in map(chosen_ablation, study.ablations or ()):
-            study.runs(study.folder, change)[0].compose()
-    return wanted
-
-
-def calibrate(study: Study) -> None:
-    """Read the trajectories and calibrate drivers in both modes, unless that is done."""
-    if (study.folder / DRIVERS).exists() and (study.folder / TRAJECTORIES).exists():
-        return
-    calibrate_once(_calibration(study), study.folder)
+        # Ablations that change nothing are left out, and of short runs those that train long.
+        gamma = study.runs(study.folder, MAIN)[0].compose().agent["gamma"]
+        left_out = {f"gamma_{gamma:g}", f"recipe_{study.recipe}"}
+        if study.recipe in (None, SMOKE):
+            left_out |= set(OF_DDPG)
+        chosen = study.ablations or tuple(name for name in ABLATIONS if name not in left_out)
+        ablations = map(chosen_ablation, chosen)
+        found |= {study.folder / "ablations" / name: change for name, change in ablations}
+    return found
 
 
 def _calibration(study: Study) -> PipelineConfig:
-    skipped = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
-    own = [item for item in study.overrides if root_key(item) not in skipped]
+    own = [item for item in study.overrides if root_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["calibration=both", *own])
     return cfg
 
 
-def _main(study: Study, wanted: StudyConfig) -> list[Outcome]:
-    outcomes, usable = _trained(study)
-    evaluate_all(study.settings("evaluate", "alcc"), usable, study.folder / "evaluation")
-    return outcomes
-
-
-def _trained(study: Study) -> tuple[list[Outcome], list[Outcome]]:
-    """Train the main part; return its outcomes, and those with seeds of earlier commands."""
-    folder = study.folder / "train"
-    outcomes = run_all(study.runs(folder, MAIN), study.jobs, study.accept)
-    return outcomes, outcomes + study.earlier(folder, MAIN)
-
-
-def _filter(study: Study, wanted: StudyConfig) -> list[Outcome]:
-    """Put the filter on the policies of the main part, with several settings."""
-    outcomes, usable = _trained(study)
-    # The variant cbf, the filter without a policy, is evaluated too; it learns nothing.
-    kept = [item for item in study.overrides if root_key(item) not in ("agent", "training")]
-    alone = replace(study, overrides=tuple(kept))
-    for speed in FILTERS:
-        own = f"scenario.filters.automated.full_speed={speed}"
-        folder = study.folder / "filter" / f"full_speed_{speed}" / "evaluation"
-        evaluate_all(alone.settings("evaluate", "cbf", own), usable, folder, own=True)
-    return outcomes
-
-
-def _ablations(study: Study, wanted: StudyConfig) -> list[Outcome]:
-    # Ablations that change nothing are left out, and of short runs those that train long.
-    left_out = {f"gamma_{wanted.agent['gamma']:g}", f"recipe_{study.recipe}"}
-    if study.recipe in (None, SMOKE):
-        left_out |= set(OF_DDPG)
-    chosen = study.ablations or tuple(name for name in ABLATIONS if name not in left_out)
-    folder = study.folder / "ablations"
-    return _each(study, {folder / n: c for n, c in map(chosen_ablation, chosen)})
-
-
-def _single(study: Study, wanted: StudyConfig) -> list[Outcome]:
-    chosen = spread_profiles(study.folder / TRAJECTORIES, wanted, study.profiles)
-    folder, recipes = study.folder / "single", ("single_profile",)
-    return _each(
-        study,
-        {folder / str(n): Change((f"split.profile={n}",), recipes=recipes) for n in chosen},
-    )
-
-
-def _followers(study: Study, wanted: StudyConfig) -> list[Outcome]:
-    changes = {
-        study.folder / "followers" / str(number): followers_change(study.overrides, number)
-        for number in sorted(set(study.followers))
-    }
-    first, *others = changes
-    # The training of the reference does not depend on the number of followers.
-    for folder in others:
-        changes[folder] = replace(changes[folder], variants=("alcc", CONTROL))
-    return _each(followers_study(study), changes, shared=first / "reference")
-
-
-def _each(
-    study: Study, changes: Mapping[Path, Change], shared: Path | None = None
-) -> list[Outcome]:
-    """Train and evaluate every change in its folder.
-
-    Every evaluation includes the variant in the folder ``shared``.
-    """
-    runs = [run for folder, change in changes.items() for run in study.runs(folder, change)]
-    outcomes = run_all(runs, study.jobs, study.accept)
-    found = outcomes + [x for item in changes.items() for x in study.earlier(*item)]
-    for folder, change in changes.items():
-        of_it = [x for x in found if {folder, shared} & set(x.run.folder.parents)]
-        own = (*change.overrides, *change.evaluation)
-        settings = study.settings("evaluate", "alcc", *own, recipes=change.recipes)
-        evaluate_all(settings, of_it, folder / "evaluation")
-    return outcomes
-
-
-def spread_profiles(table: Path, cfg: StudyConfig, count: int) -> list[int]:
-    """Choose profiles for the single-profile protocol, spread evenly over all of them."""
-    scenario = cfg.scenario
-    profiles = leader_profiles(read_episodes(table), scenario.time_step).at_least(scenario.horizon)
-    # Midpoints of equal parts: one profile is the middle one, more never cluster at the ends.
-    places = (np.arange(min(count, len(profiles))) + 0.5) / min(count, len(profiles))
-    return [int(place * len(profiles)) for place in places]
-
-
-def evaluate_all(
-    settings: Sequence[str], outcomes: Sequence[Outcome], folder: Path, own: bool = False
-) -> None:
+def _evaluate(settings: Sequence[str], outcomes: Sequence[Outcome], folder: Path) -> None:
     """Evaluate every finished policy beside the human baselines, unless that is done.
 
     Args:
         settings: overrides of the entry point ``evaluate``.
         outcomes: trainings in ``<variant>/seed_<n>``; those that did not finish are left out.
         folder: folder of the evaluation.
-        own: evaluate the variant of the settings, too.
     """
     runs = sorted(
         (outcome.run.folder for outcome in outcomes if outcome.status == FINISHED),
@@ -203,13 +229,4 @@ def evaluate_all(
     cfg.compare = [str(path) for path in runs]
     if not up_to_date(cfg, folder, runs):
         log.info("evaluating %d policies into %s", len(runs), folder)
-        evaluation.run(cfg, folder, own=own, quiet=True, replace=True)
-
-
-PARTS = {
-    "main": _main,
-    "filter": _filter,
-    "ablations": _ablations,
-    "single": _single,
-    "followers": _followers,
-}
+        evaluation.run(cfg, folder, own=False, quiet=True, replace=True)

@@ -1,7 +1,7 @@
 """Tables of energy, safety and learning in the ALCC study, with 95 % intervals.
 
-Their arguments are rows of evaluations, every strategy on the same profiles and drivers. Intervals
-of savings are over windows and seeds, all others over seeds only.
+Their arguments are windows of :class:`lcc_rl.results.means.Means`, every strategy on the same
+windows and drivers. Intervals of savings are over windows and seeds, all others over seeds only.
 """
 
 from __future__ import annotations
@@ -16,12 +16,9 @@ from lcc_rl.results.savings import (
     KINDS,
     NOTHING,
     UNTRAINED,
-    paired,
     per_seed,
-    per_window,
     savings,
     stratified,
-    worse_off,
 )
 
 PATH = "total_path_energy_kj"
@@ -36,14 +33,14 @@ SHARES = {
 LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # share of time [%], for every seed
 
 
-def energies(episodes: pd.DataFrame) -> pd.DataFrame:
+def energies(windows: pd.DataFrame) -> pd.DataFrame:
     """Mean energies of every strategy [kJ].
 
     Path energy of both vehicles and energy as drawn, the path's parts at constant speed and lost
     by accelerating, and what CAV and HDV draw.
     """
     rows = []
-    for strategy, part in episodes.groupby("strategy", sort=False):
+    for strategy, part in windows.groupby("strategy", sort=False):
         row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
         for column in (f"total_{name}" for name in KINDS.values()):
             row |= mean(part.groupby("training_seed", dropna=False)[column].mean()).columns(column)
@@ -53,42 +50,39 @@ def energies(episodes: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def headline(episodes: pd.DataFrame) -> pd.DataFrame:
+def headline(windows: pd.DataFrame) -> pd.DataFrame:
     """Savings of the total energy, of its path and as drawn, by trained strategy and baseline.
 
-    The share saved [%], that of the worst seed, and the (window, driver) pairs whose path takes
-    more [%].
+    The share saved [%] and that of the worst seed.
     """
     columns = [f"total_{column}" for column in KINDS.values()]
-    windows, path = per_window(episodes, columns), paired(episodes, columns[0])
     seeds = {column: per_seed(windows, column) for column in columns}
     rows = []
     for strategy in (name for name in seeds[columns[0]] if name not in UNTRAINED):
         for baseline in (x for x in COMPARED if x in seeds[columns[0]] and x != strategy):
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
-            row["seeds"] = _seeds(episodes[episodes["strategy"] == strategy])
+            row["seeds"] = _seeds(windows[windows["strategy"] == strategy])
             for kind, column in zip(KINDS, columns, strict=True):
                 share = savings(windows, column, strategy, baseline)
                 row |= share.columns(f"{kind}saving_pct", 100.0)
                 worst = share_saved(seeds[column][strategy].max(), seeds[column][baseline].mean())
                 row[f"worst_seed_{kind}saving_pct"] = 100.0 * worst
-            row["pairs_worse_off_pct"] = 100.0 * worse_off(path, strategy, baseline)["pairs"]
             rows.append(row)
     return pd.DataFrame(rows)
 
 
-def strata(episodes: pd.DataFrame) -> pd.DataFrame:
+def strata(windows: pd.DataFrame) -> pd.DataFrame:
     """Savings of path energy in the terciles of windows by what their leader does.
 
     Rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained strategy
     without it, against each baseline.
     """
-    names = [name for name in per_seed(episodes, PATH) if name not in UNTRAINED]
+    names = [name for name in per_seed(windows, PATH) if name not in UNTRAINED]
     parts = [
-        stratified(episodes, PATH, name, baseline).assign(strategy=name, against=baseline)
+        stratified(windows, PATH, name, baseline).assign(strategy=name, against=baseline)
         for name in (["alcc"] if "alcc" in names else names)
         for baseline in COMPARED
-        if baseline != name and (episodes["strategy"] == baseline).any()
+        if baseline != name and (windows["strategy"] == baseline).any()
     ]
     table = pd.concat(parts, ignore_index=True)
     table["by"] = table["by"].map(heading)
@@ -100,7 +94,7 @@ def _seeds(rows: pd.DataFrame) -> str:
     return str(rows["training_seed"].nunique() or MISSING)
 
 
-def constraints(episodes: pd.DataFrame) -> pd.DataFrame:
+def constraints(windows: pd.DataFrame) -> pd.DataFrame:
     """Safety and efficiency of every strategy with a controlled car.
 
     Collisions in all episodes; shares of time with TTC < 4 s and time gap > 2.5 s [%] in the mean
@@ -108,25 +102,25 @@ def constraints(episodes: pd.DataFrame) -> pd.DataFrame:
     whether every seed is within :data:`LIMITS`.
     """
     rows = []
-    for strategy in per_seed(episodes, "total_energy_kj"):
-        part = episodes[episodes["strategy"] == strategy]
+    for strategy in per_seed(windows, "total_energy_kj"):
+        part = windows[windows["strategy"] == strategy]
         row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
-        row |= {"episodes": len(part), "collisions": int(part["collided"].sum())}
+        row |= {name: int(part[name].sum()) for name in ("episodes", "collisions")}
         kept = not row["collisions"]
         for name, column in SHARES.items():
             values = 100.0 * part.groupby("training_seed", dropna=False)[column].mean()
             row[f"mean_{name}"], row[f"worst_seed_{name}"] = values.mean(), values.max()
-            row[f"worst_episode_{name}"] = 100.0 * part[column].max()
+            row[f"worst_episode_{name}"] = 100.0 * part[f"worst_{column}"].max()
             kept = kept and values.max() <= LIMITS.get(name, np.inf)
         row["least_ttc_s"], row["least_gap_m"] = part["min_ttc_s"].min(), part["min_gap_m"].min()
         rows.append(row | {"within_limits": bool(kept)})
     return pd.DataFrame(rows)
 
 
-def constraints_by_seed(episodes: pd.DataFrame) -> pd.DataFrame:
+def constraints_by_seed(windows: pd.DataFrame) -> pd.DataFrame:
     """The shares of :func:`constraints` for every trained seed, one row each."""
-    groups = episodes.groupby(["strategy", "training_seed"], sort=True)
-    table = groups[["total_energy_kj"]].mean().assign(collisions=groups["collided"].sum())
+    groups = windows.groupby(["strategy", "training_seed"], sort=True)
+    table = groups[["total_energy_kj"]].mean().assign(collisions=groups["collisions"].sum())
     for name, column in SHARES.items():
         table[name] = 100.0 * groups[column].mean()
     table["least_ttc_s"] = groups["min_ttc_s"].min()
@@ -163,34 +157,36 @@ def learning(training: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
+def comparison(windows: pd.DataFrame) -> pd.DataFrame:
     """Compare each change of the study with the baselines of its own scenario.
 
     Args:
-        episodes: rows of the evaluations.
-        by: the column that names the change.
+        windows: of the evaluations, with the column ``ablation``, which names the change.
 
     Returns:
         One row per change and trained strategy: path energy [kJ], its savings against each of
         :data:`COMPARED` [%], energy as drawn [kJ], collisions, shares of time [%], and RMS jerk
         [m/s³]; path energy and jerk also of the worst seed.
     """
-    baselines = [name for name in COMPARED if (episodes["strategy"] == name).any()]
+    baselines = [name for name in COMPARED if (windows["strategy"] == name).any()]
     rows = []
-    for change, part in episodes.groupby(by, sort=False):
-        windows = per_window(part, [PATH, "total_energy_kj", *SHARES.values(), "rms_jerk_mps3"])
-        learned = {x: y for x, y in per_seed(windows, PATH).items() if x not in UNTRAINED}
+    for change, part in windows.groupby("ablation", sort=False):
+        learned = {x: y for x, y in per_seed(part, PATH).items() if x not in UNTRAINED}
         for strategy, energy in learned.items():
-            own, inside = (x[x["strategy"] == strategy] for x in (windows, part))
-            row: dict[str, object] = {by: change, "strategy": strategy, "seeds": _seeds(inside)}
+            own = part[part["strategy"] == strategy]
+            row: dict[str, object] = {
+                "ablation": change,
+                "strategy": strategy,
+                "seeds": _seeds(own),
+            }
             row |= mean(energy).columns("path_energy_kj")
             row["worst_seed_path_energy_kj"] = energy.max()
             for baseline in baselines:
                 known = baseline != strategy
-                found = savings(windows, PATH, strategy, baseline) if known else NOTHING
+                found = savings(part, PATH, strategy, baseline) if known else NOTHING
                 row |= found.columns(f"path_saving_against_{baseline}_pct", 100.0)
             row["total_energy_kj"] = own["total_energy_kj"].mean()
-            row["collisions"] = int(inside["collided"].sum())
+            row["collisions"] = int(own["collisions"].sum())
             for name, column in SHARES.items():
                 row |= mean(per_seed(own, column)[strategy]).columns(name, 100.0)
             jerk = per_seed(own, "rms_jerk_mps3")[strategy]
@@ -199,25 +195,23 @@ def comparison(episodes: pd.DataFrame, by: str = "ablation") -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def single_profile(episodes: pd.DataFrame) -> pd.DataFrame:
-    """One profile for both training and evaluation, one row per ``study_profile``.
+def series(windows: pd.DataFrame) -> pd.DataFrame:
+    """Savings of the total energy as drawn, the paper's measure, by the series of trainings.
 
-    Total energy as drawn [kJ], the paper's measure, of ``idm``, ``reference`` and ``alcc``, the
-    saving of ``alcc`` against both, also of path energy [%], and how many seeds beat the human.
+    Args:
+        windows: of the evaluations, with the column ``ablation``, the series' name.
+
+    Returns:
+        One row per series: its trainings of ``alcc``, the share that they save against the
+        reference and against ``idm``, and the control ``own_energy`` against the reference [%].
     """
     rows = []
-    for profile, part in episodes.groupby("study_profile", sort=True):
-        energy = per_seed(part, "total_energy_kj")
-        human, seeds = energy["idm"].mean(), _seeds(part[part["strategy"] == "alcc"])
-        row: dict[str, object] = {"profile": str(profile), "seeds": seeds, "idm_energy_kj": human}
-        for strategy in (name for name in ("reference", "alcc") if name in energy):
-            row |= mean(energy[strategy]).columns(f"{strategy}_energy_kj")
-            better = int((energy[strategy] < human).sum())
-            row[f"{strategy}_seeds_below_idm"] = f"{better} of {len(energy[strategy])}"
-        for baseline in ("reference", "idm"):
-            for kind, column in KINDS.items():
-                found = savings(part, f"total_{column}", "alcc", baseline)
-                row |= found.columns(f"alcc_{kind}saving_against_{baseline}_pct", 100.0)
-        row["collisions"] = int(part.loc[part["training_seed"].notna(), "collided"].sum())
+    for name, part in windows.groupby("ablation", sort=False):
+        seeds = _seeds(part[part["strategy"] == "alcc"])
+        row: dict[str, object] = {"training": name, "seeds": seeds}
+        compared = (("alcc", "reference"), ("alcc", "idm"), ("own_energy", "reference"))
+        for strategy, baseline in compared:
+            found = savings(part, "total_energy_kj", strategy, baseline)
+            row |= found.columns(f"{strategy}_against_{baseline}_pct", 100.0)
         rows.append(row)
     return pd.DataFrame(rows)

@@ -1,0 +1,72 @@
+"""Means of an evaluation per window and per driver: what a study's tables and figures need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import pandas as pd
+
+from lcc_rl.io.files import read_parquet, write_parquet
+
+EPISODES = "episodes.parquet"
+WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
+TRAINED = ["strategy", "training_seed"]
+NUMBERS = ("profile_id", "driver_id", "training_seed")  # name a thing, measure none
+ENDS = {"min": "min", "max": "max", "worst": "max"}  # first word of a column → not its mean
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over the episodes of an evaluation in which all windows have the same drivers.
+
+    Of columns that begin with ``min_`` and ``max_`` these are the least and the largest value.
+
+    Args:
+        windows: a row per strategy, training seed and window, with ``episodes``, their number,
+            ``collisions``, and ``worst_share_…``, the largest share of an episode.
+        drivers: energies, a row per strategy and driver: means over windows and seeds.
+    """
+
+    windows: pd.DataFrame
+    drivers: pd.DataFrame
+
+    @classmethod
+    def of(cls, rows: pd.DataFrame) -> Self:
+        """Return the means of the rows of episodes.parquet."""
+        collided = rows["collided"].astype("float32")
+        worst = {f"worst_{name}": rows[name] for name in rows if str(name).startswith("share_")}
+        rows = rows.assign(episodes=1, collisions=collided, collided=collided, **worst)
+        measures = [str(name) for name in rows.select_dtypes("number") if name not in NUMBERS]
+        how = {name: ENDS.get(name.partition("_")[0], "mean") for name in measures}
+        how |= {"episodes": "sum", "collisions": "sum"}
+        keys = [*TRAINED, "profile_id", "profile"]
+        keys += [name for name in ("source",) if name in rows]
+        windows = rows.groupby(keys, dropna=False, as_index=False, observed=True, sort=False)
+        energies = [name for name in measures if name.endswith("energy_kj")]
+        drivers = rows.groupby(["strategy", "driver_id"], as_index=False, sort=False)[energies]
+        return cls(windows.agg(how), drivers.mean())
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Return the means of an evaluation: as kept in its folder, else of its episodes."""
+        if (folder / WINDOWS).exists():
+            return cls(read_parquet(folder / WINDOWS), read_parquet(folder / DRIVERS))
+        return cls.of(read_parquet(folder / EPISODES))
+
+    def write(self, folder: Path) -> None:
+        """Write both tables into a folder, with numbers of single precision and six decimals."""
+        for table, name in ((self.windows, WINDOWS), (self.drivers, DRIVERS)):
+            numbers = table.select_dtypes("float").columns
+            small = table.astype(dict.fromkeys(numbers, "float32")).round(6)
+            write_parquet(small, folder / name)
+
+    def assign(self, **columns: str | int) -> Self:
+        """Return the means with further columns of the windows."""
+        return type(self)(self.windows.assign(**columns), self.drivers)
+
+    def size(self) -> str:
+        """Return the number of windows and drivers, in words."""
+        windows = self.windows["profile_id"].nunique()
+        return f"{windows} held-out profiles × {self.drivers['driver_id'].nunique()} drivers"

@@ -1,0 +1,298 @@
+"""Calibration: right errors, known drivers recovered, real drivers fitted, bad tables refused."""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from helpers import slow_but
+
+from lcc_rl.drivers import kernel
+from lcc_rl.drivers.calibrator import Calibration, Calibrator, Constants
+from lcc_rl.drivers.fit_error import FitError
+from lcc_rl.drivers.genetic import GeneticSettings
+from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, fitted
+from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.functional.idm import simulate_follower
+from lcc_rl.functional.laws import LAWS
+
+QUICK = GeneticSettings(population=8, generations=2, founders=1)
+THOROUGH = GeneticSettings(population=128, generations=150, patience=20)
+EACH = pytest.mark.parametrize("model", list(LAWS))
+KNOWN: dict[str, dict[str, float]] = {
+    "idm": {"acceleration": 1.8, "deceleration": 2.5, "min_gap": 3.0},
+    "ovm": {"sensitivity": 2.2, "form": 0.8, "min_gap": 3.0},
+    "fvdm": {"sensitivity": 0.6, "form": 1.0, "min_gap": 3.0, "speed_gain": 0.8},
+    "gipps": {
+        "acceleration": 1.4,
+        "deceleration": 2.5,
+        "leader_deceleration": 2.8,
+        "min_gap": 3.0,
+    },
+}
+
+
+def fit(episodes: Any, mode: str = "local", seed: int = 0, **settings: Any) -> Calibration:
+    return Calibrator(modes=[mode], **settings)(episodes, seed=seed)
+
+
+def quick(episodes: Any, **settings: Any) -> Calibration:
+    return fit(episodes, local_genetic=QUICK, **settings)
+
+
+def random_candidates(model: str, *shape: int) -> torch.Tensor:
+    """Parameters of a model within the bounds, ``[*shape, names]``."""
+    names = fitted("global", model)
+    low, high = torch.tensor([DEFAULT_BOUNDS[name] for name in names]).double().unbind(-1)
+    share = torch.rand(*shape, len(names), generator=torch.Generator().manual_seed(1)).double()
+    return low + share * (high - low)
+
+
+def reference_measures(observed, candidates, model, constants) -> dict[str, torch.Tensor]:
+    """The definitions, episode by episode, with the plain simulation."""
+    law, names = LAWS[model], fitted("global", model)
+    found = {
+        name: torch.zeros(candidates.shape[:2]).double()
+        for name in ("speed_rmspe", "gap_rmse", "gap_nrmse")
+    }
+    for row, samples in enumerate(observed.samples):
+        truth, gaps = observed.follower_speed[:samples, row], observed.gaps[:samples, row]
+        for column, values in enumerate(candidates[row]):
+            own = dict(zip(names, values, strict=True))
+            speed, gap, _ = simulate_follower(
+                observed.leader_speed[:samples, row],
+                *(truth[0], gaps[0], own.pop("desired_speed"), own.pop("time_gap")),
+                constants.with_(**own),
+                observed.time_step,
+                law=law,
+            )
+            off, apart = (speed - truth).square(), (gap - gaps).square()
+            found["speed_rmspe"][row, column] = (off.sum() / truth.square().sum()).sqrt()
+            found["gap_rmse"][row, column] = apart.mean().sqrt()
+            found["gap_nrmse"][row, column] = (apart.sum() / gaps.square().sum()).sqrt()
+    return found
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(("model", "more"), [*((x, {}) for x in LAWS), ("idm", {"exponent": 2.5})])
+def test_errors_are_those_of_the_plain_simulation(model, more, compiled, uneven_lengths):
+    observed, names = observe(uneven_lengths), fitted("global", model)
+    constants, candidates = LAWS[model].constants(**more), random_candidates(model, 3, 6)
+    expected = reference_measures(observed, candidates, model, constants)
+    expected["both"] = expected["speed_rmspe"] + expected["gap_nrmse"]
+    for objective, values in expected.items():
+        error = FitError(observed, constants, names, model, objective)
+        error.compiled = compiled
+        torch.testing.assert_close(error(candidates), values, rtol=1e-9, atol=1e-9)
+
+
+def test_a_cache_that_cannot_be_read_costs_a_compilation_and_no_result(
+    uneven_lengths, monkeypatch, caplog
+):
+    def damaged(*arguments):
+        raise EOFError("Ran out of input")
+
+    def njit(cache=False, **how):
+        return (lambda function: damaged) if cache else numba_njit(**how)
+
+    numba_njit = kernel.numba.njit
+    observed, candidates = observe(uneven_lengths), random_candidates("idm", 3, 6)
+    error = FitError(observed, LAWS["idm"].constants(), fitted("global", "idm"))
+    expected = error(candidates)
+    monkeypatch.setattr(kernel.numba, "njit", njit)
+    monkeypatch.setattr(kernel, "compiled", cache(kernel.compiled.__wrapped__))
+    with caplog.at_level("INFO", logger="lcc_rl"):
+        for _ in range(2):
+            assert torch.equal(error(candidates), expected)
+    assert caplog.text.count("for this run only") == 1
+
+
+@EACH
+def test_both_simulations_agree_in_single_precision_and_on_what_is_no_number(model, uneven_lengths):
+    observed = observe(uneven_lengths).to("cpu", torch.float32)
+    names, candidates = fitted("global", model), random_candidates(model, 3, 300).float()
+    for at in range(len(names)):
+        candidates[1, at, at] = np.nan
+    found = []
+    for compiled in (True, False):
+        error = FitError(observed, LAWS[model].constants(), names, model)
+        error.compiled = compiled
+        found.append(error(candidates))
+    torch.testing.assert_close(*found, rtol=1e-3, atol=1e-4, equal_nan=True)
+    lost = torch.zeros(found[0].shape, dtype=torch.bool)
+    lost[1, : len(names)] = True
+    assert torch.equal(found[0].isnan(), lost)
+
+
+@EACH
+def test_known_drivers_are_recovered(model, known_drivers, make_episodes):
+    speeds, gaps = (known_drivers[name].tolist()[:8] for name in ("desired_speed", "time_gap"))
+    episodes = make_episodes(speeds, gaps, LAWS[model].constants(**KNOWN[model]), model=model)
+    local = fit(episodes, constants=KNOWN[model], model=model, objective="gap_rmse").drivers
+    assert (local["desired_speed_mps"] / speeds - 1.0).abs().median() < 0.01
+    assert (local["time_gap_s"] / gaps - 1.0).abs().median() < 0.01
+    assert local["rmspe"].max() < 0.01
+    assert not local["desired_speed_at_bound"].any()
+
+
+@pytest.mark.parametrize("model", slow_but(["fvdm"], LAWS))
+def test_all_parameters_of_known_drivers_are_recovered(model, known_drivers, make_episodes):
+    speeds, gaps = (known_drivers[name].tolist()[:8] for name in ("desired_speed", "time_gap"))
+    episodes = make_episodes(speeds, gaps, LAWS[model].constants(**KNOWN[model]), model=model)
+    free = fit(episodes, "global", model=model, global_genetic=THOROUGH).drivers
+    assert free["rmspe"].median() < 0.001
+    assert (free["time_gap_s"] / gaps - 1.0).abs().median() < 0.05
+
+
+@pytest.mark.parametrize("model", ["idm", "fvdm"])
+def test_constants_are_chosen_over_all_drivers(model, make_episodes):
+    known = LAWS[model].constants(**KNOWN[model])
+    episodes = make_episodes([20.0, 25.0, 30.0], [1.0, 1.4, 1.8], known, [20.0] * 3, model)
+    given = fit(episodes, model=model)
+    chosen = fit(episodes, model=model, choose_constants=True)
+    assert chosen.drivers["rmspe"].mean() < 0.5 * given.drivers["rmspe"].mean()
+    for name in LAWS[model].shared:
+        assert chosen.drivers[COLUMNS[name]].nunique() == 1
+    assert any("constants chosen" in line for line in chosen.report)
+
+
+def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
+    both = Calibrator(modes=["local", "global"], local_genetic=QUICK, global_genetic=QUICK)
+    seen: list[tuple[int, int]] = []
+    drivers = both(uneven_lengths, progress=lambda *state: seen.append(state[:2])).drivers
+    assert drivers["mode"].tolist() == ["local"] * 3 + ["global"] * 3
+    assert drivers["episode"].tolist() == [0, 1, 2] * 2
+    assert drivers["follower_id"].tolist() == [100, 101, 102] * 2
+    assert drivers["samples"].tolist() == [238, 401, 315] * 2
+    assert drivers.columns.tolist() == [
+        *("episode", "recording", "follower_id", "leader_id"),
+        *(COLUMNS[name] for name in fitted("global")),
+        *("rmspe", "gap_rmse_m", "gap_nrmse", "samples"),
+        *(f"{name}_at_bound" for name in fitted("global")),
+        *("mode", "model"),
+    ]
+    assert seen == [(1, 2), (2, 2)] * 2
+    renamed = uneven_lengths.rename(columns={"episode": "event", "recording": "period"})
+    pd.testing.assert_frame_equal(both(renamed).drivers, drivers)
+
+
+def test_equal_seeds_give_equal_drivers_and_none_depends_on_the_others(uneven_lengths):
+    first, again, other = (quick(uneven_lengths, seed=seed).drivers for seed in (3, 3, 4))
+    pd.testing.assert_frame_equal(first, again)
+    assert not first.equals(other)
+    alone = quick(uneven_lengths[uneven_lengths["episode"] == 2], seed=3).drivers
+    pd.testing.assert_series_equal(alone.iloc[0], first.iloc[2], check_names=False)
+
+
+def test_a_driver_who_never_drives_freely_is_flagged(make_episodes):
+    episodes = make_episodes([35.0, 20.0], [1.2, 1.2])
+    drivers = fit(episodes, bounds={"desired_speed": [5.0, 30.0]}).drivers
+    assert drivers["desired_speed_at_bound"].tolist() == [True, False]
+    assert not drivers[["acceleration_at_bound", "min_gap_at_bound"]].any(axis=None)
+
+
+def test_unfit_episodes_are_dropped_and_counted(make_episodes):
+    episodes = make_episodes([20.0] * 6, [1.0] * 6, seconds=[20.0] * 5 + [5.0])
+    at = {number: episodes.index[episodes["episode"] == number] for number in range(6)}
+    episodes.loc[at[1][50], "gap_m"] = 0.5
+    episodes.loc[at[2][50], "follower_speed_mps"] = np.nan
+    episodes.loc[at[3], ["follower_speed_mps", "leader_speed_mps"]] = 0.0
+    episodes = episodes.drop(at[4][50:60])
+    result = quick(episodes, selection=Selection(max_duration_s=15.0))
+    assert result.drivers["episode"].tolist() == [0]
+    assert result.drivers["samples"].tolist() == [151]
+    counted = [line for line in result.report if line.startswith("1 of 6 episodes dropped: ")]
+    assert len(counted) == 5
+
+
+def test_episodes_are_cut_where_the_holdout_begins(uneven_lengths):
+    observed = observe(uneven_lengths)
+    first, last = observed.split(0.3)
+    assert (first.samples + last.samples == observed.samples + 1).all()
+    assert last.samples.tolist() == [int(0.3 * n) + 1 for n in observed.samples]
+    for name in ("leader_speed", "follower_speed", "gaps"):
+        whole = getattr(observed, name)
+        for column, samples in enumerate(observed.samples):
+            cut = first.samples[column] - 1
+            head, tail = getattr(first, name)[:, column], getattr(last, name)[:, column]
+            assert torch.equal(head[: cut + 1], whole[: cut + 1, column])
+            assert torch.equal(tail[: samples - cut], whole[cut:samples, column])
+            assert not head[cut + 1 :].any()
+            assert not tail[samples - cut :].any()
+
+
+def test_the_part_held_out_is_predicted_and_has_no_say_in_the_fit(make_episodes):
+    episodes = make_episodes([20.0, 25.0], [1.0, 1.5])
+    whole = fit(episodes, holdout=0.3).drivers
+    # The free drive that tells v0 begins at 40 % of the episode.
+    assert whole["rmspe_out"].max() < 0.02
+    changed = episodes.copy()
+    late = changed.groupby("episode")["time_s"].rank(pct=True) > 0.75
+    changed.loc[late, "follower_speed_mps"] += 1.0
+    other = fit(changed, holdout=0.3).drivers
+    same = ["desired_speed_mps", "time_gap_s", "rmspe", "gap_rmse_m", "samples"]
+    pd.testing.assert_frame_equal(whole[same], other[same])
+    assert (other["rmspe_out"] != whole["rmspe_out"]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.drop(columns="gap_m"), "gap_m"),
+        (lambda table: table.iloc[:0], "no rows"),
+        (lambda table: table.assign(gap_m="x"), "'gap_m' is not numeric"),
+        (lambda table: table.assign(time_s=1.0), "does not advance"),
+        (lambda table: table.assign(gap_m=0.2), "gap below 1 m"),
+    ],
+)
+def test_bad_tables_end_in_one_clear_error(change, message, uneven_lengths):
+    with pytest.raises(DataError, match=message):
+        quick(change(uneven_lengths))
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"modes": []}, "modes"),
+        ({"model": "krauss"}, "model"),
+        ({"bounds": {"time_gap": [2.0, 1.0]}}, "time_gap"),
+        ({"bounds": {"time_gap": [0.0, 1.0]}}, "time_gap"),
+        ({"model": "ovm", "constants": Constants(acceleration=1.0)}, "acceleration"),
+        ({"selection": {"min_gap_m": -1.0}}, "min_gap_m"),
+        ({"selection": {"max_duration_s": 5.0}}, "max_duration_s"),
+        ({"local_genetic": {"population": 3}}, "population"),
+    ],
+)
+def test_bad_settings_are_named(settings, key):
+    with pytest.raises(ConfigError, match=key):
+        Calibrator(**settings)
+
+
+def test_real_drivers_reach_the_reference_errors(shared_data):
+    observed = observe(pd.read_parquet(shared_data / "i80_pairs.parquet"))
+    assert observed.count == 249
+    start = time.process_time()
+    local = fit(observed).drivers
+    assert time.process_time() - start < 10.0
+    assert local["rmspe"].mean() <= 0.095
+    assert fit(observed, "global").drivers["rmspe"].mean() <= 0.082
+    assert 0.3 < local["desired_speed_at_bound"].mean() < 0.45
+
+
+@pytest.mark.slow
+def test_real_drivers_by_every_model(shared_data):
+    observed = observe(pd.read_parquet(shared_data / "i80_pairs.parquet"))
+    means = {}
+    for model in LAWS:
+        drivers = fit(observed, "global", model=model, objective="gap_rmse", holdout=0.3).drivers
+        means[model] = drivers[["gap_rmse_m", "gap_rmse_m_out"]].mean()
+    assert means["fvdm"]["gap_rmse_m"] < 1.05
+    assert means["fvdm"]["gap_rmse_m_out"] < 3.4
+    assert means["idm"]["gap_rmse_m"] < 1.15
+    assert all(mean["gap_rmse_m_out"] < 4.5 for mean in means.values())
