@@ -233,7 +233,7 @@ def options_exist(source: Path, words: Sequence[str]) -> None:
     given = (word.partition("=")[0] for word in words if word.startswith("--"))
     flags = {flag.replace("--no-", "--") for flag in given}
     assert all(f'"{flag}"' in text for flag in flags - {"--help"}), words
-    typed = [word for word in words if "=" in word and not word.startswith("--")]
+    typed = [word for word in words if re.match(r"[+~]?[\w./@]+=", word)]
     once("train", (*ALWAYS.get(words[0], ()), *typed))
 
 
