@@ -16,7 +16,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import SingleAgent, build_env
 from lcc_rl.envs.clock import reset_options
-from lcc_rl.envs.inputs import constant_profiles, string_of
+from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.single import group_key
 from lcc_rl.envs.step import pieces_of, tick, written
 from lcc_rl.errors import ConfigError
@@ -73,7 +73,7 @@ def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:
     """Yield an environment of every configuration, and its string."""
     population = bootstrap()
     for cfg in configurations():
-        string = string_of(cfg)
+        string = cfg.scenario.vehicles
         scenario = cfg.scenario
         profiles = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
         env = build_env(cfg, profiles, population, batch_size=7)

@@ -17,7 +17,6 @@ from leaderboard import task_scores
 from matplotlib.figure import Figure
 
 from lcc_rl.cli.entry import main_guard
-from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import require
 from lcc_rl.figures.drawing import legend_above, new_figure, save, style
 from lcc_rl.functional.pattern import AUTOMATED
@@ -49,7 +48,7 @@ def scored(run: Path) -> pd.DataFrame:
     cfg, task, _, found = task_scores(run)
     require(task.name in SHOWN, f"{run}: an evaluation of {task.name}, not of {', '.join(SHOWN)}")
     found["strategy"] = found["strategy"].astype(str).replace(cfg.variant, LEARNED)
-    string = string_of(cfg)
+    string = cfg.scenario.vehicles
     found.insert(0, SHARE, string.count(AUTOMATED) / len(string))
     return found
 

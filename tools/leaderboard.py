@@ -23,9 +23,8 @@ from lcc_rl.cli.entry import main_guard
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.commands.tasks import task_of
 from lcc_rl.config.schemas import EvaluateConfig
-from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import string_of
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.envs.step import entries, pieces_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.strategies import Strategy
@@ -80,7 +79,7 @@ def scored(folder: Path) -> tuple[str, pd.DataFrame]:
     strategies, inputs = strategies_of(cfg)
     spent = {}
     for strategy in strategies:
-        if AUTOMATED in string_of(strategy.cfg).names:
+        if AUTOMATED in strategy.cfg.scenario.vehicles.names:
             env = build_env(strategy.cfg, inputs.evaluation, inputs.population, 1, nominal=True)
             spent[strategy.name] = decision_ms(strategy, env)
     table["decision_ms"] = table["strategy"].map(spent)

@@ -19,17 +19,16 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.cli.entry import main_guard
-from lcc_rl.commands.reproduce import REPORTS
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.data.leaders import stretch
-from lcc_rl.envs.inputs import string_of
 from lcc_rl.figures.drawing import in_words, legend_above, new_figure, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
+from lcc_rl.studies.reproduce import REPORTS
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 RING = "tasks/ring_steps.parquet"
@@ -61,7 +60,9 @@ def figure_of_record() -> Figure:
     """Draw the speed record that platoons train on, and their test cases."""
     cfg = load("evaluate", ["variant=cacc"])
     step, used = cfg.scenario.time_step, cfg.leader["training"]["udds"]
-    leaders = build(cfg.leader, "leader").load(step, cfg.scenario.horizon, len(string_of(cfg)))
+    leaders = build(cfg.leader, "leader").load(
+        step, cfg.scenario.horizon, len(cfg.scenario.vehicles)
+    )
     record = stretch(used["path"], step, used["scale"])
     return record_figure(record, used["from_s"], leaders.cases)
 

@@ -17,7 +17,6 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import world_of
-from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
@@ -35,7 +34,7 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     Raises:
         ConfigError: naming the option at fault; if there is none, or nobody for it to drive.
     """
-    string = string_of(cfg)
+    string = cfg.scenario.vehicles
     if not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: it has no agent")
     if not string.count(AUTOMATED):

@@ -20,7 +20,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed
+from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed, root_key
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.runs.interrupts import (
@@ -242,11 +242,6 @@ def _stop(error: Exception) -> NoReturn:
         sys.exit(INTERRUPTED)
     print(f"lcc_rl: error: {text}", file=sys.stderr)
     sys.exit(BAD_INPUT)
-
-
-def root_key(override: str) -> str:
-    """Return the top-level key that an override changes."""
-    return override.lstrip("+~").split("=")[0].split(".")[0].split("@")[0]
 
 
 def run_folder() -> Path:

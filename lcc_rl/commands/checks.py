@@ -17,7 +17,6 @@ from lcc_rl.envs.inputs import (
     build_drivers,
     build_source,
     constant_profiles,
-    string_of,
 )
 from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.errors import ConfigError, require, unknown_name
@@ -177,7 +176,7 @@ def check_variant(cfg: StudyConfig) -> None:
 def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
     """Whether there is somebody to drive, by the same kind of controller as in another one."""
     kinds = [part.scenario.controllers[AUTOMATED].get(TARGET) for part in (cfg, own)]
-    return string_of(cfg).count(AUTOMATED) > 0 and kinds[0] == kinds[1]
+    return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] == kinds[1]
 
 
 def objectives(cfg: TrainConfig) -> list[str]:

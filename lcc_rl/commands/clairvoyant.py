@@ -26,11 +26,10 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from lcc_rl.commands.pipeline import root_key
-from lcc_rl.config import load
+from lcc_rl.config import check_overrides, load
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import load_inputs
-from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
@@ -42,7 +41,6 @@ from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.studies.runner import check_overrides
 
 DRIVERS = 12
 BLOCK = 480  # episodes planned side by side: a few GiB
@@ -87,7 +85,7 @@ def start(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
         ConfigError: if its string has no human drivers.
     """
     policy = load_policy(path, cfg.variant, tuple(cfg.trust))
-    if HUMAN not in string_of(policy[1]).names:
+    if HUMAN not in policy[1].scenario.vehicles.names:
         raise ConfigError(
             f"--policy {path} was trained as variant {policy[1].variant}, which has no human "
             "drivers; expected that of a car with a human behind, such as alcc"
@@ -165,10 +163,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
-    for word in overrides:
-        if root_key(word) in GIVEN:
-            raise ConfigError(f"{word}: the controller is that of --policy, as it was trained")
-    check_overrides(overrides)
+    check_overrides(overrides, GIVEN, "the controller is that of --policy, as it was trained")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     episodes = plan(options, overrides)
     Console().print(as_rich(summary(episodes), "the whole profile known"))

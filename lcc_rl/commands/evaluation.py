@@ -14,8 +14,8 @@ from lcc_rl.commands.checks import check_evaluation, check_installed, check_size
 from lcc_rl.commands.tasks import check_named, only_named, task_of
 from lcc_rl.config import identity
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
-from lcc_rl.energy import build_energy
 from lcc_rl.envs import Inputs, load_inputs
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, Interrupted, unknown_name
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store

@@ -16,10 +16,9 @@ import pandas as pd
 from rich.console import Console
 
 from lcc_rl import results
-from lcc_rl.cli.entry import root_key
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_settings, check_sizes
-from lcc_rl.config import load
+from lcc_rl.config import load, root_key
 from lcc_rl.config.nodes import with_defaults
 from lcc_rl.config.schemas import (
     KINDS,

@@ -8,7 +8,7 @@ from pathlib import Path
 from lcc_rl.agents.factory import learns
 from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
-from lcc_rl.energy import build_energy
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import unknown_name
 from lcc_rl.evaluation.strategies import rules
 from lcc_rl.results.policies import PRETRAINED

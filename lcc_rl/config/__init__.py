@@ -12,16 +12,20 @@ from lcc_rl.config.compose import (
     load,
     parsed,
 )
+from lcc_rl.config.words import check_overrides, key_of, root_key
 
 __all__ = [
     "HYDRA_ERRORS",
     "NOT_IDENTITY",
     "as_meant",
+    "check_overrides",
     "composed",
     "config_hash",
     "explained",
     "identity",
     "is_sweep",
+    "key_of",
     "load",
     "parsed",
+    "root_key",
 ]

@@ -16,6 +16,7 @@ from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.errors import LAST_SEED, ConfigError
+from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
 
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
@@ -63,6 +64,15 @@ class ScenarioConfig(Settings):
     start: Nodes
     filters: Nodes
     pieces: Nodes
+
+    @property
+    def vehicles(self) -> VehicleString:
+        """The string of vehicles that ``string`` and ``road`` describe.
+
+        Raises:
+            ConfigError: pointing at the place in the pattern where it cannot be read.
+        """
+        return parse_string(self.string, self.road)
 
 
 class RewardConfig(Settings):

@@ -2,7 +2,7 @@
 
 from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor
-from lcc_rl.energy.fleet import Fleet, as_fleet, build_energy
+from lcc_rl.energy.fleet import Fleet, as_fleet
 from lcc_rl.energy.fuel import CirclesFuel
 
 __all__ = [
@@ -12,5 +12,4 @@ __all__ = [
     "Fleet",
     "PaperMotor",
     "as_fleet",
-    "build_energy",
 ]

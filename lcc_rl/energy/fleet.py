@@ -8,12 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lcc_rl.config.nodes import build
 from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
 
-MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
 
 
@@ -28,19 +26,14 @@ class Fleet:
 
     def __init__(
         self,
-        models: Mapping[str, EnergyModel | Mapping[str, Any]],
+        models: Mapping[str, EnergyModel],
         shares: Mapping[str, float] | None = None,
         roles: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
         if not models:
             raise ConfigError("energy.models is empty: a mixture needs at least one model")
         self.names = list(models)
-        self.models = [
-            model
-            if isinstance(model, EnergyModel)
-            else build(model, f"energy.models.{name}", EnergyModel)
-            for name, model in models.items()
-        ]
+        self.models = list(models.values())
         shares = dict.fromkeys(self.names, 1.0) if shares is None else shares
         self.shares = self._checked(shares, "energy.shares")
         self.roles = {
@@ -111,11 +104,3 @@ def as_fleet(energy: EnergyModel | Fleet | None) -> Fleet:
     if isinstance(energy, Fleet):
         return energy
     return Fleet({"all": PaperMotor() if energy is None else energy})
-
-
-def build_energy(cfg: Any) -> Fleet:
-    """Build the energy models that the node ``energy`` of a configuration describes.
-
-    Without the node, it is the ALCC paper's.
-    """
-    return as_fleet(cfg.energy and build(cfg.energy, "energy", MEANT))

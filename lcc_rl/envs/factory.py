@@ -14,11 +14,10 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, build
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import build_energy
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.finite import ACTION
-from lcc_rl.envs.inputs import load_inputs, string_of
+from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, unknown_name
@@ -74,7 +73,7 @@ def build_env(
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
-        actions[ACTION] = (string_of(cfg).count(AUTOMATED), 1)
+        actions[ACTION] = (cfg.scenario.vehicles.count(AUTOMATED), 1)
     check_pieces(pieces, scenario.horizon, actions)
     require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
@@ -90,7 +89,7 @@ def world_of(
     """Return what the pieces of a configuration share; arguments as of :func:`build_env`."""
     scenario = cfg.scenario
     return World(
-        string_of(cfg),
+        cfg.scenario.vehicles,
         scenario.time_step,
         scenario.horizon,
         profiles,
@@ -240,7 +239,7 @@ def make_env(
     inputs = load_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)
-    count = string_of(cfg).count(AUTOMATED)
+    count = cfg.scenario.vehicles.count(AUTOMATED)
     if single and count != 1:
         raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
     return env.append_transform(SingleAgent()) if count == 1 and single is not False else env

@@ -18,9 +18,12 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes, find_files
+from lcc_rl.energy import EnergyModel, Fleet, as_fleet
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.functional.pattern import RING, VehicleString, parse_string
+from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
+
+MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
 
 @dataclass(frozen=True)
@@ -57,15 +60,6 @@ class Inputs:
         return self.training
 
 
-def string_of(cfg: StudyConfig) -> VehicleString:
-    """Return the string of vehicles of a configuration.
-
-    Raises:
-        ConfigError: pointing at the place in the pattern where it cannot be read.
-    """
-    return parse_string(cfg.scenario.string, cfg.scenario.road)
-
-
 def build_drivers(cfg: StudyConfig) -> Population:
     """Build the human drivers of a configuration.
 
@@ -74,6 +68,22 @@ def build_drivers(cfg: StudyConfig) -> Population:
     """
     needed = ("desired_speed", "time_gap", "constants")
     return cast(Population, build(cfg.drivers, "drivers", needed))
+
+
+def build_energy(cfg: StudyConfig) -> Fleet:
+    """Build the energy models of a configuration; without the node, that of the ALCC paper.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    node = cfg.energy
+    if node is not None and isinstance(node.get("models"), Mapping):
+        models = {
+            name: build(model, f"energy.models.{name}", EnergyModel)
+            for name, model in node["models"].items()
+        }
+        node = {**node, "models": models}
+    return as_fleet(node and build(node, "energy", MEANT))
 
 
 def build_source(node: Any) -> Any:
@@ -101,7 +111,7 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
         return Inputs(nobody, nobody, population)
-    wanted = len(string_of(cfg)) if cfg.evaluation.rows == "vehicles" else None
+    wanted = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
     leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, wanted)
     windows, training = leaders.windows, leaders.training
     if len(training):

@@ -13,7 +13,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import build_pieces
-from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.envs.inputs import Inputs
 from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
@@ -64,7 +64,7 @@ def evaluate(
 
 def cases_of(cfg: StudyConfig, inputs: Inputs) -> list[Case]:
     """Return the cases of an evaluation, its held-out windows and its whole records."""
-    windows = Case(WINDOWS, inputs.evaluation, len(string_of(cfg)))
+    windows = Case(WINDOWS, inputs.evaluation, len(cfg.scenario.vehicles))
     return [*inputs.cases, windows, *(inputs.full_length if cfg.evaluation.full_length else ())]
 
 
@@ -79,7 +79,7 @@ def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
     """Return the configuration of a case; a platoon has the case's number of vehicles."""
     cfg = deepcopy(cfg)
     cfg.scenario.horizon = case.horizon
-    if set(string_of(cfg).names) == {AUTOMATED}:
+    if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
         cfg.scenario.string = f"{AUTOMATED}*{case.followers}"
     return cfg
 
@@ -100,7 +100,7 @@ def drive(
     ids, drivers = torch.arange(runs, device=env.device), len(inputs.population.time_gap)
     given = reset_options(env, ids, ids % drivers, seed, drivers)
     record, _ = play(env, strategy.policy, given, KEYS, strategy.title)
-    index, vehicles = record.pop(INDEX, None), len(string_of(cfg))
+    index, vehicles = record.pop(INDEX, None), len(cfg.scenario.vehicles)
     series = {"leader": record.pop(("leader", "speed"))}
     for (space, name), entry in record.items():
         entry = entry.squeeze(-1)

@@ -17,9 +17,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.energy import Fleet, as_fleet, build_energy
+from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
-from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.envs.rollout import ACTION
 from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import any_leader, pairs
@@ -87,7 +87,7 @@ def clairvoyant(
         any_leader(strategy.cfg), inputs.evaluation, inputs.population, len(profile), nominal=True
     )
     given = reset_options(env, profile, driver, seed, count)
-    string, fleet = string_of(strategy.cfg), build_energy(strategy.cfg)
+    string, fleet = strategy.cfg.scenario.vehicles, build_energy(strategy.cfg)
     source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon

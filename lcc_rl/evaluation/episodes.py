@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.energy import build_energy
 from lcc_rl.envs import build_env
-from lcc_rl.envs.inputs import Inputs, string_of
+from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
@@ -189,7 +188,7 @@ class Episodes:
             self.player.env, profile, driver, self.seed, plan.population, repeat
         )
         record, alive = self.player.play(options)
-        groups = grouped(record, string_of(self.cfg))
+        groups = grouped(record, self.cfg.scenario.vehicles)
         described = describe(
             self.strategy,
             inputs.evaluation,

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import Fleet, as_fleet
-from lcc_rl.envs.inputs import string_of
 from lcc_rl.evaluation.metrics import (
     KILO,
     energy_measures,
@@ -178,7 +177,7 @@ def describe(
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
     """Return v0 [m/s] by episode: the strategy's own one, or that of the episode's driver."""
     controllers = strategy.cfg.scenario.controllers
-    own = controllers.get(AUTOMATED) if string_of(strategy.cfg).count(AUTOMATED) else None
+    own = controllers.get(AUTOMATED) if strategy.cfg.scenario.vehicles.count(AUTOMATED) else None
     given = None if own is None else own.get("desired_speed")
     drivers = episodes["desired_speed_mps"].to_numpy()
     return drivers if given is None else np.full_like(drivers, given)

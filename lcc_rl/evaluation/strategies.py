@@ -22,7 +22,6 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET, short_name
 from lcc_rl.config.schemas import AUTO, StudyConfig
-from lcc_rl.envs.inputs import string_of
 from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
@@ -99,7 +98,7 @@ def baselines(cfg: StudyConfig, further: Sequence[str] = ()) -> list[Strategy]:
 
 def applies(cfg: StudyConfig, name: str) -> bool:
     """Return whether a string has the vehicles that a baseline drives."""
-    roles = set(string_of(cfg).names)
+    roles = set(cfg.scenario.vehicles.names)
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
@@ -157,7 +156,7 @@ def without_filter(cfg: StudyConfig) -> StudyConfig:
 
 def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose string lacks the automated vehicles."""
-    roles = [role for role in string_of(cfg).roles if role != AUTOMATED]
+    roles = [role for role in cfg.scenario.vehicles.roles if role != AUTOMATED]
     cfg = without_filter(cfg)
     cfg.scenario.string = " ".join(roles)
     return cfg
@@ -168,7 +167,7 @@ def rule(cfg: StudyConfig) -> Strategy:
 
     Its name is that of the variant, or of the controller's class where that is not the variant's.
     """
-    if not string_of(cfg).count(AUTOMATED):
+    if not cfg.scenario.vehicles.count(AUTOMATED):
         return Strategy(DIRECT, cfg)
     try:
         own = _target(load("evaluate", [f"variant={cfg.variant}"]))
@@ -242,7 +241,7 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
         found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
-    if set(string_of(cfg).names) == {AUTOMATED}:
+    if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
         knowing = driven_by(cfg, {**cfg.deployed, "lookahead": "oracle"})
         found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found

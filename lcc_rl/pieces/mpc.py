@@ -2,27 +2,70 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from importlib.util import find_spec
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, how_to_install
-from lcc_rl.functional.mpc import Array, FollowingProgram, MPCSettings
+from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
+from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 LONGEST = 200.0  # gaps beyond it are planned for as this one [m]
+Array = np.ndarray
+MOST_STEPS = 200  # of a plan
+
+
+class MPCSettings(Settings):
+    """Horizon, prediction, limits and prices of :class:`MPC`."""
+
+    horizon: Positive = 5.0  # how far ahead is planned [s]
+    step: Positive = 0.25  # of the plan; the horizon is a multiple of it [s]
+    # Time constant with which the acceleration of the vehicle ahead is expected to decay; 0: it
+    # keeps its speed [s].
+    acceleration_time: NonNegative = 1.5
+    margin: NonNegative = 1.0  # gap at standstill that is kept [m]
+    least_time_gap: NonNegative = 0.5  # that is kept beyond it [s]
+    # The gap that is not exceeded is this time gap times the speed [s] plus longest_gap, which may
+    # be negative [m]; more where the vehicle ahead is so slow that it would be less than the gap
+    # to be kept.
+    longest_time_gap: Positive = 2.8
+    longest_gap: Number = -8.5
+    least_ttc: NonNegative = 4.1  # time-to-collision that is kept [s]
+    steady_price: NonNegative = 1.0  # of what the planned speeds take without accelerating
+    jerk_price: NonNegative = 0.1  # of the squared change of the acceleration per second [s²]
+    # Of the squared distance by which the gap is too short, too long, or too short for the
+    # time-to-collision [1/(m²s⁴)].
+    near_price: Positive = 3.0
+    far_price: Positive = 0.1
+    ttc_price: Positive = 30.0
+    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    # Absolute and relative, at which the solver stops.
+    tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
+    iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # after which it gives up
+
+    def __post_init__(self) -> None:
+        if self.longest_time_gap <= self.least_time_gap:
+            least = f"least_time_gap={self.least_time_gap}"
+            raise ValueError(f"longest_time_gap must be above {least}, got {self.longest_time_gap}")
+        steps = self.horizon / self.step
+        if not 1 <= round(steps) <= MOST_STEPS or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(
+                f"horizon must be 1 to {MOST_STEPS} times step={self.step:g}, got {self.horizon:g}"
+            )
 
 
 class MPC(MPCSettings, Controller):
     """Plans accelerations by a quadratic program every step and commands the first one.
 
     Little energy within limits of the gap and of the time-to-collision, see
-    :class:`lcc_rl.functional.mpc.FollowingProgram`; solved by OSQP (Stellato et al. 2020) from
+    :class:`FollowingProgram`; solved by OSQP (Stellato et al. 2020) from
     the same start every time, so that the command depends on what is read alone. Where OSQP finds
     no solution it brakes fully, and ``(role, "unsolved")``, ``[*batch, n, 1]``, is 1. It passes no
     gradient and is not compiled; rows that are alike are solved once.
@@ -120,3 +163,107 @@ def _set_up(program: FollowingProgram) -> Any:
         check_termination=10,
     )
     return solver
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """The parts of the program that depend on the moment, one row per vehicle.
+
+    Args:
+        linear: q, ``[rows, 4 N]``.
+        lower, upper: bounds of A x, ``[rows, 5 N]``.
+    """
+
+    linear: Array
+    lower: Array
+    upper: Array
+
+
+class FollowingProgram:
+    """min ½ xᵀPx + qᵀx, l ≤ Ax ≤ u; x: N accelerations and N slacks of each of three limits.
+
+    The plan's speeds and gaps are linear in its accelerations, so that P and A depend on settings
+    only. Minimised is what accelerating loses (the part of A2 with a²) and ``steady_price`` times
+    the slope of the steady power at the present speed, over the loss of 1 m/s² at that speed. The
+    limits of the gap and of the time-to-collision are soft: there is always a solution.
+
+    Args:
+        settings: of the controller.
+
+    Attributes:
+        quadratic: P, ``[4 N, 4 N]``.
+        constraints: A, ``[5 N, 4 N]``.
+    """
+
+    def __init__(self, settings: MPCSettings) -> None:
+        self.settings, self.steps = settings, round(settings.horizon / settings.step)
+        h, n = settings.step, self.steps
+        self.times = h * np.arange(1, n + 1)
+        sums = np.tril(np.ones((n, n)))
+        self.speeds = h * sums  # of the plan, by its accelerations
+        # Trapezoids, as the vehicles move (A18).
+        self.ways = h * sums @ (self.speeds - 0.5 * h * np.eye(n))
+        changes = (np.eye(n) - np.eye(n, k=-1)) / h
+        own = np.eye(n) + settings.jerk_price * changes.T @ changes
+        prices = (settings.near_price, settings.far_price, settings.ttc_price)
+        self.quadratic = 2.0 * np.diag(np.repeat([0.0, *prices], n))
+        self.quadratic[:n, :n] = 2.0 * own
+        self.constraints = self._constraints()
+
+    def _constraints(self) -> Array:
+        """Return A: gap too short, too long, too short for the speeds; speed; acceleration."""
+        n, s = self.steps, self.settings
+        rows = np.zeros((5 * n, 4 * n))
+        closing = [
+            self.ways + s.least_time_gap * self.speeds,
+            -(self.ways + s.longest_time_gap * self.speeds),
+            self.ways + s.least_ttc * self.speeds,
+            -self.speeds,
+            np.eye(n),
+        ]
+        rows[:, :n] = np.concatenate(closing)
+        rows[: 3 * n, n:] = -np.eye(3 * n)
+        return rows
+
+    def vectors(
+        self, speed: Array, gap: Array, acceleration: Array, ahead: Array, ahead_change: Array
+    ) -> Vectors:
+        """Return what depends on the moment.
+
+        Args:
+            speed, gap, acceleration: of the vehicle, ``[rows]`` [m/s], [m], [m/s²].
+            ahead, ahead_change: speed and acceleration of the one ahead, ``[rows]`` [m/s], [m/s²].
+        """
+        s, n = self.settings, self.steps
+        speed = speed[:, None]
+        lead, way = self.predicted(ahead[:, None], ahead_change[:, None])
+        free = gap[:, None] + way - speed * self.times  # gaps without accelerating
+        # Following steadily, the limits leave a gap at any speed.
+        narrowest = s.margin - (s.longest_time_gap - s.least_time_gap) * lead
+        upper = [
+            free - s.margin - s.least_time_gap * speed,
+            s.longest_time_gap * speed + np.maximum(narrowest, s.longest_gap) - free,
+            free - s.least_ttc * (speed - lead),
+            np.broadcast_to(speed, free.shape),
+            np.full_like(free, s.max_acceleration),
+        ]
+        lower = np.full((len(free), 5 * n), -np.inf)
+        lower[:, 4 * n :] = -s.max_acceleration
+        linear = np.zeros((len(free), 4 * n))
+        linear[:, :n] = s.steady_price * _steady_slope(speed) * self.speeds.sum(0)
+        linear[:, 0] -= 2.0 * s.jerk_price * acceleration / s.step**2
+        return Vectors(linear, lower, np.concatenate(upper, 1))
+
+    def predicted(self, speed: Array, acceleration: Array) -> tuple[Array, Array]:
+        """Return speeds and distances of the vehicle ahead, ``[rows, N]`` [m/s], [m]."""
+        decay = self.settings.acceleration_time
+        change = decay * -np.expm1(-self.times / decay) if decay else np.zeros_like(self.times)
+        speeds = np.maximum(speed + acceleration * change, 0.0)
+        before = np.concatenate([speed, speeds[:, :-1]], 1)
+        return speeds, np.cumsum(0.5 * self.settings.step * (before + speeds), 1)
+
+
+def _steady_slope(speed: Array) -> Array:
+    """Return dP/dv of the steady power over the loss of 1 m/s² at a speed, from A2."""
+    (_, _, p02), (p10, _, p12), (p20, _, _), (p30, _, _) = POWER_COEFFICIENTS
+    return (p10 + speed * (2.0 * p20 + speed * 3.0 * p30)) / (p02 + p12 * speed)

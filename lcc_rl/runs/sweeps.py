@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.live import Live
 
-from lcc_rl.config import NOT_IDENTITY, identity, parsed
+from lcc_rl.config import NOT_IDENTITY, identity, key_of, parsed
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
@@ -85,11 +85,6 @@ def _mark(root: DictConfig) -> str:
 def result_overrides(typed: Sequence[str]) -> list[str]:
     """Return the overrides that change a result."""
     return [item.removeprefix("++") for item in typed if key_of(item) not in NOT_IDENTITY]
-
-
-def key_of(override: str) -> str:
-    """Return the dotted key that an override changes."""
-    return override.lstrip("+~").split("=")[0]
 
 
 def parallel_jobs(threads: int) -> int:

@@ -18,20 +18,18 @@ from typing import Any
 
 from lcc_rl.config import NOT_IDENTITY, identity, load
 from lcc_rl.config.schemas import StudyConfig, as_plain
-from lcc_rl.errors import ConfigError, Interrupted, require
+from lcc_rl.errors import Interrupted, require
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
-from lcc_rl.runs.sweeps import key_of
 
 log = logging.getLogger("lcc_rl")
 
 NOTES = "study.json"
 EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 FINISHED, FAILED, FOREIGN = "finished", "failed", "other settings"
-GIVEN = ("seed", "variant")  # set by the study for each of its runs
 
 
 @dataclass(frozen=True)
@@ -95,18 +93,6 @@ class BaseStudy:
 def quoted(path: str | Path) -> str:
     """Return a path quoted for Hydra's command line."""
     return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
-
-
-def check_overrides(words: Sequence[str]) -> None:
-    """Check that the remaining words of a command line are overrides, and not of each run's own."""
-    if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
-        raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
-    for word in words:
-        if key_of(word) in GIVEN:
-            raise ConfigError(
-                f"{word}: every run has its own; --seeds is their number, counted from 0, and "
-                "options of this command choose the variants"
-            )
 
 
 def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> list[str]:

@@ -6,7 +6,8 @@ from helpers import slow_but
 
 import lcc_rl
 from lcc_rl.config import load
-from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor, build_energy
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.features import CLASS
 

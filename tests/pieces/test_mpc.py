@@ -13,9 +13,9 @@ from scipy.optimize import minimize
 from lcc_rl.data.profiles import from_records
 from lcc_rl.envs import build_env
 from lcc_rl.functional.kinematics import advance_gap
-from lcc_rl.functional.mpc import MPCSettings
 from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces import MPC
+from lcc_rl.pieces.mpc import MPCSettings
 
 AUTO = "scenario.controllers.automated"
 PLACE = f"controller@{AUTO}"

@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 from commands import UNTRAINED
 
-from lcc_rl.commands import reproduce, training
+from lcc_rl.commands import training
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.studies import runner
+from lcc_rl.studies import reproduce, runner
 from lcc_rl.studies.alcc import report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.runner import FAILED, FINISHED, FOREIGN, Outcome, Run

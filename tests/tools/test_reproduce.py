@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lcc_rl.cli.entry import main_guard
-from lcc_rl.commands import reproduce as tool
+from lcc_rl.studies import reproduce as tool
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lcc_rl.commands import evaluation
-from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, known_settings, root_key
-from lcc_rl.config import load
+from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, known_settings
+from lcc_rl.config import key_of, load, root_key
 from lcc_rl.config.schemas import PipelineConfig
 from lcc_rl.errors import unknown_name
-from lcc_rl.runs.sweeps import key_of
 from lcc_rl.studies.runner import (
     EPISODES,
     FINISHED,

@@ -11,8 +11,8 @@ from typing import Any
 import pandas as pd
 
 from lcc_rl.commands.evaluation import evaluate_and_write
-from lcc_rl.commands.pipeline import known_settings, root_key
-from lcc_rl.config import load
+from lcc_rl.commands.pipeline import known_settings
+from lcc_rl.config import load, root_key
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.fit import check_policy

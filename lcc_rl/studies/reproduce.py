@@ -21,15 +21,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lcc_rl.config import check_overrides
 from lcc_rl.config.schemas import FORMATS
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
-from lcc_rl.studies.runner import FINISHED, Outcome, check_overrides, read_notes
+from lcc_rl.studies.runner import FINISHED, Outcome, read_notes
 
 log = logging.getLogger("lcc_rl")
 
+GIVEN = ("seed", "variant")
+OWN = (
+    "every run has its own; --seeds is their number, counted from 0, and options of this command "
+    "choose the variants"
+)
 OTHERS = "further formats of figures: " + ",".join(FORMATS[1:])
 REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
@@ -130,7 +136,7 @@ def main(words: list[str]) -> int:
     wrong = [item for item in overrides if item.startswith("-")]
     if wrong or (overrides and "folder" in arguments):
         top.error(f"unknown: {' '.join(wrong or overrides)}")
-    check_overrides(overrides)
+    check_overrides(overrides, GIVEN, OWN)
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     return int(arguments.run(arguments, shlex.join(["lcc-rl", "reproduce", *words])))

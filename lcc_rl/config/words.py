@@ -1,0 +1,35 @@
+"""Words of a command line: overrides and the keys that they change."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from lcc_rl.errors import ConfigError
+
+
+def key_of(override: str) -> str:
+    """Return the dotted key that an override changes."""
+    return override.lstrip("+~").split("=")[0]
+
+
+def root_key(override: str) -> str:
+    """Return the top-level key that an override changes."""
+    return key_of(override).split(".")[0].split("@")[0]
+
+
+def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -> None:
+    """Check that the remaining words of a command line are overrides.
+
+    Args:
+        words: what is left of the command line.
+        given: keys that the command sets itself.
+        reason: why they cannot be given, for the message.
+
+    Raises:
+        ConfigError: naming the word at fault.
+    """
+    if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
+        raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
+    for word in words:
+        if root_key(word) in given:
+            raise ConfigError(f"{word}: {reason}")
