@@ -14,7 +14,7 @@ from lcc_rl.runs import interrupts
 from lcc_rl.version import __version__
 
 __all__ = ["__version__", "compare", "export", "learn", "make_env", "results"]
-# Where what loads torch is defined.
+# Modules of the names that load torch.
 LAZY = {
     "make_env": "lcc_rl.envs.factory",
     "learn": "lcc_rl.api",

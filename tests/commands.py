@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import signal
@@ -51,6 +52,15 @@ def assert_same_tables(one: Path, two: Path) -> None:
         pd.testing.assert_frame_equal(*frames, check_exact=True)
 
 
+def content(folder: Path) -> dict[str, str]:
+    """Return a checksum of every file of a folder, those of Hydra included."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
 @dataclass(frozen=True)
 class Done:
     """What a command left behind."""
@@ -61,16 +71,9 @@ class Done:
 
 
 def run_command(module: str, *words: str, cwd: Path, check: bool = False) -> Done:
-    """Run an entry point as ``python -m`` would, without a new process.
+    """Run an entry point as ``python -m`` would, without a new process, which imports for seconds.
 
-    A fresh interpreter imports torch, TorchRL and Hydra for seven seconds. Here the process's
-    state is put back afterwards. An exception that a process would end on is raised.
-
-    Args:
-        module: for example ``"lcc_rl.cli.train"``.
-        words: what is typed after the module.
-        cwd: working directory of the command.
-        check: whether another exit code than 0 is an error of the test.
+    The process's state is put back afterwards. An exception that a process would end on is raised.
     """
     main, code = import_module(module).main, 0
     with process_state(module, words, cwd) as (out, err):
@@ -107,13 +110,6 @@ def start(module: str, *words: str, cwd: Path) -> subprocess.Popen[str]:
     )
 
 
-def run_process(module: str, *words: str, cwd: Path) -> Done:
-    """Run an entry point in a process of its own to its end."""
-    with start(module, *words, cwd=cwd) as child:
-        _, errors = child.communicate(timeout=300)
-    return Done(child.returncode, "", errors)
-
-
 def wait_for(path: Path, child: subprocess.Popen[str], seconds: float = 120.0) -> None:
     """Wait until a process has written a file."""
     deadline = time.monotonic() + seconds
@@ -143,7 +139,7 @@ def process_state(
         stack.enter_context(patch.dict(os.environ))
         stack.enter_context(chdir(cwd))
         stack.enter_context(kept_logging())
-        stack.enter_context(kept_signals())
+        handlers = {kind: signal.getsignal(kind) for kind in SIGNALS}
         stack.enter_context(redirect_stdout(out))
         stack.enter_context(redirect_stderr(err))
         try:
@@ -151,41 +147,29 @@ def process_state(
         finally:
             GlobalHydra.instance().hydra = hydra
             HydraConfig.instance().cfg = job
+            for kind, handler in handlers.items():
+                signal.signal(kind, handler)
             torch.set_num_threads(threads)
             torch.set_float32_matmul_precision(precision)
 
 
 @contextmanager
-def kept_signals() -> Iterator[None]:
-    """Put signal handlers back; a command meets those of a process started by a shell."""
-    before = {kind: signal.getsignal(kind) for kind in SIGNALS}
-    try:
-        yield
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
-
-
-@contextmanager
 def kept_logging() -> Iterator[None]:
     """Put loggers back as they were, and close the files that were opened meanwhile."""
-    names = [None, *(name for name, kind in _known() if isinstance(kind, logging.Logger))]
-    loggers = [logging.getLogger(name) for name in names]
-    before = [(log, log.level, log.disabled, log.propagate, log.handlers[:]) for log in loggers]
+    before = [(log, log.level, log.disabled, log.propagate, log.handlers[:]) for log in loggers()]
     try:
         yield
     finally:
-        old = {id(handler) for *_, handlers in before for handler in handlers}
-        everyone = [logging.getLogger(), *(log for _, log in _known())]
-        for log in everyone:
-            for handler in list(getattr(log, "handlers", ())):
-                if id(handler) not in old:
-                    log.removeHandler(handler)
-                    handler.close()
+        old = {handler for *_, handlers in before for handler in handlers}
+        for log in loggers():
+            for handler in set(log.handlers) - old:
+                log.removeHandler(handler)
+                handler.close()
         for log, level, disabled, propagate, handlers in before:
             log.setLevel(level)
             log.disabled, log.propagate, log.handlers = disabled, propagate, handlers
 
 
-def _known() -> list[tuple[str, object]]:
-    return list(logging.Logger.manager.loggerDict.items())
+def loggers() -> list[logging.Logger]:
+    known = logging.Logger.manager.loggerDict.values()
+    return [logging.getLogger(), *(log for log in known if isinstance(log, logging.Logger))]

@@ -14,7 +14,6 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs" / "reference").glob("*.md")),
 ]
-LANGUAGES = {"bash", "console", "python", "yaml", "text"}
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,6 @@ class Block:
     language: str
     text: str
     before: str
-
-
-def name_of(page: Path) -> str:
-    """Return a page's path from the root."""
-    return page.relative_to(ROOT).as_posix()
 
 
 def blocks(page: Path) -> list[Block]:
@@ -58,13 +52,11 @@ def blocks(page: Path) -> list[Block]:
 
 def commands(block: Block) -> Iterator[list[str]]:
     """Yield the words of every command of a block of the languages bash and console."""
-    text = block.text.replace("\\\n", " ")
-    for line in text.splitlines():
-        if block.language == "console" and not line.startswith("$ "):
-            continue
-        words = words_of(line.removeprefix("$ "))
-        if words:
-            yield words
+    for line in block.text.replace("\\\n", " ").splitlines():
+        if block.language == "bash" or line.startswith("$ "):
+            words = words_of(line.removeprefix("$ "))
+            if words:
+                yield words
 
 
 def words_of(line: str) -> list[str]:

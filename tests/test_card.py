@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-import pandas as pd
 import torch
 from pages import ROOT, blocks
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.transforms import Transform
 
 from lcc_rl.agents.controller import ControllerPolicy
-from lcc_rl.envs import Clock
-from lcc_rl.pieces import CACC, NGSIMLeader
+from lcc_rl.pieces import CACC
 from lcc_rl.pieces.world import World
-from lcc_rl.synthetic.stream import StreamSource
-
-
-def test_an_ngsim_file_is_a_transform_in_one_line(tmp_path) -> None:
-    path = tmp_path / "trajectories.csv"
-    StreamSource(recordings=1, platoons=2, vehicles=3, keep=str(path)).load()
-    leader = NGSIMLeader.from_file(path, horizon=100)
-    assert isinstance(leader, Transform)
-    env = TransformedEnv(Clock(100, 4), Compose(leader))
-    speed = env.rollout(100)["next", "leader", "speed"]
-    assert speed.shape == (4, 100, 1)
-    recorded = pd.read_csv(path)["v_Vel"].max() * 0.3048
-    assert 0.0 <= float(speed.min()) < float(speed.max()) <= recorded + 0.1
 
 
 def test_the_page_on_composing_by_hand_prints_what_it_says(tmp_path, monkeypatch, capsys) -> None:

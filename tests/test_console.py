@@ -1,4 +1,4 @@
-"""The console command: every command under one name, errors in one line; and the wheel's list."""
+"""The console command: every command under one name, quick to start; and the wheel's list."""
 
 from __future__ import annotations
 
@@ -11,75 +11,81 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
+import pandas as pd
 import pytest
+from commands import run_command
 
 import lcc_rl
-from lcc_rl.cli.console import COMMANDS, main
+from lcc_rl.cli.console import COMMANDS
+from lcc_rl.io.files import write_parquet
 
 ROOT = Path(__file__).parents[1]
+HEAVY = {"torch", "tensordict", "torchrl", "matplotlib", "scipy.stats", "scipy.interpolate"}
+TABLES = {"pandas", "pyarrow"}
+# Does what its argument says, as python -m would, then names what was loaded on the way.
+PROGRAM = """
+import runpy, sys
+task, *sys.argv[1:] = sys.argv[1:]
+try:
+    if task.startswith("from"):
+        exec(task)
+    else:
+        runpy.run_module(task, run_name="__main__", alter_sys=True)
+except SystemExit:
+    pass
+print("loaded:", *sys.modules, file=sys.stderr)
+"""
 
 
-def test_the_version_is_that_of_the_package_and_stands_once(capsys) -> None:
-    main(["--version"])
-    assert capsys.readouterr().out == f"lcc-rl {lcc_rl.__version__}\n"
+def ran(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_help_names_the_version_and_every_command(tmp_path) -> None:
+    def said(*words: str) -> str:
+        return run_command("lcc_rl.cli.console", *words, cwd=tmp_path, check=True).stdout
+
+    assert said("--version") == f"lcc-rl {lcc_rl.__version__}\n"
     assert version("lcc_rl") == lcc_rl.__version__
-
-
-def test_help_names_every_command(capsys) -> None:
-    main([])
-    text = capsys.readouterr().out
-    assert all(f"\n  {name} " in text for name in COMMANDS)
-
-
-def test_every_command_has_its_function() -> None:
+    assert all(f"\n  {name} " in said() for name in COMMANDS)
+    assert "usage: lcc-rl status" in said("status", "-h")
     assert all(callable(import_module(module).main) for module, _ in COMMANDS.values())
 
 
-def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["trian"])
-    said = capsys.readouterr().err
-    assert caught.value.code == 2
-    assert "Did you mean 'train'?" in said
-    assert said.count("\n") == 1
-
-
-@pytest.mark.parametrize("name", ["status", "reproduce", "fetch"])
-def test_help_of_a_command_bears_its_name(name, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["lcc-rl"])
-    monkeypatch.setattr("lcc_rl.runs.interrupts.end_quietly", lambda: None)
-    with pytest.raises(SystemExit) as caught:
-        main([name, "-h"])
-    assert caught.value.code == 0
-    assert f"usage: lcc-rl {name}" in capsys.readouterr().out
-
-
-def packages() -> set[str]:
-    found = (path.parent.relative_to(ROOT) for path in ROOT.glob("lcc_rl/**/__init__.py"))
-    names = {".".join(path.parts) for path in found if "conf" not in path.parts}
-    return names | {"lcc_rl.conf"}
+@pytest.mark.parametrize(
+    ("words", "unused", "printed"),
+    [
+        (["lcc_rl.cli.train", "--help"], HEAVY | TABLES, "calibration: both, global, local"),
+        (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
+        (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
+    ],
+)
+def test_what_need_not_wait_for_torch_does_not_load_it(tmp_path, words, unused, printed) -> None:
+    write_parquet(pd.DataFrame({"x": [1.0]}), tmp_path / "run" / "episodes.parquet")
+    (tmp_path / "run" / "config.yaml").write_text("seed: 3\n")
+    done = ran(sys.executable, "-c", PROGRAM, *words, cwd=tmp_path)
+    assert not unused.intersection(done.stderr.rpartition("loaded:")[2].split())
+    assert printed in done.stdout
 
 
 def test_the_listed_packages_are_those_of_the_folders() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert set(settings["packages"]) == packages()
-
-
-def ran(*words: str, cwd: Path = ROOT) -> str:
-    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout + done.stderr
+    found = (path.parent.relative_to(ROOT) for path in ROOT.glob("lcc_rl/**/__init__.py"))
+    names = {".".join(path.parts) for path in found if "conf" not in path.parts}
+    assert set(settings["packages"]) == names | {"lcc_rl.conf"}
 
 
 @pytest.mark.slow
 def test_a_wheel_runs_in_an_empty_folder(tmp_path) -> None:
     pip = (sys.executable, "-m", "pip", "wheel", "--no-deps", "--quiet", "--wheel-dir")
-    assert "arning" not in ran(*pip, str(tmp_path), str(ROOT))
+    assert "arning" not in ran(*pip, str(tmp_path), str(ROOT)).stderr
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as content:
         content.extractall(tmp_path / "site")
         names = set(content.namelist())
-    tracked = ran("git", "ls-files", "lcc_rl", "conf").split()
+    tracked = ran("git", "ls-files", "lcc_rl", "conf").stdout.split()
     assert {re.sub("^conf/", "lcc_rl/conf/", name) for name in tracked} <= names
     program = (
         f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); "

@@ -1,46 +1,313 @@
-"""The pages' commands: each one exists, its options do, and its settings compose."""
+"""The pages' commands: each one exists and composes; in make test-all, each one runs as a try."""
 
 from __future__ import annotations
 
 import re
+import runpy
+import shlex
 import sys
+import tomllib
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from functools import cache, partial
+from pathlib import Path
 
+import matplotlib as mpl
 import pytest
-from page_checks import CHOICES, check, named, write_configuration
-from pages import LANGUAGES, PAGES, ROOT, blocks, commands, inline, name_of, words_of
+from commands import DATA, QUICK, jobs_in_threads, process_state, run_command
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from page_files import LEFT_OUT, write_named
+from pages import PAGES, ROOT, Block, blocks, commands, inline, words_of
 
-CONF = ROOT / "conf"
+from lcc_rl import learn
+from lcc_rl.cli import console
+from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
+
+# Commands that are composed only, by their first words, and why.
+NOT_RUN = {
+    "make": "sets up an environment",
+    "pip": "needs a package index",
+    "source": "of the shell",
+    "export": "of the shell",
+    "ls": "of the shell",
+    "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
+    "python tools/sumo_ring.py": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
+    "lcc-rl animate": "tests/results/test_motion.py runs it",
+    "lcc-rl maps": "tests/results/test_figures.py runs it",
+    "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
+    "python tools/kill_test.py": "takes an hour",
+}
+# Settings that shrink a command, where they are settings of it.
+LENGTH, WINDOWS = "scenario.horizon=40", ("evaluation.profiles=2", "evaluation.drivers=2")
+TRAINING = ("training.episodes=24", "training.environments=8", "training.segment=20")
+SMALL = (
+    *(LENGTH, *TRAINING, *WINDOWS, QUICK, *DATA),
+    *("training.checkpoint_every=1", "evaluation.full_length=false"),
+)
+OF_TRAINING = ("agent.batch_size=64", "agent.population=4")
+# What a page asks for, and what is enough for a try.
+ENOUGH = {
+    "range(8)": "range(2)",
+    "range(64)": "range(2)",
+    "evaluation.shards=64": "evaluation.shards=2 evaluation.batch_size=8",
+    "automated*100": "automated*8",
+    "evaluation.repeats=2000": "evaluation.repeats=4",
+    "evaluation.repeats=200": "evaluation.repeats=2",
+    "--iterations 200": "--iterations 2",
+    '["experiment=limits"]': repr([LENGTH, *TRAINING, *WINDOWS, *DATA]),
+    '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
+    "batch_size=1024": "batch_size=4",
+    "num_envs=64": "num_envs=2",
+    "rollout(6000": "rollout(20",
+    "rollout(300": "rollout(20",
+    "(0, 2999, 5999)": "(0, 9, 19)",
+}
+ENTRIES = {"run": "pipeline"}  # entry points that are not called as their command
+SHELL = {"source", "export", "ls"}
+ALWAYS = {"tools/sumo_ring.py": ("task=ring-22",)}  # settings that a tool gives itself
+MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+NEEDS = {"interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime")}  # extras of a page
+PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
+LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
+CHOICES = set((ROOT / "conf").rglob("*.yaml"))
 
 
-@pytest.fixture(autouse=True)
-def own_modules(tmp_path, monkeypatch):
-    """Write the modules that the pages tell to write."""
-    for page in PAGES:
+class Reader:
+    """Reads a page in a folder: writes its files and checks its commands.
+
+    Args:
+        folder: an empty folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.failures: list[str] = []
+
+    def read(self, page: Path) -> None:
+        """Read all blocks; fail with all that went wrong."""
         for block in blocks(page):
-            file = re.match(r"# (\w+\.py)", block.text) if block.language == "python" else None
-            if file:
-                with (tmp_path / file[1]).open("a") as module:
-                    module.write(block.text)
-    monkeypatch.syspath_prepend(tmp_path)
-    yield
+            file = re.match(r"# ([\w/]+\.py)", block.text)
+            if block.language == "yaml":
+                self.write(block.before.strip("`:"), block.text)
+            elif block.language == "python" and file:
+                self.write(file[1], block.text)
+            elif block.language == "python":
+                self.note(block.line, self.program, block)
+            elif block.language in ("bash", "console"):
+                error = re.search(r"^lcc_rl: error: .{20}", block.text, flags=re.M)
+                for words in commands(block):
+                    self.note(block.line, self.command, words, error and error[0])
+            else:
+                assert block.language == "text", f"{page}:{block.line}: {block.language}"
+        self.end(page)
+        assert not self.failures, f"{page}:" + f"\n\n{page}:".join(self.failures)
+
+    def write(self, name: str, text: str) -> None:
+        """Add to a file that the page tells to write."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(text)
+        sys.modules.pop(path.stem, None)  # the next command imports it anew, as a process would
+
+    def note(self, line: int, act, *given) -> None:
+        """Do something; keep what goes wrong."""
+        try:
+            act(*given)
+        except (Exception, SystemExit) as error:
+            self.failures.append(f"{line}: {given[0]}: {type(error).__name__}: {error}")
+
+    def program(self, block: Block) -> None:
+        """Programs are run only."""
+
+    def command(self, words: list[str], error: str | None) -> None:
+        """Check one command, which may end with an error, without running it."""
+        program, *rest = [PLACEHOLDER.sub("a_name", word) for word in words]
+        if program == "make":
+            assert next(word for word in rest if "=" not in word) in MAKE
+        elif program == "pip":
+            assert set(re.findall(r"\w+", rest[-1].strip("'\""))) <= set(EXTRAS), rest
+        elif program.endswith("python"):
+            options_exist(ROOT / rest[0], rest)
+        elif program == "lcc-rl" and rest and rest[0] in console.HYDRA:
+            settings = settings_of(rest[1:], self.folder)
+            with suppress(ConfigError) if error else nullcontext():
+                for choice in (0, -1):
+                    entry = ENTRIES.get(rest[0], rest[0])
+                    once(entry, tuple(one_run(word, choice) for word in settings))
+        elif program == "lcc-rl" and rest[0] in console.COMMANDS:
+            module = console.COMMANDS[rest[0]][0].replace(".", "/")
+            options_exist(ROOT / f"{module}.py", rest)
+        else:
+            assert program in SHELL or rest[0] == "-h"
+
+    def end(self, page: Path) -> None:
+        """Check the commands and choices inside the text."""
+        for span in inline(page):
+            if span.startswith(("lcc-rl ", "python tools/", "make ", "pip ")):
+                self.note(0, self.command, words_of(span), None)
+            for group, choice in re.findall(r"(?:^|\s)\+?([a-z_/]+)=([a-z_0-9]+)(?=\s|$)", span):
+                if (ROOT / "conf" / group).is_dir() and choice not in ("null", "none"):
+                    assert ROOT / "conf" / group / f"{choice}.yaml" in CHOICES, span
+
+
+class Runner(Reader):
+    """Runs everything on a page, in one folder, with a run for those that it does not make."""
+
+    def __init__(self, folder: Path, run: Path) -> None:
+        super().__init__(folder)
+        self.run, self.count, self.space = run, 0, dict[str, object]()
+
+    def program(self, block: Block) -> None:
+        """Run a program in the state that those before it left."""
+        if "my.sumocfg" not in block.text:  # of the reader's own
+            exec(self.filled(block.text), self.space)
+
+    def command(self, words: list[str], error: str | None) -> None:
+        """Run one command; one whose error the page shows ends with it."""
+        if shlex.join(words).startswith(tuple(NOT_RUN)) or "hydra/sweeper=" in " ".join(words):
+            return
+        words = [word for word in words if not word.startswith(LAUNCH)]
+        for group, (key, path) in LEFT_OUT.items():
+            if group in words:
+                words = [f"{key}={path}" if word == f"{key}=…" else word for word in words]
+        program, name, *rest = shlex.split(self.filled(shlex.join(words)))
+        if program == "python":
+            with process_state(name, tuple(rest), self.folder) as (_, errors):
+                try:
+                    runpy.run_path(str(ROOT / name), run_name="__main__")
+                except SystemExit as stop:
+                    if stop.code:
+                        raise RuntimeError(errors.getvalue()) from stop
+            return
+        rest += [] if error else self.shrunk(name, rest)
+        done = run_command("lcc_rl.cli.console", name, *rest, cwd=self.folder)
+        assert done.returncode == (2 if error else 0), done.stderr[-2000:]
+        assert not error or error in done.stderr, done.stderr
+
+    def end(self, page: Path) -> None:
+        """Leave the commands inside the text."""
+
+    def shrunk(self, name: str, words: Sequence[str]) -> list[str]:
+        """Return further words that make a command a matter of seconds."""
+        if name == "clairvoyant":
+            return ["--iterations", "2", "--no-compile", LENGTH, *WINDOWS, *DATA]
+        if name not in console.HYDRA or any(word.startswith("resume=") for word in words):
+            return []
+        self.count += 1
+        place = [] if "-m" in words else [f"hydra.run.dir=outputs/{name}/{self.count}"]
+        if "experiment=smoke" in words:  # small by itself
+            return place
+        typed = settings_of(words, self.folder)
+        ends = [[one_run(word, choice) for word in typed] for choice in (0, -1)]
+        sweep = ends[0] != ends[1]  # some of its runs may learn nothing
+        small = [*SMALL, *(OF_TRAINING if name != "evaluate" and not sweep else ())]
+        fits = partial(composes, ENTRIES.get(name, name), sweep=sweep)
+        return [*place, *(item for item in small if all(fits([*e, item]) for e in ends))]
+
+    def filled(self, text: str) -> str:
+        """Put sizes of a try, and runs of this page, in place of what the page says."""
+        for much, little in ENOUGH.items():
+            text = text.replace(much, little)
+        return re.sub(r"(?:outputs/(\w+)/)?<([a-z ]+)>(/\w+\.parquet)?", self.latest, text)
+
+    def latest(self, found: re.Match[str]) -> str:
+        """Return the run that the page made last, of the kind that its name says."""
+        kind, name, file = found.groups()
+        if file == "/trajectories.parquet":
+            return f"outputs/{kind}/run{file}"
+        holds = file or ("/episodes.parquet" if kind == "evaluate" else "/policy.pt")
+        where = kind or ("calibrate" if file else "train")
+        made = self.folder.glob(f"outputs/{where}/**/{holds[1:]}")
+        runs = sorted(made, key=lambda path: path.stat().st_mtime)
+        folder = runs[-1].parent if runs and not name.startswith("other") else self.run
+        return f"{folder}{file or ''}"
+
+
+def options_exist(source: Path, words: Sequence[str]) -> None:
+    """Check the options of a program against its source, and its settings as those of a train."""
+    files = source.glob("*.py") if source.is_dir() else [source]
+    text = "".join(file.read_text() for file in files)
+    given = (word.partition("=")[0] for word in words if word.startswith("--"))
+    flags = {flag.replace("--no-", "--") for flag in given}
+    assert all(f'"{flag}"' in text for flag in flags - {"--help"}), words
+    typed = [word for word in words if re.match(r"[+~]?[\w./@]+=", word)]
+    once("train", (*ALWAYS.get(words[0], ()), *typed))
+
+
+@cache
+def once(entry: str, settings: tuple[str, ...]) -> None:
+    """Compose settings; a command in the text may leave out a required one."""
+    try:
+        load(entry, settings)
+    except ConfigError as error:
+        if "is required" not in str(error):
+            raise
+
+
+def composes(entry: str, settings: Sequence[str], sweep: bool) -> bool:
+    """Whether settings compose; in a sweep, runs that learn nothing may be given how to."""
+    try:
+        load(entry, settings)
+    except ConfigError as error:
+        return sweep and "learns nothing" in str(error)
+    return True
+
+
+def settings_of(words: Sequence[str], own: Path) -> list[str]:
+    """Return the settings among the words of a command of Hydra, without those of launchers."""
+    settings = [word for word in words if "=" in word or word.startswith("~")]
+    flags = [word for word in words if word not in settings]
+    launchers = [word.replace("=", "/") for word in settings if word.startswith(LAUNCH)]
+    assert {ROOT / "conf" / f"{name}.yaml" for name in launchers} <= CHOICES
+    settings = [word for word in settings if not word.startswith(LAUNCH)]
+    if flags[:1] == ["--config-dir"]:
+        settings.append(f"hydra.searchpath=[file://{own / flags[1]}]")
+        flags = flags[2:]
+    assert set(flags) <= {"-m", "--help"}, flags
+    return settings
+
+
+def one_run(setting: str, choice: int) -> str:
+    """Return one value of a setting that may be swept."""
+    (override,) = OverridesParser.create().parse_overrides([setting])
+    if not override.is_sweep_override():
+        return setting
+    values = list(override.sweep_string_iterator())
+    return f"{override.get_key_element()}={values[choice]}"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty folder whose modules are found, and forgotten afterwards."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
     for path in tmp_path.glob("*.py"):
         sys.modules.pop(path.stem, None)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_what_a_page_names_exists(page, tmp_path) -> None:
-    own = write_configuration(blocks(page), tmp_path)
-    for block in blocks(page):
-        assert block.language in LANGUAGES, f"{page}:{block.line}: {block.language}"
-        if block.language in ("bash", "console"):
-            for words in commands(block):
-                with named(page, block.line, words):
-                    check(words, own, fails="lcc_rl: error:" in block.text)
-    for span in inline(page):
-        if span.startswith(("lcc-rl ", "python tools/", "make ", "pip ")):
-            words = words_of(span)
-            with named(page, 0, words):
-                check(words, None)
-        for group, choice in re.findall(r"(?:^|\s)\+?([a-z_/]+)=([a-z_0-9]+)(?=\s|$)", span):
-            if (CONF / group).is_dir() and choice not in ("null", "none"):
-                assert CONF / group / f"{choice}.yaml" in CHOICES, f"{group}={choice}"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_names_exists(page, folder) -> None:
+    Reader(folder).read(page)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run that stands for one which a page does not make itself."""
+    small = ["experiment=smoke", "agent.batch_size=64", "seed=7", *DATA]
+    return learn("alcc", small, tmp_path_factory.mktemp("pages") / "run").folder
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of what a reader may see
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_everything_on_a_page_runs(page, run, folder, monkeypatch) -> None:
+    for extra in NEEDS.get(page.name, ()):
+        pytest.importorskip(extra)
+    jobs_in_threads(monkeypatch)
+    monkeypatch.chdir(folder)
+    mpl.use("agg")
+    write_named(page.read_text(), folder)
+    Runner(folder, run).read(page)

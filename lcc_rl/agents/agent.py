@@ -22,7 +22,7 @@ Whole = Annotated[int, Field(ge=0)]
 
 @dataclass(frozen=True)
 class Scene:
-    """Where an agent learns.
+    """The scene in which an agent learns.
 
     Args:
         observation_size: entries of the observation of one automated vehicle.

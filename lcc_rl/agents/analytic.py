@@ -1,7 +1,7 @@
 """Policy gradient through the simulator itself: back-propagation through time.
 
 The environment is differentiable, so the gradient of the return by the policy's weights need not
-be estimated from samples. Rewards with thresholds have none; smooth stand-ins take their place in
+be estimated from samples. Rewards with thresholds have none; smooth surrogates take their place in
 the objective (:mod:`lcc_rl.pieces.surrogates`), while the record keeps the literal terms. The
 gradient may be cut into segments, each ended by a learned value (short-horizon actor-critic, Xu
 et al., "Accelerated policy learning with parallel differentiable simulation", ICLR 2022).

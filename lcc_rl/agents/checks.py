@@ -49,7 +49,7 @@ def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
         Diverged: naming the first entry that is not a number, its step and its episode.
     """
     known = {as_key(key): value.detach() for key, value in batch.items(True, True)}
-    # The moment left is the one that the step before reached.
+    # The state before a step is the one that the previous step reached.
     keys = [ACTION, *(key for key in known if key[0] == NEXT and root_key(key) != ACTION)]
     entries = {root_key(key): known[key].transpose(0, 1) for key in keys if key in known}
     running = torch.ones((*batch.shape[1::-1], 1), dtype=torch.bool, device=batch.device)

@@ -66,7 +66,7 @@ def make_trainer(
         kind = short_name(cfg.scenario.controllers[AUTOMATED].get(TARGET))
         raise ConfigError(
             f"scenario.controllers.automated ({kind}) takes no action of a policy, so nothing can "
-            "be learned; say agent=none, or leave the controller out"
+            "be learned; use agent=none, or leave the controller out"
         )
     loops: dict[type, Any] = {Analytic: GradientTrainer, Tuned: SearchLoop}
     loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)

@@ -171,7 +171,7 @@ class FusedUpdate:
     def _through_critic(self, space: Workspace, raw: Tensor, action: Tensor) -> Tensor:
         """Return the derivative of the actor's loss by its output before the tanh."""
         below = backward(self.critic, space.own, space.slope, None, space.spare)
-        # Of the critic's inputs, only the action depends on the actor.
+        # Only the action, among the critic's inputs, depends on the actor.
         slope = torch.mm(below, self.critic[0][0][:, -action.shape[-1] :])
         slope.mul_(action.square_().neg_().add_(1.0))
         return slope.add_(raw, alpha=2.0 * self.saturation / len(raw))

@@ -1,10 +1,10 @@
 """Limits of a training: prices rise until the limits hold, and no further.
 
-A limit is a share of the time that must not be exceeded. Its smooth stand-in, which has a gradient,
-is priced by a multiplier; the multiplier follows the share that is really missed (a proxy
+A limit is a share of the time that must not be exceeded. Its smooth surrogate, which has a
+gradient, is priced by a multiplier; the multiplier follows the share that is really missed (a proxy
 Lagrangian: Cotter, Jiang and Sridharan, "Two-player games for efficient non-convex constrained
-optimization", ALT 2019). Where something else keeps the limit, such as a safety filter, its price
-falls towards nothing.
+optimization", ALT 2019). If something else keeps the limit, such as a safety filter, its price
+falls towards zero.
 """
 
 from __future__ import annotations

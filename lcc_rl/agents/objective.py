@@ -1,4 +1,4 @@
-"""What a training through the simulator maximises: the reward's terms, their stand-ins, limits."""
+"""What a training through the simulator maximises: the reward's terms, their surrogates, limits."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Objective:
         self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
 
     def wanted(self, known: Collection[Key]) -> list[Key]:
-        """Return the entries of the moment reached that the terms read.
+        """Return the entries of the next state that the terms read.
 
         Args:
             known: the entries that there are.

@@ -61,7 +61,7 @@ class OffPolicy(Agent):
     # algorithm. Without it some seeds brake fully for ever: where every action leads to the same
     # end, nothing else draws the actor back from the tanh's flat part.
     saturation: NonNegative = 0.001
-    # Of the learning rates at the end; they fall to it along half a cosine. 1 is the literal
+    # Share of the learning rates that is left at the end of half a cosine. 1 is the literal
     # algorithm, whose policy keeps swinging until it stops.
     final_lr_fraction: Fraction = 0.05
     # Updates per collected transition; the paper is silent. Many more would never end.

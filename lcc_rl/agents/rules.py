@@ -167,7 +167,7 @@ def make_policy(
     size = observation.event_shape[-1]
     if kind == NETWORK:
         if constants:
-            raise ConfigError("agent.constants belong to a rule: say agent.policy=idm or acc")
+            raise ConfigError("agent.constants belong to a rule: use agent.policy=idm or acc")
         return make_actor(size, 1, hidden, seed)
     name = kind.removeprefix(RESIDUAL)
     if name not in RULES:

@@ -51,7 +51,7 @@ class Tuned(SimulatedAgent):
             )
         self.begun = parameters_to_vector(self.weights).detach().double().cpu().numpy()
         self.search = self._search()
-        # Of every candidate so far: its cost, and its share of each limit, by name.
+        # Cost of every candidate so far, and its share of each limit, by name.
         self.costs: list[float] = []
         self.missed: list[list[float]] = []
         self.asked: list[np.ndarray] = []

@@ -239,7 +239,7 @@ class DriveLeaders(Settings):
 
     Several drives are divided by name: whether a drive is held out depends on a SHA-256 hash of
     its name alone, or of the part that drives of one day share, so that it is on the same side in
-    every file. Of a single record the end is held out.
+    every file. The end of a single record is held out.
     """
 
     # A .csv or .parquet file, of drives also several or a pattern. A native OpenACC file is the
@@ -385,7 +385,7 @@ class Mixture:
             if not callable(getattr(source, "load", None)):
                 raise ConfigError(
                     f"leader.{name} must be a source of leaders, got {source!r}; "
-                    f"say +leader@leader.{name}=…"
+                    f"use +leader@leader.{name}=…"
                 )
         for name, weight in (weights or {}).items():
             if name not in sources:

@@ -1,6 +1,6 @@
 """Reader of NGSIM files in any published layout.
 
-Three layouts are read, plain or gzipped, told apart by their first line: the native headerless
+Three layouts are read, plain or gzipped, distinguished by their first line: the native headerless
 18 columns separated by white space, the 18-column CSV with header (19 with Location), and the
 25-column export of the public portal. Files are streamed in blocks and only the needed columns
 are kept, in compact types, so that the whole portal export fits in a few gigabytes.
@@ -439,7 +439,7 @@ def _fill_headways(
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:
     """Check that the vehicles of every recording are as long as vehicles are.
 
-    Where a file gives no lengths, the shortest headways (1 % quantile) are looked at instead.
+    If a file gives no lengths, the shortest headways (1 % quantile) are checked instead.
     """
     for name, part in samples.groupby("recording", observed=True):
         lengths = part.groupby("vehicle")["length_m"].first()
@@ -456,6 +456,6 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
             other = "feet" if units == "metres" else "metres"
             raise DataError(
                 f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "
-                f"{units}; expected {low:g} to {high:g} m; is the file in {other}? say "
+                f"{units}; expected {low:g} to {high:g} m; is the file in {other}? Use "
                 f"data.units={other}"
             )

@@ -69,7 +69,7 @@ class Plausible(Settings):
         starts = starts_of(table["episode"].to_numpy())
         first = np.isin(np.arange(len(table)), starts)
         lengths = np.diff([*starts, len(table)])
-        keep, lines, told = np.ones(len(starts), dtype=bool), [], ""
+        keep, lines, advice = np.ones(len(starts), dtype=bool), [], ""
         for column, words, values, name, wrong in self._faults(table, first):
             bad = np.logical_or.reduceat(wrong, starts) & keep
             if not bad.any():
@@ -79,13 +79,13 @@ class Plausible(Settings):
             said = f"{place(row, column)} {words.format(values[row])}, {limit}"
             lines.append(f"left out {int(bad.sum()):,} implausible record(s), the first: {said}")
             more = remedy if name == "max_acceleration" else ""
-            told = told or f"{said}; mend the file{more}, or raise that threshold"
+            advice = advice or f"{said}; mend the file{more}, or raise that threshold"
             keep &= ~bad
         if not keep.any() or np.mean(~keep) > self.max_share:
             raise DataError(
                 f"{source}: {int((~keep).sum()):,} of {len(keep):,} records are implausible (at "
                 f"most {setting}.max_share={self.max_share:g} of them may be left out), the first: "
-                f"{told}"
+                f"{advice}"
             )
         kept = table if keep.all() else table[np.repeat(keep, lengths)].reset_index(drop=True)
         rate = gap_rate(kept)

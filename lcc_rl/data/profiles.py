@@ -291,7 +291,7 @@ class Split(Settings):
         if len(distinct) < 2:
             raise DataError(
                 f"cannot split {len(profiles)} profiles by {self.by}: only {distinct} found; "
-                "say split.by=vehicle or give more data"
+                "use split.by=vehicle or give more data"
             )
         held = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
         # Evenly spread over the sorted groups, the last always among them: deterministic and

@@ -23,7 +23,7 @@ FIELDS = (
     Column("time", "time"),
     Column("speed", "speed", least=0.0),
 )
-# Of the first car of a native OpenACC file, whose blank cells divide a record.
+# Columns of the first car of a native OpenACC file; blank cells divide a record.
 NATIVE = (Column("time", "time"), Column("speed", "speed", least=0.0, blank=True))
 COLUMNS: dict[str, str | None] = {"drive": "drive", "time": TIME, "speed": SPEED}
 UNEVEN = 0.1  # of the median step, by which a step may differ from it

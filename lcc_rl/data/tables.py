@@ -81,7 +81,7 @@ class Column:
 
 
 def check_map(columns: Iterable[Column], names: Names, units: Mapping[str, str], at: str) -> None:
-    """Check what a configuration says of the columns of a file.
+    """Check the columns and units of a file as a configuration names them.
 
     Args:
         columns: those that there may be.
@@ -368,7 +368,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reading(name: str | Path) -> Iterator[IO[bytes]]:
-    """Open a plain or gzipped file, told by its first bytes.
+    """Open a plain or gzipped file, distinguished by its first bytes.
 
     Raises:
         DataError: if it cannot be read or is damaged.
@@ -396,7 +396,7 @@ def unpacked_size(name: str | Path) -> int:
         if not packed:
             return size
         file.seek(max(0, size - 4))
-        # Of the content, modulo 4 GiB, which is never less than the file itself.
+        # Size of the content modulo 4 GiB; the content is never smaller than the file.
         return max(size, int.from_bytes(file.read(4), "little"))
     return 0
 

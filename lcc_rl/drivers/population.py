@@ -41,8 +41,8 @@ class DriverPopulation:
         desired_speed: v0, ``[drivers]`` [m/s].
         time_gap: T, ``[drivers]`` [s].
         constants: the other parameters of the IDM: numbers where all drivers share them, else
-            tensors ``[drivers]`` (a globally calibrated population). Of drivers with other
-            models, what an estimator by the IDM takes them for.
+            tensors ``[drivers]`` (a globally calibrated population). For drivers of other
+            models they are what an estimator by the IDM assumes.
         ids: the drivers' identities, one per driver.
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
         models: the model of every driver; None: the IDM of all.

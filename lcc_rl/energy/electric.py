@@ -26,7 +26,7 @@ class ElectricCar(EnergyModel):
     through the battery (0.985).
     """
 
-    # Of the car and those in it [kg].
+    # Mass of the car and its passengers [kg].
     mass: Annotated[float, Field(ge=100.0, le=100_000.0)] = 1636.0
     rotating_mass: Positive = 1.03  # factor of the mass that is accelerated
     drag: Positive = 0.315  # drag coefficient

@@ -73,7 +73,7 @@ def _play(
 def _kept(piece: Piece) -> dict[str, list[Any]]:
     """Return what a piece and the modules in it hold in attributes, so that a change shows.
 
-    Of a tensor the number of changes in place belongs to it, of a list or mapping its items.
+    A tensor counts with the number of its changes in place, a list or mapping with its items.
     """
     held = {}
     for path, module in piece.named_modules():

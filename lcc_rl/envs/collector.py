@@ -35,7 +35,7 @@ class StringCollector(BaseCollector):
         policy: writes the action into a TensorDict with its ``in_keys``; None for random actions.
         frames_per_batch: frames of one batch: steps times episodes side by side.
         total_frames: frames after which iteration ends; −1: never.
-        keys: the entries of a batch, those of the moment reached under ``"next"``; a key of
+        keys: the entries of a batch, those of the next state under ``"next"``; a key of
             several entries stands for all of them. None: all entries.
         compiled: compile the step, policy included; where there is no compiler, one line of the
             log says so and the plain step is used.
@@ -156,7 +156,7 @@ class StringCollector(BaseCollector):
         return {**state, inner: action if inner == self.action else action.unsqueeze(-2)}
 
     def _advance(self, state: State) -> tuple[State, list[Tensor], Tensor]:
-        """Return the moment reached, the entries to keep and whether any episode is over."""
+        """Return the next state, the entries to keep and whether any episode is over."""
         before = self._act(state)
         reached = self.step(before)
         kept = [
@@ -175,7 +175,7 @@ class StringCollector(BaseCollector):
         """Begin a new episode where one is over.
 
         Args:
-            state: the moment reached.
+            state: the next state.
             renewed: :meth:`_renewed`, or the same compiled.
             size: for how many episodes it is compiled; 0 for any number.
         """

@@ -14,8 +14,7 @@ log = logging.getLogger("lcc_rl")
 
 # CppCompileError: of a compiler that is there, but refuses the processor's code.
 COMPILER_ERRORS = (TorchDynamoException, InductorError, CppCompileError)
-# Where an object whose method is compiled keeps the environment and its pieces, and an environment
-# its pieces.
+# Attributes in which an object with a compiled method keeps the environment and its pieces.
 CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
 
 

@@ -142,7 +142,7 @@ def build_pieces(
 
 
 def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[Piece]:
-    """Build the pieces that say what the filters answer for, and what they change."""
+    """Build the pieces that record what the filters promise, and what they change."""
     filters = {piece.role: piece for piece in drivers if isinstance(piece, CBFFilter)}
     changed = [
         Corrected(max_acceleration=piece.max_acceleration).bind(world, piece.role)
@@ -183,7 +183,7 @@ def _drivers(scenario: Any, world: World) -> list[Any]:
                 known = ", ".join(name for name in nodes if nodes[name] is not None)
                 raise ConfigError(
                     f"scenario.string has the role {role!r}, but scenario.controllers names only "
-                    f"{known}; say +controller@scenario.controllers.{role}=… for another"
+                    f"{known}; use +controller@scenario.controllers.{role}=… for another"
                 )
         strange = [role for role in nodes if not needed and role not in roles]
         if strange:

@@ -31,7 +31,7 @@ class DifferentiableRollout:
 
     Args:
         env: the environment, without the single-agent view.
-        wanted: entries of the moment reached that the record must hold, with their gradient.
+        wanted: entries of the next state that the record must hold, with their gradient.
         observed: further entries that the record must hold; what only they need gets none.
         compiled: compile the step, for a batch size once; where there is no compiler, one line
             of the log says so and the plain step is used.
@@ -64,7 +64,7 @@ class DifferentiableRollout:
         return {key: td.get(key) for key in sorted(self.carried)}
 
     def _advance(self, state: State, action: Tensor) -> State:
-        """Return the moment reached."""
+        """Return the next state."""
         reached = self.step({**state, ACTION: action})
         return {key: reached[key] for key in state}
 

@@ -51,10 +51,10 @@ class Step:
         self.horizon = horizon
 
     def __call__(self, before: State) -> State:
-        """Return the entries of the moment reached.
+        """Return the entries of the next state.
 
         Args:
-            before: the entries of the moment left that the pieces read, the action among them.
+            before: the entries before the step that the pieces read, the action among them.
         """
         reached = tick(before[SEED], before[STEP] + 1, self.horizon)
         for piece, detached in self.pieces:

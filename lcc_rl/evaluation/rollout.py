@@ -19,7 +19,7 @@ from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
 # Reads and writes a TensorDict; None where a rule drives.
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Record = dict[Key, Tensor]
-# The moment reached, the entries to keep, who still runs, and a sum of all that was written.
+# The next state, the entries to keep, which episodes run, and a sum of all that was written.
 Advanced = tuple[State, list[Tensor], Tensor]
 PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
 
@@ -117,7 +117,7 @@ class Player:
         return {key: value for key, value in state.items() if key in carried}
 
     def _advance(self, state: State, running: Tensor) -> Advanced:
-        """Return the moment reached, the entries to keep, and who still runs."""
+        """Return the next state, the entries to keep, and which episodes still run."""
         before = {**state, **self._action(state)}
         reached = self.step(before)
         after = {key: reached.get(key, value) for key, value in state.items()}

@@ -170,7 +170,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     spread = rows.groupby(["profile", "driver_id"])[first_speed].transform("std")
     first = rows.iloc[int(spread.to_numpy().argmax())]
     rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
-    # Of several vehicles of a kind the first is shown.
+    # The first of several vehicles of a kind is shown.
     return rows.rename(columns=lambda name: re.sub(r"^(cav|hdv)1_", r"\1_", name))
 
 

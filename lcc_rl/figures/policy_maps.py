@@ -61,7 +61,7 @@ def accelerations(rows: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any
 
 
 def winners(rows: pd.DataFrame) -> Figure:
-    """Who drives in a hybrid strategy over gap and relative speed.
+    """Draw which controller drives in a hybrid strategy over gap and relative speed.
 
     Args:
         rows: of responses.parquet.

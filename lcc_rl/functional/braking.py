@@ -20,7 +20,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Braking:
-    """Who can brake how hard, and what is to be kept.
+    """Braking of both vehicles, and the time-to-collision to be kept.
 
     Args:
         own: largest braking of the vehicle itself, positive [m/s²].
@@ -63,7 +63,7 @@ def _room_at(
 ) -> Tensor:
     """Return the least room from the moment on at which the vehicle ahead stands."""
     tau, own = braking.time_to_collision, braking.own
-    # Who stands before opens the gap again; its room was least before.
+    # A vehicle that stands earlier sees its gap open again: its room was least before.
     reached = (speed - own * time).clamp(min=0.0)
     moving = torch.minimum(time, speed / own)
     gap = gap + 0.5 * speed_ahead * time - 0.5 * (speed + reached) * moving

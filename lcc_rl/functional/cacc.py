@@ -68,7 +68,7 @@ def platoon_errors(
 
 
 class Chain(NamedTuple):
-    """Who hears whom by radio; all others rely on their own sensors, which have no delay.
+    """The radio links of a string; other vehicles use their own sensors, which have no delay.
 
     first: place of the first vehicle of each vehicle's chain of connected vehicles, int64,
     ``[*batch, N]``; hears: whether the vehicle ahead, and so the leader of its chain, sends to it,

@@ -15,7 +15,7 @@ from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
 
 class Place(NamedTuple):
-    """Where a vehicle is in its platoon, each ``[*batch, N, 1]``.
+    """Place of a vehicle in its platoon, each ``[*batch, N, 1]``.
 
     leader_gap: e_x(i,0), positive where too far behind [m]; leader_speed: v_0 [m/s].
     """
@@ -176,7 +176,7 @@ def hybrid_decision(
         last_winner: winner of the frame before; negative or None where there was none.
         leader_next: the predicted speed of each vehicle's leader [m/s].
         interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
-        cap: see :func:`safe_acceleration`; None leaves it out. Where it or a candidate is not a
+        cap: see :func:`safe_acceleration`; None leaves it out. If it or a candidate is not a
             finite number, the vehicle brakes as hard as it can.
         reward: the reward to compare by.
         time_step: T [s].
@@ -212,7 +212,7 @@ def _bounded(
     if cap is None:
         return candidates, clamped, torch.zeros_like(clamped)
     bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
-    # Where a wish, or what the cap is computed from, is no number, nothing is known to be safe.
+    # If a candidate, or what the cap is computed from, is no number, nothing is known to be safe.
     known = (free.isfinite() & bounded.isfinite() & cap.isfinite()).all(0)
     bounded = torch.where(known, bounded, -max_acceleration)
     return bounded, clamped, (bounded != candidates).any(0)

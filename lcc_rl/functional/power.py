@@ -73,8 +73,8 @@ def acceleration_loss(speed: Tensor, acceleration: Tensor) -> Tensor:
 
     Over a trip A2 is a sum of three: the :func:`steady_power` of the speeds driven, what the last
     speed stores more than the first (the part with a, the derivative of a function of the speed,
-    which braking returns), and this. Of the three only this is left to a controller that follows
-    the same leader over the same distance.
+    which braking returns), and this. A controller that follows the same leader over the
+    same distance can only change this one.
 
     Args:
         speed: speed at the start of the step, any shape [m/s].

@@ -42,7 +42,7 @@ class Bridge:
 
     The commands are executed exactly: SUMO's checks of speeds, right of way and traffic lights are
     off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees nobody
-    ahead within ``sight``; its memory then begins anew. Where nobody is behind and the policy does
+    ahead within ``sight``; its memory then begins anew. If nobody is behind and the policy does
     not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
 
     Args:

@@ -3,12 +3,12 @@
 One object serves every role: in an environment, inside a ``TensorDictSequential``, by keyword
 call, on a stored rollout and in a replay buffer. Two kinds exist:
 
-* a :class:`Feature` reads one moment: the same function at reset and after every step;
-* a :class:`StepTransform` reads two: keys under ``"next"`` belong to the moment reached, all
-  others to the moment left, so that it applies unchanged to any stored transition.
+* a :class:`Feature` reads one state: the same function at reset and after every step;
+* a :class:`StepTransform` reads two: keys under ``"next"`` belong to the state after the step, all
+  others to the state before it, so that it applies unchanged to any stored transition.
 
-A piece is made of its settings (:mod:`lcc_rl.settings`), and a copy of it is put into a world by
-``bind``, which calls ``setup``: there it says by ``wire`` what it reads and writes.
+A piece is made of its settings (:mod:`lcc_rl.settings`). ``bind`` puts a copy of it into a world
+and calls ``setup``, which declares by ``wire`` what the piece reads and writes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ STEP = ("episode", "step")
 
 
 def next_key(key: NestedKey) -> Key:
-    """Return the key of the same entry at the moment reached."""
+    """Return the key of the same entry in the next state."""
     return (NEXT, *as_key(key))
 
 
@@ -124,8 +124,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """Compute the entries written from plain mappings of entries.
 
         Args:
-            before: entries of the moment left; a feature does not look at them.
-            reached: entries of the moment reached, to which those written are added.
+            before: entries of the state before the step; a feature ignores them.
+            reached: entries of the state after it, to which those written are added.
             detached: cut the gradient of what is written.
         """
         values = self._entries(before, reached)
@@ -188,7 +188,7 @@ class Feature(Piece):
 
 
 class StepTransform(Piece):
-    """A piece that reads the moment left and the moment reached."""
+    """A piece that reads the states before and after a step."""
 
     def wire(
         self,
@@ -203,7 +203,7 @@ class StepTransform(Piece):
         Args:
             reads: keys of the arguments of :meth:`compute`; under ``"next"`` for the moment
                 reached.
-            writes: keys written at the moment reached, given without ``"next"``.
+            writes: keys written in the next state, given without ``"next"``.
             event_shape: shape of one written entry after the batch dimensions.
             constants: keys that :meth:`begin` sets at reset and that keep their value for the
                 whole episode.
@@ -265,7 +265,7 @@ class StepTransform(Piece):
 class RewardPiece(Feature):
     """A feature written to the reward spec: it exists after a step, not at reset.
 
-    Called on stored transitions (TensorDicts with ``"next"``), it reads the moment reached and
+    Called on stored transitions (TensorDicts with ``"next"``), it reads the next state and
     writes there, as in an environment.
     """
 

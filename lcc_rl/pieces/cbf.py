@@ -22,7 +22,7 @@ class CBFFilter(StepTransform):
     Two functions of the state are to stay positive: ``gap − margin − τ·(v − v_ahead)``, which
     keeps time-to-collision above τ, and ``longest(v) − gap``, which keeps the time gap below
     ``time_gap``. Each may fall at most at its rate times its value per second, which bounds the
-    acceleration from above and from below; within the bounds the controller decides. Where they
+    acceleration from above and from below; within the bounds the controller decides. If they
     contradict each other, safety wins. This is the quadratic programme of Ames, Grizzle and
     Tabuada ("Control barrier function based quadratic programs with application to adaptive
     cruise control", CDC 2014), whose solution for one number is a clamp. The vehicle ahead is
@@ -32,7 +32,7 @@ class CBFFilter(StepTransform):
     braking maintains the first limit even if the vehicle ahead brakes by ``braking_ahead`` until
     it stands (:mod:`lcc_rl.functional.braking`). A vehicle that starts there has no TTC below τ at
     any sample as long as the vehicle ahead brakes no harder; which steps that covers, the
-    :class:`Promised` of :meth:`watch` writes. Where a measurement or the command is no number, the
+    :class:`Promised` of :meth:`watch` writes. If a measurement or the command is no number, the
     filter brakes fully.
 
     With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
@@ -74,7 +74,7 @@ class CBFFilter(StepTransform):
         self.braking = Braking(self.max_acceleration, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> Promised:
-        """Return the piece that says for which steps the filter answers."""
+        """Return the piece that records the steps for which the filter promises its limit."""
         watching = Promised(braking=self.braking, margin=self.margin)
         return watching.bind(World(self.string), self.role)
 

@@ -42,8 +42,8 @@ class Communication(Feature):
     [m]; speed [m/s] and acceleration [m/s²] of its leader.
 
     A connected vehicle hears the connected vehicles ahead of it without a gap in the chain. The
-    vehicle ahead of the first of them is the chain's leader; where it is not connected, the first
-    one sees it by its own sensors, without delay. Of a vehicle that is not connected the errors
+    vehicle ahead of the first of them is the chain's leader; if it is not connected, the first
+    one sees it by its own sensors, without delay. The errors of a vehicle that is not connected
     refer to the vehicle ahead.
     """
 
@@ -170,5 +170,5 @@ def check_leader(lookahead: str, controller: Controller) -> None:
     if lookahead == "oracle" and controller.string.names != (controller.role,):
         raise ConfigError(
             f"{where}.lookahead=oracle knows the recorded leader only, but the string has "
-            f"{', '.join(controller.string.names)}; say causal or hold"
+            f"{', '.join(controller.string.names)}; use causal or hold"
         )

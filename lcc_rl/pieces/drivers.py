@@ -24,7 +24,7 @@ from lcc_rl.settings import NonNegative, Positive, Share
 
 LEADER_SPEED = ("leader", "speed")
 MOTION = ("self.speed", "self.gap", "self.relative_speed")
-LONGEST = 1000.0  # time gap up to which an equilibrium is told [s]
+LONGEST = 1000.0  # time gap up to which an equilibrium gap is written [s]
 MOST_DELAY = 1000  # steps that a driver may be late; each is kept per vehicle
 
 
@@ -59,9 +59,9 @@ class Drivers(Controller):
         """Take the drivers, and choose what is read and written by the settings."""
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
-        told = ["driver", "desired_speed", "desired_time_gap"]
+        kept = ["driver", "desired_speed", "desired_time_gap"]
         self.starts = self.tells_gap and not world.string.ring
-        constants = [(role, name) for name in [*told, *["equilibrium_gap"] * self.starts]]
+        constants = [(role, name) for name in [*kept, *["equilibrium_gap"] * self.starts]]
         history = [(role, "motion_history")] * (self.delay > 0)
         names = [*MOTION, *(".".join(key) for key in constants[1:3]), "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]

@@ -99,7 +99,8 @@ def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:
 class MotorPower(StepTransform):
     """Writes the power of the step just taken [W], from the speed at its start (A2 by default).
 
-    Of a predicted acceleration it is what an automated vehicle believes of a human driver (A16).
+    From a predicted acceleration it computes what an automated vehicle believes of a human driver
+    (A16).
     """
 
     vehicles: str = VEHICLES  # whose power: "vehicles" for all of them, or a role

@@ -56,7 +56,7 @@ class HCFS(Controller):
     safe_cap: bool = True
     braking: Positive = 3.0  # b of the safe cap [m/s²]
     margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
-    # Of the reward compared, see lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
+    # Settings of the compared lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
     # the paper's rule, gap_scale and spacing_time have no effect.
     velocity_weight: NonNegative = 10.0
     speed_scale: Positive = 27.1  # [m/s]
@@ -165,6 +165,6 @@ def check_spacing(pieces: Sequence[Piece], profiles: Profiles) -> None:
                     f"the leader drives {speed:.1f} m/s ({profiles.names[fastest]}): the safe cap "
                     f"of HCFS then needs a gap of {needed:.2f} m, the platoon keeps a headway of "
                     f"{heard.headway:g} m, enough up to "
-                    f"{(heard.headway - hybrid.margin) / reach:.1f} m/s; say "
+                    f"{(heard.headway - hybrid.margin) / reach:.1f} m/s; use "
                     f"scenario.start.automated.headway={math.ceil(needed + SPARE)}"
                 )

@@ -105,7 +105,7 @@ class NGSIMLeader(StepTransform):
     def compute(
         self, profile: Tensor, first: Tensor, speed: Tensor, step: Tensor, seed: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return speed, acceleration and next speed at the moment reached."""
+        """Return speed, acceleration and next speed after the step."""
         reached = self.speed_at(profile, first, step, seed)
         motion = (reached, (reached - speed) / self.time_step)
         if not self.foresight:

@@ -40,7 +40,7 @@ class MPCSettings(Settings):
     least_ttc: NonNegative = 4.1  # time-to-collision that is kept [s]
     steady_price: NonNegative = 1.0  # of what the planned speeds take without accelerating
     jerk_price: NonNegative = 0.1  # of the squared change of the acceleration per second [s²]
-    # Of the squared distance by which the gap is too short, too long, or too short for the
+    # Prices of the squared distance by which the gap is too short, too long, or too short for the
     # time-to-collision [1/(m²s⁴)].
     near_price: Positive = 3.0
     far_price: Positive = 0.1

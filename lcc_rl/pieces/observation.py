@@ -23,7 +23,7 @@ Width = Annotated[int, Field(ge=1, le=10_000)]  # entries of one view
 class Observation(Feature):
     """Gathers entries, each times a fixed constant, into ``("automated", "observation")``.
 
-    Writes ``[*batch, A, entries]``, one row per automated vehicle. Where a vehicle may have
+    Writes ``[*batch, A, entries]``, one row per automated vehicle. If a vehicle may have
     fewer than ``visible`` vehicles behind, their entries are zero and one more entry per vehicle
     behind says whether it is there (1 or 0). HCFS observes the state H3, see
     ``conf/observation/platoon.yaml``.
@@ -33,12 +33,12 @@ class Observation(Feature):
     # observation, e.g. {"self": {"speed": 0.1}, "ahead": {"speed": 0.1}}.
     scales: Mapping[str, Mapping[str, Number]]
     visible: Width = 1  # how many vehicles behind are seen, the nearest first
-    # Of views whose entries are wider than one number their width, or a list as long as they are
-    # wide, e.g. the horizons of a preview.
+    # Width of the views whose entries are wider than one number, or a list of that length, e.g.
+    # the horizons of a preview.
     widths: Mapping[str, Width | Sequence[float]] | None = None
-    # Of views whose entries are seen as differences, from what, dotted: {"preview": "ahead.speed"},
-    # or one for each of as many equal parts; None: as they are. What matters is then not hidden in
-    # a small difference of large numbers.
+    # Dotted names of what entries are seen as differences from, e.g. {"preview": "ahead.speed"}, or
+    # one for each of as many equal parts; None: as they are. A difference does not hide what
+    # matters in large numbers.
     relative_to: Mapping[str, str | Sequence[str] | None] | None = None
     raw: bool = False  # take every entry times 1, in SI units, whatever its scale
 
@@ -74,7 +74,7 @@ class Observation(Feature):
         shape = (string.count(AUTOMATED), len(values))
         self.wire(self.views.keys, [(AUTOMATED, OBSERVATION)], shape)
         firsts = [sum(counts[:place]) for place in range(len(counts))]
-        # Of entries seen as they are: the (first) column of each.
+        # The (first) column of each entry that is seen as it is.
         each = zip(seen, firsts, bases, strict=True)
         self.layout = {".".join(key): first for key, first, base in each if not base}
         self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
@@ -94,9 +94,9 @@ class Observation(Feature):
         return self.layout[name]
 
     def columns(self) -> list[list[str]]:
-        """Return of every column what is seen, and from what it is a difference, if from any.
+        """Return the names of what each column holds, and of what it is a difference from, if any.
 
-        Of a view with several columns the number of the column follows: ``"memory.entries.0"``.
+        A view with several columns ends with the column's number: ``"memory.entries.0"``.
         """
         found = []
         for name, bases, repeat in zip(self.seen, self.bases, self.repeats, strict=True):
@@ -115,7 +115,7 @@ class Observation(Feature):
                 base = torch.cat([values[i] for i in bases], -1)
                 seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
         vehicles = max(entry.shape[-2] for entry in seen)
-        # Where all see the same, such as a preview of the leader, there is one row for all.
+        # What all see alike, such as a preview of the leader, has one row for all.
         rows = [
             entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
             for entry in seen

@@ -78,12 +78,12 @@ class EquilibriumStart(Part):
         if desired_speed is None or time_gap is None:
             raise ConfigError(
                 f"scenario.start.{role}: EquilibriumStart needs {role}.desired_speed and "
-                f"{role}.desired_time_gap, which only driver models write; say for example "
+                f"{role}.desired_time_gap, which only driver models write; use for example "
                 f"'scenario.start.{role}=${{scenario.start.automated}}'"
             )
-        told = start.get((role, "equilibrium_gap"), None)
-        if told is not None:
-            return speed, capped(told, speed, self.drivers, self.cap_time_gap)
+        known = start.get((role, "equilibrium_gap"), None)
+        if known is not None:
+            return speed, capped(known, speed, self.drivers, self.cap_time_gap)
         gap = equilibrium_gap(speed, desired_speed, time_gap, self.drivers, self.cap_time_gap)
         return speed, gap
 

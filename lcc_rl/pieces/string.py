@@ -27,8 +27,8 @@ LEADER_SPEED = (LEADER, "speed")
 class Places(StepTransform):
     """Writes which vehicles have which role, ``(role, "index")``, ``[*batch, n]``, int64.
 
-    Of a string whose places are drawn, for every role and anew in every episode, by its seed;
-    else for the automated vehicles alone. The places are constant within an episode.
+    If the places of a string are drawn, they are written for every role, anew in every episode by
+    its seed; else for the automated vehicles alone. The places are constant within an episode.
     """
 
     index: ClassVar[Tensor]
@@ -134,7 +134,7 @@ class StringMotion(StepTransform):
         return self.initial_speed, gap
 
     def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
-        """Return the motion at the moment reached, and the commands that led there."""
+        """Return the motion after the step, and the commands that led there."""
         leader, reached = (None, None) if self.string.ring else more[:2]
         parts = more[0 if self.string.ring else 2 :]
         roles = len(self.string.names)

@@ -1,9 +1,9 @@
-"""Smooth stand-ins for reward terms with thresholds: what a gradient can follow, in training only.
+"""Smooth surrogates of reward terms with thresholds, which have a gradient; for training only.
 
 The literal terms have no slope where it matters: an indicator has none at all, a penalty that
-begins at a threshold has none before it. Each stand-in takes a ``threshold`` of its own, to be
-set a little on the safe side of the term's, and a ``width`` over which it bends. Where a limit is
-to be kept and not a price to be paid, ``missed`` says where it is not.
+begins at a threshold has none before it. Each surrogate has a ``threshold`` of its own, to be
+set a little on the safe side of the term's, and a ``width`` over which it bends. ``missed`` marks
+the steps that violate the term's limit.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Smoothness(RewardTerm):
     """Minus the square of the jerk: draws a policy that still learns away from limit cycles.
 
     With a high gain on the gap a controlled car oscillates, and gradients through an oscillating
-    car are long and say little.
+    car are long and carry little information.
     """
 
     weight: NonNegative = 0.001  # price of 1 (m/s³)²

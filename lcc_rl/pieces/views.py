@@ -11,8 +11,8 @@
 any other ``name.x``    the entry as it is, ``[*batch, n, w]``: one row per vehicle of the role
 ======================  ====================================================================
 
-With ``next.`` before a name the moment reached is meant. Whatever the name, what comes out is
-``[*batch, n, w]``, one row per vehicle of the role (or 1 where all of them see the same).
+A name that begins with ``next.`` means the state after the step. Every name gives
+``[*batch, n, w]``, one row per vehicle of the role (or 1 if all of them see the same).
 """
 
 from __future__ import annotations

@@ -55,8 +55,8 @@ def saving(values: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Esti
 
     The interval is that of a clustered bootstrap: held-out windows and training seeds are
     resampled crosswise (the pigeonhole bootstrap, Owen 2007). Both sides meet the same windows;
-    the seeds of two trainings are independent. Of n windows or seeds n − 1 are drawn, which makes
-    the variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 %
+    the seeds of two trainings are independent. From n windows or seeds n − 1 are drawn, which
+    makes the variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 %
     intervals of eight seeds hold the truth in 90 to 97 % of cases, of four in 80 to 91 %, of two
     in 61 to 84 %: with few seeds that differ much, the interval is too narrow.
 

@@ -21,7 +21,7 @@ ENDS = {"min": "min", "max": "max", "worst": "max"}  # first word of a column â†
 class Means:
     """Means over the episodes of an evaluation in which all windows have the same drivers.
 
-    Of columns that begin with ``min_`` and ``max_`` these are the least and the largest value.
+    Columns that begin with ``min_`` or ``max_`` hold the least or the largest value.
 
     Args:
         windows: a row per strategy, training seed and window, with ``episodes``, their number,

@@ -1,4 +1,4 @@
-"""Where every vehicle of a sample episode is: what diagrams and animations draw."""
+"""Positions of all vehicles in a sample episode, for diagrams and animations."""
 
 from __future__ import annotations
 

@@ -1,53 +1,159 @@
-"""What an environment is made with and stepped with, in Python."""
+"""What an environment is made, reset and stepped with in Python, and pieces that remember."""
 
 from __future__ import annotations
+
+from collections import deque
 
 import pytest
 import torch
 from commands import DATA
+from helpers import compose, single_env, small_env, wavy_profiles
+from tensordict import TensorDict
 
-from lcc_rl.data.leaders import stretch
-from lcc_rl.envs import make_env
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_env
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.pieces import Controller, Feature
+from lcc_rl.pieces.rewards import REWARD
 
-PLATOON = ("scenario.string=automated*3",)
+PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
+SEED, GAP = ("episode", "seed"), ("vehicles", "gap")
+BAD = [
+    ({("humn", "driver"): torch.zeros(2, 1, 1).long()}, r"humn\.driver is no .*those that exist"),
+    ({GAP: torch.zeros(2, 2, 1)}, r"vehicles\.gap is no .*episode\.seed, leader\.profile"),
+    ({("episode", "step"): torch.zeros(2, 1).long()}, r"episode\.step is no reset option"),
+    ({DRIVER: torch.zeros(2, 1, 1)}, r"human\.driver must be \[2, 1, 1\] torch.int64, got"),
+    ({DRIVER: torch.zeros(2, 3, 1).long()}, r"human\.driver must be .* got \[2, 3, 1\]"),
+    ({DRIVER: torch.full((2, 1, 1), 10**6)}, r"human\.driver must lie in 0…\d+, got 1000000"),
+    ({SEED: torch.tensor([[1], [-3]])}, r"episode\.seed must lie in 0…4294967295, got -3"),
+    ({PROFILE: torch.tensor([[0], [4]])}, r"leader\.profile must lie in 0…3, got 4"),
+    ({START: torch.tensor([[0], [380]])}, r"leader\.start must lie in 0…379, got 380"),
+]
 
 
-@pytest.mark.parametrize("size", [10**9, (10**5, 10**5), 10**30])
-def test_a_batch_that_does_not_fit_into_memory(size) -> None:
-    with pytest.raises(ConfigError, match=r"batch_size=.* needs about \d+.* of memory"):
-        make_env("alcc", size, DATA)
+@pytest.fixture(scope="module")
+def envs():
+    return {"group": small_env("alcc", 2), "single": single_env("alcc", 2)}
+
+
+@pytest.mark.parametrize(("given", "words"), BAD)
+def test_a_bad_reset_option_is_named(envs, given, words) -> None:
+    for env in envs.values():
+        with pytest.raises(ConfigError, match=words):
+            env.reset(TensorDict(given, [2]))
+
+
+def test_every_way_to_reset_refuses_them(envs) -> None:
+    env, given = envs["group"], TensorDict({GAP: torch.zeros(2, 2, 1)}, [2])
+    with pytest.raises(ConfigError, match=r"vehicles\.gap is no"):
+        play(env, lambda td: td, given, [REWARD])
+    with pytest.raises(ConfigError, match=r"vehicles\.gap is no"):
+        DifferentiableRollout(env, [REWARD]).start(given)
+    with pytest.raises(ConfigError, match=r"TensorDict of \[2\] episodes, .* got \[3\]"):
+        env.reset(TensorDict({SEED: torch.zeros(3, 1).long()}, [3]))
+
+
+@pytest.mark.parametrize("kind", ["group", "single"])
+def test_a_whole_moment_may_be_given_and_replays_its_episode(envs, kind) -> None:
+    env, given = envs[kind], TensorDict({SEED: torch.tensor([[3], [4]])}, [2])
+    first = env.reset(given).clone()
+    assert (env.reset(given) == first).all()  # TorchRL has written the moment into it
+    reached = env.rollout(5, break_when_any_done=False, tensordict=first.clone())[:, -1]
+    assert torch.equal(env.reset(reached.exclude("next"))[SEED], first[SEED])
+
+
+def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
+    for env in envs.values():
+        assert env.rollout(45, break_when_any_done=False).shape == (2, 45)
+    collector = StringCollector(envs["group"], None, frames_per_batch=90)
+    assert collector.collect().shape == (2, 45)
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("size", "seed", "words"),
     [
-        ({"seed": -1}, "seed must be a whole number from 0"),
-        ({"seed": 10**30}, "seed must be a whole number from 0"),
-        ({"seed": 0.5}, "seed must be a whole number from 0"),
+        (10**30, 0, r"batch_size=.* needs about \d+.* of memory"),
+        ((), -1, "seed must be"),
     ],
 )
-def test_numbers_that_are_none(settings, words) -> None:
+def test_an_impossible_batch_or_seed(size, seed, words) -> None:
     with pytest.raises(ConfigError, match=words):
-        make_env("alcc", overrides=DATA, **settings)
+        make_env("alcc", size, DATA, seed=seed)
 
 
-@pytest.mark.parametrize("shape", [(2,), (2, 2), (2, 1, 1)])
-def test_an_action_of_another_shape(shape) -> None:
-    env = make_env("alcc", 2, DATA)
-    moment = env.reset().set("action", torch.zeros(shape))
+def test_an_action_of_another_shape(envs) -> None:
+    moment = envs["single"].reset().set("action", torch.zeros(2))
     with pytest.raises(ConfigError, match=r"action must be \[2, 1\], got"):
-        env.step(moment)
-
-
-def test_one_action_does_not_drive_three_vehicles() -> None:
-    env = make_env("ddpg", 2, PLATOON, single=False)
-    moment = env.reset().set(("automated", "action"), torch.zeros(2, 1, 1))
+        envs["single"].step(moment)
+    three = small_env("ddpg", 2, ["scenario.string=automated*3"])
+    moment = three.reset().set(("automated", "action"), torch.zeros(2, 1, 1))
     with pytest.raises(ConfigError, match=r"automated.action must be \[2, 3, 1\], got \[2, 1, 1\]"):
-        env.step(moment)
+        three.step(moment)
 
 
-def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:
-    assert stretch("udds", 0.1, scale=2.0).speeds.max() > 50.0
-    with pytest.raises(ConfigError, match=r"udds at scale=100 drives up to .* m/s, leader.plaus"):
-        stretch("udds", 0.1, scale=100.0)
+# -- controllers that remember -----------------------------------------------------------------
+
+
+class Remembering(Controller):
+    """Sums up what it saw in ``self``, in one of several ways."""
+
+    how: str = ""
+    reads = ("self.speed",)
+
+    def setup(self, world) -> None:
+        super().setup(world)
+        self.last, self.seen, self.total = None, deque(), torch.zeros(())
+
+    def command(self, speed):
+        if self.how == "last":
+            self.last = speed
+        elif self.how == "seen":
+            self.seen.append(speed)
+        elif self.how == "total":
+            self.total += speed.mean()
+        elif self.how == "once" and self.last is None:
+            self.last = torch.ones(())
+        return torch.zeros_like(speed)
+
+
+class RememberingFeature(Feature):
+    """Keeps the last gap in an attribute."""
+
+    def setup(self, world) -> None:
+        shape = (len(world.string), 1)
+        self.wire([GAP], [("vehicles", "change")], shape)
+        self.before = None
+
+    def compute(self, gap):
+        self.before = gap
+        return gap
+
+
+def driven_by(group: str, name: str, node: dict) -> None:
+    cfg = compose("idm")
+    getattr(cfg.scenario, group)[name] = node
+    build_env(cfg, wavy_profiles(), bootstrap(), 2)
+
+
+@pytest.mark.parametrize("how", ["last", "seen", "total"])
+def test_a_controller_that_remembers_in_an_attribute_is_refused(how) -> None:
+    node = {"_target_": f"{__name__}.Remembering", "how": how}
+    words = f"Remembering remembers in its attribute '{how}'.* writes=… and reads"
+    with pytest.raises(ConfigError, match=words):
+        driven_by("controllers", "automated", node)
+
+
+def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:
+    with pytest.raises(ConfigError, match="remembers in its attribute 'before'"):
+        driven_by("pieces", "change", {"_target_": f"{__name__}.RememberingFeature"})
+    inner = {"_target_": f"{__name__}.Remembering", "how": "last"}
+    human = {"_target_": "lcc_rl.pieces.ConstantAcceleration"}
+    node = {"_target_": "lcc_rl.pieces.Handover", "before": human, "after": inner, "from_s": 1.0}
+    with pytest.raises(ConfigError, match=r"remembers in its attribute 'after\.last'"):
+        driven_by("controllers", "automated", node)
+
+
+@pytest.mark.parametrize("how", ["", "once"])
+def test_what_does_not_change_may_be_kept(how) -> None:
+    driven_by("controllers", "automated", {"_target_": f"{__name__}.Remembering", "how": how})

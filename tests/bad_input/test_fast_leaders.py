@@ -1,20 +1,20 @@
-"""Leaders faster than any driver wants to be: said in log, table and page, with the remedy."""
+"""Leaders faster than any driver wants to be: measured, and said with the remedy."""
 
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from commands import tiny
-from study_frames import episodes
 
 from lcc_rl.commands import evaluation
+from lcc_rl.data.leaders import stretch
 from lcc_rl.data.profiles import from_records
+from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rows import leader_faster
-from lcc_rl.results.tables import FASTER, leader_too_fast, summary
+from lcc_rl.results.tables import FASTER
 
 
 def test_the_share_of_time_by_hand() -> None:
@@ -27,7 +27,7 @@ def test_the_share_of_time_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("v0", "said"), [(2.0, True), (40.0, False)])
-def test_slow_drivers_behind_faster_leaders_are_said(tmp_path: Path, caplog, v0, said) -> None:
+def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, said) -> None:
     words = ["variant=alcc", "agent=none", "scenario.string=human", "drivers=fixed"]
     cfg = tiny("evaluate", *words, f"drivers.desired_speed={v0}", agent=False)
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
@@ -36,13 +36,7 @@ def test_slow_drivers_behind_faster_leaders_are_said(tmp_path: Path, caplog, v0,
     assert ("Raise v0: drivers=highway" in caplog.text) == said
 
 
-@pytest.mark.parametrize(("share", "said"), [(0.19, False), (0.21, True)])
-def test_the_warning_stands_in_the_table(share: float, said: bool) -> None:
-    assert leader_too_fast(episodes()) == []
-    frame = episodes()
-    frame[FASTER] = np.where(frame["strategy"] == "idm", share, 0.02)
-    frame = frame.assign(cav_distance_m=500.0, hdv_distance_m=500.0)
-    assert [line.partition(" for ")[0] for line in leader_too_fast(frame)] == [
-        "the leaders drive faster than the desired speed of idm"
-    ] * said
-    assert summary(frame).set_index("strategy").loc["idm", FASTER] == pytest.approx(share)
+def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:
+    assert stretch("udds", 0.1, scale=2.0).speeds.max() > 50.0
+    with pytest.raises(ConfigError, match=r"udds at scale=100 drives up to .* m/s, leader.plaus"):
+        stretch("udds", 0.1, scale=100.0)

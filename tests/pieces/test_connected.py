@@ -343,7 +343,7 @@ def fast(speed: float) -> Profiles:
 def test_a_headway_that_the_safe_cap_contradicts_is_refused_with_the_remedy() -> None:
     words = (
         r"leader drives 32\.0 m/s \(leader1\): the safe cap of HCFS then needs a gap of 7\.06 m, "
-        r"the platoon keeps a headway of 5 m, enough up to 22\.0 m/s; say "
+        r"the platoon keeps a headway of 5 m, enough up to 22\.0 m/s; use "
         r"scenario\.start\.automated\.headway=10$"
     )
     with pytest.raises(ConfigError, match=words):

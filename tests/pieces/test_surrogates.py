@@ -1,4 +1,4 @@
-"""Smooth stand-ins: near the literal terms beyond their bend, with slopes that lead back."""
+"""Smooth surrogates: near the literal terms beyond their bend, with slopes that lead back."""
 
 from __future__ import annotations
 

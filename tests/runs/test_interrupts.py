@@ -1,4 +1,4 @@
-"""What signals do to a command: one line while it imports, KeyboardInterrupt while it works."""
+"""What signals do to a command, and that it resumes as if nothing had happened."""
 
 from __future__ import annotations
 
@@ -6,13 +6,25 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from commands import (
+    QUICK,
+    TINY,
+    assert_same_tables,
+    jobs_in_threads,
+    run_command,
+    start,
+    tiny,
+    wait_for,
+)
 
-from lcc_rl.cli.entry import sweep
-from lcc_rl.errors import Interrupted
-from lcc_rl.runs.interrupts import INTERRUPTED, interruptible, is_command, stop_signal
+from lcc_rl.commands import training
+from lcc_rl.io.files import read_parquet
+from lcc_rl.runs.interrupts import interruptible, stop_signal
 
+LONGER = ("training.episodes=240", "variant=alcc")
 IMPORTS = "import sys; sys.argv = ['-m']; import lcc_rl; print('on', flush=True); input()"
 
 
@@ -31,44 +43,56 @@ def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
         assert child.stdout.readline() == "on\n"
         child.send_signal(kind)
         _, errors = child.communicate(timeout=60)
-    assert (child.returncode, errors) == (INTERRUPTED, "lcc_rl: interrupted\n")
-
-
-def test_importing_the_package_elsewhere_changes_no_handler() -> None:
-    assert not is_command()
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-
-
-def test_an_interrupt_that_another_error_hides_is_one_still() -> None:
-    def composing() -> None:
-        try:
-            raise KeyboardInterrupt
-        finally:
-            {}["what the interrupt has left half done"]
-
-    def stopping() -> None:
-        try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt:
-            raise Interrupted("stopped; resume it") from None
-
-    for command, kind in ((composing, KeyboardInterrupt), (stopping, Interrupted)):
-        with pytest.raises(kind):
-            sweep(command)
-    with pytest.raises(KeyError):
-        sweep(lambda: {}["no interrupt"])
-
-
-def test_sigterm_is_an_interrupt_and_afterwards_what_it_was() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), interruptible():
-        os.kill(os.getpid(), signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert (child.returncode, errors) == (130, "lcc_rl: interrupted\n")
 
 
 def test_the_first_signal_asks_and_the_second_acts() -> None:
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # importing changes no handler
     with interruptible(), stop_signal() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.is_set()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    training.run(tiny("train", *LONGER), folder, quiet=True)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_training_that_is_ended_resumes_to_the_same_rows(whole, tmp_path, kind) -> None:
+    with start("lcc_rl.cli.train", *TINY, *LONGER, "hydra.run.dir=run", cwd=tmp_path) as child:
+        wait_for(tmp_path / "run" / "checkpoint.pt", child)
+        second = run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path)
+        assert child.poll() is None
+        child.send_signal(kind)
+        _, errors = child.communicate(timeout=60)
+    assert second.returncode == 2
+    assert "another process is working on this run" in second.stderr
+    assert child.returncode == (-kind if kind == signal.SIGKILL else 130)
+    assert "Traceback" not in errors
+    assert ("resume=" in errors) == (kind != signal.SIGKILL)
+    assert not (tmp_path / "run" / "episodes.parquet").exists()
+    run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path, check=True)
+    assert_same_tables(whole, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
+    words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
+    with start("lcc_rl.cli.pipeline", *words, cwd=tmp_path) as process:
+        wait_for(tmp_path / "job/alcc/checkpoint.pt", process)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process of the job
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "resume=" in errors
+    assert not (tmp_path / "job/alcc/episodes.parquet").exists()
+    jobs_in_threads(monkeypatch)
+    run_command("lcc_rl.cli.pipeline", "resume=job", cwd=tmp_path, check=True)
+    assert len(read_parquet(tmp_path / "job/alcc/training.parquet")) == 50
+    assert (tmp_path / "job/evaluation/figures/overview.png").exists()

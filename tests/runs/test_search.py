@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.runs.search import SearchSweeper, distribution, resumed
+from lcc_rl.runs.states import claim
 
 optuna = pytest.importorskip("optuna", reason="extra sweeps")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:sqlalchemy.*")
@@ -35,29 +35,17 @@ def begun(folder: Path) -> optuna.Study:
     return study
 
 
-@pytest.mark.parametrize("wanted", [5, 2, 1])
-def test_finished_trials_count(tmp_path, caplog, wanted) -> None:
-    study = begun(tmp_path)
-    with caplog.at_level(logging.INFO, "lcc_rl"):
-        assert resumed(study, tmp_path, wanted) == 2
-    assert ("finished before" in caplog.text) == (wanted <= 2)
-
-
 def test_a_trial_that_was_cut_off_is_tried_first_and_queued_once(tmp_path) -> None:
     study = begun(tmp_path)
-    lost = study.get_trials()[3].params
-    for _ in range(2):
-        resumed(study, tmp_path, 5)
-    assert study.ask(SPACE).params == lost
-    assert study.ask(SPACE).params != lost
-
-
-def test_the_trials_of_others_at_work_are_left_to_them(tmp_path, monkeypatch) -> None:
-    study = begun(tmp_path)
-    at_work = type("State", (), {"state": "running"})
-    monkeypatch.setattr("lcc_rl.runs.search.survey", lambda folder: [at_work])
-    resumed(study, tmp_path, 5)
+    cut_off = study.get_trials()[3].params
+    (tmp_path / "run").mkdir()
+    with claim(tmp_path / "run"):  # of another process, which has its own trials
+        assert resumed(study, tmp_path, 5) == 2
     assert [trial.state.name for trial in study.get_trials()].count("WAITING") == 0
+    for _ in range(2):
+        assert resumed(study, tmp_path, 5) == 2
+    assert study.ask(SPACE).params == cut_off
+    assert study.ask(SPACE).params != cut_off
 
 
 def test_a_resumed_search_draws_what_it_would_have_drawn(tmp_path) -> None:
@@ -77,30 +65,25 @@ def test_a_resumed_search_draws_what_it_would_have_drawn(tmp_path) -> None:
     assert len(set(drawn[0])) == 13
 
 
-@pytest.mark.parametrize(
-    ("typed", "expected"),
-    [
-        ("interval(0.1, 2)", optuna.distributions.FloatDistribution(0.1, 2.0)),
-        ("tag(log, interval(1, 10))", optuna.distributions.FloatDistribution(1.0, 10.0, log=True)),
-        ("tag(int, interval(1, 9))", optuna.distributions.IntDistribution(1, 9)),
-        ("range(1, 4)", optuna.distributions.CategoricalDistribution(["1", "2", "3"])),
-        ("[64,64],[16]", optuna.distributions.CategoricalDistribution(["[64,64]", "[16]"])),
-    ],
-)
-def test_sweeps_in_hydras_words(typed, expected) -> None:
-    (sweep,) = OverridesParser.create().parse_overrides([f"key={typed}"])
-    assert distribution(optuna, sweep) == expected
-
-
-@pytest.mark.parametrize("typed", ["interval(2, 1)", "tag(log, interval(0, 1))"])
-def test_an_impossible_interval_is_named(typed) -> None:
-    (sweep,) = OverridesParser.create().parse_overrides([f"agent.gamma={typed}"])
-    with pytest.raises(ConfigError, match=r"agent\.gamma: expected two numbers"):
-        distribution(optuna, sweep)
+def test_sweeps_in_hydras_words() -> None:
+    kinds = optuna.distributions
+    expected = {
+        "interval(0.1, 2)": kinds.FloatDistribution(0.1, 2.0),
+        "tag(log, interval(1, 10))": kinds.FloatDistribution(1.0, 10.0, log=True),
+        "tag(int, interval(1, 9))": kinds.IntDistribution(1, 9),
+        "range(1, 4)": kinds.CategoricalDistribution(["1", "2", "3"]),
+        "[64,64],[16]": kinds.CategoricalDistribution(["[64,64]", "[16]"]),
+    }
+    parsed = OverridesParser.create().parse_overrides([f"key={typed}" for typed in expected])
+    assert [distribution(optuna, sweep) for sweep in parsed] == list(expected.values())
 
 
 def test_wrong_settings_are_named(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"directions.*minimize.*got 'down'"):
+    for typed in ("interval(2, 1)", "tag(log, interval(0, 1))"):
+        (sweep,) = OverridesParser.create().parse_overrides([f"agent.gamma={typed}"])
+        with pytest.raises(ConfigError, match=r"agent\.gamma: expected two numbers"):
+            distribution(optuna, sweep)
+    with pytest.raises(ConfigError, match="'down'"):
         sweeper(tmp_path, directions=["down"])
     with pytest.raises(ConfigError, match="n_trials"):
         sweeper(tmp_path, trials=0)
