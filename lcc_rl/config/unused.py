@@ -23,7 +23,7 @@ def check_used(content: Mapping[str, Any], overrides: Sequence[str], sweep: bool
         sweep: the runs of a sweep share what was typed, so what one of them learns by may be
             given to another that learns nothing.
     """
-    if "scenario" not in content:
+    if "string" not in content.get("scenario", {}):
         return
     reasons = dict(_of_traffic(content))
     if not sweep:

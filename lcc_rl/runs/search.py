@@ -24,6 +24,7 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
+from lcc_rl.config import as_meant, key_of
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.states import survey
@@ -87,7 +88,8 @@ class SearchSweeper(Sweeper):
         optuna = load_optuna()
         own = [f"{key}={value}" for key, value in self.given.params.items()]
         parsed = self.parser.parse_overrides([*own, *arguments])
-        settings = {item.get_key_element(): item for item in parsed}  # the last one counts
+        # The last one counts; the command line adds signs to keys.
+        settings = {key_of(item.get_key_element()): item for item in parsed}
         swept = {key: item for key, item in settings.items() if item.is_sweep_override()}
         space = {key: distribution(optuna, item) for key, item in swept.items()}
         fixed = [
@@ -101,7 +103,8 @@ class SearchSweeper(Sweeper):
         left = self.given.n_trials - resumed(study, self.folder, self.given.n_trials)
         for first in range(0, left, self.given.n_jobs):
             trials = [self.ask(study, space) for _ in range(min(self.given.n_jobs, left - first))]
-            batch = [[*fixed, *(f"{k}={v}" for k, v in trial.params.items())] for trial in trials]
+            drawn = ([f"{k}={v}" for k, v in trial.params.items()] for trial in trials)
+            batch = [as_meant([*fixed, *words]) for words in drawn]
             self.validate_batch_is_legal(batch)
             done = self.launcher.launch(batch, initial_job_idx=trials[0].number)
             for trial, job in zip(trials, done, strict=True):
