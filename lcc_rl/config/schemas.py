@@ -211,11 +211,11 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
     """
     kind = kind or _kind_of(content)
     check_numbers(content, "")
-    found = with_defaults(content)
+    found, known = with_defaults(content), {item.name for item in dataclasses.fields(kind)}
     for key, value in found.items():
         check_nodes(value, key)
     for name, section in SECTIONS.items():
-        if name in found:
+        if name in found and name in known:
             if not isinstance(found[name], Mapping):
                 raise ConfigError(f"{name} must be a mapping of settings, got {found[name]!r}")
             found[name] = parse(section, found[name], name)
