@@ -31,6 +31,7 @@ SHARES = [
     for name in ("unsafe_ttc_pct", tables.LONG)
     for which in ("mean", "worst_seed")
 ]
+TUNED = ("idm tuned", "acc tuned")
 ITSELF = "this study"
 BOTH = {"alcc", "reference"}
 
@@ -69,14 +70,17 @@ def write_results(
 
 def _narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     """Return tables that fit the width of a page of the documentation, by name."""
-    energies, human = shown["energies"], shown["human_energy"]
+    energies, human, shares = (
+        table[~table.iloc[:, 0].isin(TUNED)]
+        for table in (shown["energies"], shown["human_energy"], shown["constraints"])
+    )
     human = human[human["energy"] == paper_tables.NAMES[""]]
     parts = ["strategy", "total_path_energy_kj", "total_path_energy_kj_low"]
     parts += ["total_path_energy_kj_high", "total_energy_kj", *tables.PARTS]
     return {
         "parts": energies.loc[energies["strategy"] != "direct", parts],
         "behind": human.drop(columns=["energy", "least_driver_pct", "most_driver_pct"]),
-        "shares": shown["constraints"][["strategy", "collisions", *SHARES]],
+        "shares": shares[["strategy", "collisions", *SHARES]],
     }
 
 
