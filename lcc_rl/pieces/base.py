@@ -75,6 +75,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """Make it a transform, which reads and writes nothing before :meth:`wire`."""
         Transform.__init__(self, in_keys=[], out_keys=[])
 
+    def __getattr__(self, name: str) -> Any:
+        if name in ("needs", "targets", "views", "event_shape"):
+            kind = type(self).__name__
+            raise AttributeError(f"{kind} is not bound to a world yet: use {kind}(…).bind(world)")
+        return super().__getattr__(name)
+
     def wire(
         self,
         reads: Sequence[NestedKey],
@@ -143,7 +149,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
     @dispatch(auto_batch_size=False)  # entries of vehicles have one dimension more
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
-        values = self.compute(*(tensordict.get(key) for key in self.in_keys))
+        reads = self.in_keys if self.needs else ()
+        values = self.compute(*(tensordict.get(key) for key in reads))
         values = (values,) if isinstance(values, Tensor) else values
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)

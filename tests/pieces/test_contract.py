@@ -23,7 +23,7 @@ from helpers import (
     small_env,
     wavy_profiles,
 )
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
@@ -318,6 +318,12 @@ def same(piece: Piece, got: torch.Tensor, expected: torch.Tensor) -> bool:
 def assert_results_equal(piece: Piece, got: TensorDictBase, expected: TensorDictBase) -> None:
     for key in results(piece):
         assert same(piece, got[key], expected[key]), key
+
+
+@pytest.mark.parametrize("piece", [SafetyReward(), IDM(), TimeGap()])
+def test_a_piece_that_is_not_bound_says_so(piece) -> None:
+    with pytest.raises(AttributeError, match=r"not bound to a world yet: use \w+\(…\)\.bind"):
+        piece(TensorDict({}, [2]))
 
 
 def test_every_exported_class_is_under_contract() -> None:
