@@ -11,6 +11,7 @@ import yaml
 from lcc_rl.errors import ResultsError
 
 LARGEST_FILE = 2**20  # bytes; a configuration has some thousands
+NESTED = 2000  # signs that may nest, at most, for the C loader
 # The C loader is five times as fast as Python's.
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -41,8 +42,10 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
     Raises:
         ResultsError: naming what was wrong and where it comes from.
     """
+    # The C loader would end the process at deep nesting, which no settings have.
+    loader = LOADER if sum(map(text.count, "[{-")) < NESTED else yaml.SafeLoader
     try:
-        content = yaml.load(text, Loader=LOADER)  # safe: plain values only
+        content = yaml.load(text, Loader=loader)  # safe: plain values only
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise ResultsError(f"{where}: damaged: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):

@@ -69,6 +69,7 @@ FOREIGN: list[tuple[dict[str, object] | str, str]] = [
     ({"seed": "${oc.env:SECRET}"}, "seed refers to"),
     ("seed: !!python/object:os.system {}", "damaged"),
     (": [", "damaged"),
+    ("seed: " + 50_000 * "[", "damaged.*recursion"),
     ({"agent": "ddpg"}, "agent: expected a node"),
     ({"scenario": None}, "scenario must be"),
 ]
