@@ -15,15 +15,17 @@ from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.mpc import MPC
 from lcc_rl.pieces.observation import Observation
-from lcc_rl.pieces.platoon_rewards import JerkReward, SpacingReward, VelocityReward
 from lcc_rl.pieces.ranges import RangeReward, SmoothRange
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,
     EnergyReward,
+    JerkReward,
     RewardTerm,
     SafetyReward,
+    SpacingReward,
     TotalReward,
+    VelocityReward,
 )
 from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart

@@ -37,7 +37,7 @@ class CalibratedDrivers(Drivers):
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
         """Return the drivers, see :class:`Drivers`."""
         if not hasattr(world.population, "parameters"):
-            raise ConfigError(f"{where}: expected a population that tells its drivers' parameters")
+            raise ConfigError(f"{where}: expected a population with its drivers' parameters")
         return super().described(world, where)
 
     def acceleration(self, speed: Tensor, *more: Tensor) -> Tensor:
