@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Real
+from typing import Any
 
 
 class LccError(Exception):
@@ -49,6 +51,13 @@ def require(condition: bool, message: str) -> None:
     """Raise a ConfigError with the message unless the condition holds."""
     if not condition:
         raise ConfigError(message)
+
+
+def require_positive(what: str, value: Any) -> None:
+    """Raise a ConfigError unless the value is a positive number within what traffic knows."""
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    if not (number and 0.0 < value <= LARGEST):
+        raise ConfigError(f"{what} must be a positive, finite number, got {value!r}")
 
 
 def how_to_install(extra: str) -> str:

@@ -16,12 +16,14 @@ import pandas as pd
 
 from lcc_rl import results
 from lcc_rl.cli.entry import main_guard
+from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.means import EPISODES, TRAINED, Means
+from lcc_rl.results.means import TRAINED, Means
+from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.studies.alcc.report import CURVES, MAIN
 from lcc_rl.studies.alcc.study import DRIVERS
-from lcc_rl.studies.hcfs.study import STEPS, TRAINING
+from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
 
 # Columns of the learning curves that are kept, besides the terms of the reward.
@@ -46,12 +48,12 @@ def lengths(studies: Sequence[Path], path: Path) -> None:
 
 def means(evaluations: Sequence[Path], target: Path) -> None:
     """Keep the means of an evaluation per window and per driver."""
-    Means.of(read_parquet(evaluations[0] / EPISODES)).write(target)
+    Means.of(read_parquet(_only(evaluations) / EPISODES)).write(target)
 
 
 def alcc(studies: Sequence[Path], target: Path) -> None:
     """Keep what the page of an ALCC study shows of its main part."""
-    study = studies[0]
+    study = _only(studies)
     means([study / MAIN], target / MAIN)
     steps = read_parquet(study / MAIN / STEPS)
     steps = steps[steps["strategy"] == "alcc"]
@@ -64,6 +66,11 @@ def alcc(studies: Sequence[Path], target: Path) -> None:
     rewards = curves.select_dtypes("float").columns
     write_parquet(curves.astype(dict.fromkeys(rewards, "float32")), target / CURVES)
     write_parquet(read_parquet(study / DRIVERS), target / DRIVERS)
+
+
+def _only(folders: Sequence[Path]) -> Path:
+    require(len(folders) == 1, f"expected one folder, got {len(folders)}")
+    return folders[0]
 
 
 KINDS = {"lengths": lengths, "means": means, "alcc": alcc}

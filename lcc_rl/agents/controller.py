@@ -6,7 +6,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 
 from lcc_rl.agents.actor import ACTION
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_positive
 from lcc_rl.pieces.base import NEXT, root_key
 from lcc_rl.pieces.controllers import Controller
 
@@ -26,8 +26,7 @@ class ControllerPolicy(TensorDictModuleBase):
     """
 
     def __init__(self, controller: Controller, max_acceleration: float = 3.0) -> None:
-        if not max_acceleration > 0.0:
-            raise ConfigError(f"policy.max_acceleration must be positive, got {max_acceleration}")
+        require_positive("policy.max_acceleration", max_acceleration)
         if len(controller.targets) > 1 or any(key[0] == NEXT for key in controller.in_keys):
             raise ConfigError(
                 f"{type(controller).__name__} remembers entries of its own, which only an "

@@ -16,9 +16,8 @@ from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file, in_words
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
-from lcc_rl.results.runs import CONFIG, stored_config
+from lcc_rl.results.runs import CONFIG, STEPS, stored_config
 
-STEPS = "steps.parquet"
 KEPT = "evaluation.sample_episodes=4"
 
 

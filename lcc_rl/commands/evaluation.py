@@ -32,7 +32,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.policies import PRETRAINED, load_policy
-from lcc_rl.results.runs import check_folder, load_config, save_config
+from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import Task, scores
 from lcc_rl.results.scores import as_rich as scores_as_rich
@@ -46,7 +46,7 @@ from lcc_rl.runs.states import check_present, claim, forget
 
 log = logging.getLogger("lcc_rl")
 
-EPISODES, STEPS, IDENTITY = "episodes.parquet", "steps.parquet", "lcc_rl.config"
+IDENTITY = "lcc_rl.config"
 TASK = f"{Task.__module__}.{Task.__name__}"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.commands.animate import KEPT, with_steps
-from lcc_rl.commands.evaluation import IDENTITY, STEPS, strategies_of
+from lcc_rl.commands.evaluation import IDENTITY, strategies_of
 from lcc_rl.config import identity
 from lcc_rl.config.schemas import EvaluateConfig, as_plain
 from lcc_rl.errors import ConfigError, LccError, ResultsError
@@ -25,7 +25,7 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.figures.policy_maps import policy_maps
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
-from lcc_rl.results.runs import load_config
+from lcc_rl.results.runs import STEPS, load_config
 from lcc_rl.runs.precision import prepare_torch
 
 log = logging.getLogger("lcc_rl")

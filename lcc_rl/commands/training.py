@@ -10,7 +10,7 @@ import pandas as pd
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
-from lcc_rl.commands.evaluation import EPISODES, evaluate_and_write, made_by
+from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.config import identity
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
@@ -21,7 +21,7 @@ from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.policies import load_policy, save_policy
-from lcc_rl.results.runs import check_folder, load_config, save_config
+from lcc_rl.results.runs import EPISODES, check_folder, load_config, save_config
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import Silent

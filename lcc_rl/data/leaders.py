@@ -28,7 +28,7 @@ from lcc_rl.data.sources import NgsimSource
 from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import LARGEST, ConfigError, DataError, unknown_name
+from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, checked, parse
 
 WHOLE = "full length"  # a case that is a whole record, before the record's name
@@ -390,8 +390,7 @@ class Mixture:
         for name, weight in (weights or {}).items():
             if name not in sources:
                 raise unknown_name("source in leader.weights", str(name), sources)
-            if not 0.0 < weight <= LARGEST:
-                raise ConfigError(f"leader.weights.{name} must be positive, got {weight!r}")
+            require_positive(f"leader.weights.{name}", weight)
         self.sources, self.weights = sources, dict(weights or {})
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:

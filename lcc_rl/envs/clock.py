@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -64,7 +65,8 @@ class Clock(EnvBase):
         if horizon < 1:
             raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
         batch = batch_shape(batch_size)
-        if seed not in range(MOST_SEED + 1):
+        whole = isinstance(seed, Integral) and not isinstance(seed, bool)
+        if not (whole and 0 <= seed <= MOST_SEED):
             raise ConfigError(f"seed must be a whole number from 0 to {MOST_SEED}, got {seed!r}")
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon

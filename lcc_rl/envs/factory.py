@@ -73,7 +73,7 @@ def build_env(
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
-        actions[ACTION] = (cfg.scenario.vehicles.count(AUTOMATED), 1)
+        actions[ACTION] = (scenario.vehicles.count(AUTOMATED), 1)
     check_pieces(pieces, scenario.horizon, actions)
     require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
@@ -89,7 +89,7 @@ def world_of(
     """Return what the pieces of a configuration share; arguments as of :func:`build_env`."""
     scenario = cfg.scenario
     return World(
-        cfg.scenario.vehicles,
+        scenario.vehicles,
         scenario.time_step,
         scenario.horizon,
         profiles,

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import LARGEST, ConfigError
+from lcc_rl.errors import require_positive
 
 
 class DriverConstants:
@@ -28,9 +28,8 @@ class DriverConstants:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (isinstance(value, Tensor) or 0.0 < value <= LARGEST):
-                model = type(self).__name__.removesuffix("Constants")
-                raise ConfigError(f"{model}.{name} must be positive and finite, got {value!r}")
+            if not isinstance(value, Tensor):
+                require_positive(f"{type(self).__name__.removesuffix('Constants')}.{name}", value)
 
     def with_(self, **changes: Tensor | float) -> Self:
         """Return a copy in which some constants vary by driver (tensors, for calibration)."""

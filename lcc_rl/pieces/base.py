@@ -149,7 +149,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
     @dispatch(auto_batch_size=False)  # entries of vehicles have one dimension more
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
-        reads = self.in_keys if self.needs else ()
+        reads = self.in_keys if self.needs else ()  # an unbound piece raises here
         values = self.compute(*(tensordict.get(key) for key in reads))
         values = (values,) if isinstance(values, Tensor) else values
         for key, value in zip(self.out_keys, values, strict=True):

@@ -9,8 +9,8 @@ from typing import Self
 import pandas as pd
 
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.runs import EPISODES
 
-EPISODES = "episodes.parquet"
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
 TRAINED = ["strategy", "training_seed"]
 NUMBERS = ("profile_id", "driver_id", "training_seed")  # name a thing, measure none
@@ -61,10 +61,6 @@ class Means:
             numbers = table.select_dtypes("float").columns
             small = table.astype(dict.fromkeys(numbers, "float32")).round(6)
             write_parquet(small, folder / name)
-
-    def assign(self, **columns: str | int) -> Self:
-        """Return the means with further columns of the windows."""
-        return type(self)(self.windows.assign(**columns), self.drivers)
 
     def size(self) -> str:
         """Return the number of windows and drivers, in words."""

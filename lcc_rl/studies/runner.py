@@ -21,14 +21,13 @@ from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import Interrupted, require
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import read_json
-from lcc_rl.results.runs import CONFIG, differing, flatten, load_config
+from lcc_rl.results.runs import CONFIG, EPISODES, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
 
 log = logging.getLogger("lcc_rl")
 
 NOTES = "study.json"
-EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 FINISHED, FAILED, FOREIGN = "finished", "failed", "other settings"
 
 

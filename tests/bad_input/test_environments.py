@@ -74,7 +74,7 @@ def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
     ("size", "seed", "words"),
     [
         (10**30, 0, r"batch_size=.* needs about \d+.* of memory"),
-        ((), -1, "seed must be"),
+        *(((), seed, "seed must be") for seed in (-1, 2**64, 1.0, True, "1")),
     ],
 )
 def test_an_impossible_batch_or_seed(size, seed, words) -> None:

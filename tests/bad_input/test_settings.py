@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 from time import perf_counter
+from types import SimpleNamespace
 
 import pytest
 from commands import NO_AGENT, tiny
 from table_text import long_table
 
+from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
+from lcc_rl.data.leaders import Mixture
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.ovm import OVMConstants
 from lcc_rl.io import memory
+from lcc_rl.pieces.controllers import ConstantAcceleration
 
 HUGE = 10**15
 AUTO = "scenario.controllers.automated"
@@ -105,6 +110,19 @@ def test_options_without_effect_are_refused(typed) -> None:
 def test_a_bad_setting_of_a_calibration_is_named(tmp_path, typed, words) -> None:
     with pytest.raises(ConfigError, match=words):
         calibration.run(load("calibrate", [typed]), tmp_path)
+
+
+@pytest.mark.parametrize("number", [0.0, -1.0, float("nan"), float("inf"), True, "1"])
+def test_what_must_be_positive_is_refused_at_every_door(number) -> None:
+    source = SimpleNamespace(load=list)
+    doors = (
+        lambda: OVMConstants(form=number),
+        lambda: ControllerPolicy(ConstantAcceleration().bind(), number),
+        lambda: Mixture({"a": number}, a=source),
+    )
+    for door in doors:
+        with pytest.raises(ConfigError, match="must be a positive, finite number"):
+            door()
 
 
 def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import keep
 import pandas as pd
+import pytest
 from study_frames import episodes
 
+from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 
 
@@ -46,6 +48,10 @@ def test_means_per_window_and_per_driver(tmp_path) -> None:
     # A human of 50 kJ, 2 more for each driver's number, 10 more on the second profile.
     assert own["hdv_energy_kj"].tolist() == [52.0, 62.0]
     assert own["min_gap_m"].tolist() == [1.0, 1.0]  # the least of the drivers, not their mean
+    several = ["means", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "other")]
+    with pytest.raises(ConfigError, match="expected one folder, got 2"):
+        keep.main(several)
+    assert not (tmp_path / "other").exists()
     own = drivers[drivers["strategy"] == "reference"]
     assert own["hdv_energy_kj"].tolist() == [55.0, 57.0, 59.0]
     assert own["cav_energy_kj"].tolist() == [85.0] * 3

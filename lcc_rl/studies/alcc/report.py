@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
@@ -14,8 +14,8 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.means import EPISODES, WINDOWS, Means
-from lcc_rl.results.runs import CONFIG
+from lcc_rl.results.means import WINDOWS, Means
+from lcc_rl.results.runs import CONFIG, EPISODES
 from lcc_rl.results.savings import LEADER
 from lcc_rl.results.tables import leader_too_fast
 from lcc_rl.studies.alcc import figures, paper_tables, tables
@@ -58,11 +58,15 @@ def write_results(
     tables_there = (f"**/evaluation/{name}" for name in (EPISODES, WINDOWS))
     if not any(path for name in tables_there for path in page.folder.glob(name)):
         raise ResultsError(f"{folder}: no evaluation/{EPISODES}; lcc-rl reproduce alcc makes it")
-    if (page.folder / MAIN).exists():
-        add_main(page)
-    for add in (_learning, _ablations, _people):
-        add(page)
+    main = _means(page.folder / MAIN)
+    if main is not None:
+        add_main(page, main)
+    _learning(page)
+    _ablations(page, main)
+    _people(page)
     if target is not None:
+        if main is None:
+            raise ResultsError(f"{folder}: {target} shows the main part, which is not there")
         page.tables |= _narrow(page.tables)
         page.fill(target)
     return _made(page)
@@ -84,9 +88,8 @@ def _narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     }
 
 
-def add_main(page: Page) -> None:
+def add_main(page: Page, means: Means) -> None:
     """Add the sections of the main evaluation."""
-    means = Means.read(page.folder / MAIN)
     windows = means.windows
     _headline(page, means)
     text = """The study asks for no collision in any episode, time with TTC < 4 s of at most 0.1 %,
@@ -215,11 +218,20 @@ def _learning(page: Page) -> None:
     page.add("Learning", text, shown, drawn)
 
 
-def _ablations(page: Page) -> None:
-    found = _evaluations(page.folder / "ablations", "ablation", list(ABLATIONS))
+def _ablations(page: Page, main: Means | None) -> None:
+    found = {
+        path.parent.name: means
+        for path in page.folder.glob("ablations/*/evaluation")
+        if (means := _means(path)) is not None
+    }
     if not found:
         return
-    windows = _beside_main(page, found, ablation=ITSELF)
+    order = [*(name for name in ABLATIONS if name in found), *sorted(found.keys() - ABLATIONS)]
+    parts = {ITSELF: main} if main is not None else {}
+    parts |= {name: found[name] for name in order}
+    windows = pd.concat(
+        [means.windows.assign(ablation=name) for name, means in parts.items()], ignore_index=True
+    )
     text = """Each line changes the recipe and trains anew; savings are against controllers in the
         same scenario, so that a change of the scenario (no recuperation) is compared with itself.
         Intervals are over windows and seeds. The paper prints a saving of 4.38 % of alcc against
@@ -251,22 +263,10 @@ def _people(page: Page) -> None:
     page.add("Drivers and power", text, figures=drawn)
 
 
-def _beside_main(page: Page, found: Sequence[Means], **column: str) -> pd.DataFrame:
-    """Join the windows of evaluations to those of the main part, if there is one."""
-    path = page.folder / MAIN
-    main = [Means.read(path).assign(**column)] if path.exists() else []
-    return _together([*main, *found])
-
-
-def _together(found: Sequence[Means]) -> pd.DataFrame:
-    return pd.concat([means.windows for means in found], ignore_index=True)
-
-
-def _evaluations(root: Path, column: str, order: Sequence[str] = ()) -> list[Means]:
-    """Read the evaluation of every part below a folder, with its name as a column."""
-    found = {path.parent.name: path for path in root.glob("*/evaluation")}
-    names = [*(name for name in order if name in found), *sorted(found.keys() - set(order))]
-    return [Means.read(found[name]).assign(**{column: name}) for name in names]
+def _means(folder: Path) -> Means | None:
+    """Read the means of an evaluation, if it is there and finished."""
+    finished = any((folder / name).exists() for name in (WINDOWS, EPISODES))
+    return Means.read(folder) if finished else None
 
 
 def _made(page: Page) -> Path:

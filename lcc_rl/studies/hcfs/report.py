@@ -12,11 +12,12 @@ from lcc_rl.figures import platoon
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.studies.hcfs import tables
-from lcc_rl.studies.hcfs.study import STEPS, TRAINING
+from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
-from lcc_rl.studies.runner import EPISODES, read_notes
+from lcc_rl.studies.runner import read_notes
 
 LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
 TITLE = "Hybrid Car-Following Strategy: the study"

@@ -25,7 +25,7 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
-from lcc_rl.results.runs import save_config
+from lcc_rl.results.runs import STEPS, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.studies.hcfs.tables import LEARNED, per_run, rounded
 from lcc_rl.studies.runner import (
@@ -45,7 +45,6 @@ log = logging.getLogger("lcc_rl")
 BASELINES = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
 TRAINING = "training.parquet"
-STEPS = "steps.parquet"
 # A second whole record beside the default leader's.
 WLTC = "+leader.full_length.wltc={path: wltc_3b, scale: 0.5}"
 
