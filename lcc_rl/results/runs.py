@@ -22,9 +22,9 @@ log = logging.getLogger("lcc_rl")
 
 CONFIG = "config.yaml"
 TABLES = ("episodes", "training", "timing", "steps", "drivers")
-# What no command of other settings may replace: results, and what a stopped run resumes from.
 EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 STEPS = "steps.parquet"
+# What no command of other settings may replace: results, and what a stopped run resumes from.
 KEPT = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
 

@@ -12,7 +12,7 @@ import pytest
 from commands import UNTRAINED
 
 from lcc_rl.commands import training
-from lcc_rl.errors import LccError
+from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.studies import reproduce, runner
 from lcc_rl.studies.alcc import report
@@ -59,6 +59,8 @@ def study(quick, tmp_path_factory) -> alcc.Study:
     one = alcc.Study(folder, "smoke", 1, TINY, ablations=("late:agent.tau=0.01",))
     outcomes = alcc.run(one, ["ablations"])
     assert "late" in report.write_results(folder).read_text()  # a part alone has a page
+    with pytest.raises(ResultsError, match="main part"):
+        report.write_results(folder, target=folder / "page.md")
     two = replace(one, seeds=2)
     outcomes += alcc.run(two, ["main"], "typed")
     assert [outcome.status for outcome in outcomes] == [FINISHED] * (2 + 6)

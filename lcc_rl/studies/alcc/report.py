@@ -55,18 +55,17 @@ def write_results(
         ResultsError: if there is no evaluation in the folder, or a file cannot be read.
     """
     page = Page(folder, formats)
-    tables_there = (f"**/evaluation/{name}" for name in (EPISODES, WINDOWS))
-    if not any(path for name in tables_there for path in page.folder.glob(name)):
+    if not any(map(_finished, page.folder.glob("**/evaluation"))):
         raise ResultsError(f"{folder}: no evaluation/{EPISODES}; lcc-rl reproduce alcc makes it")
-    main = _means(page.folder / MAIN)
+    main = Means.read(page.folder / MAIN) if _finished(page.folder / MAIN) else None
+    if main is None and target is not None:
+        raise ResultsError(f"{folder}: {target} shows the main part, which is not there")
     if main is not None:
         add_main(page, main)
     _learning(page)
     _ablations(page, main)
     _people(page)
     if target is not None:
-        if main is None:
-            raise ResultsError(f"{folder}: {target} shows the main part, which is not there")
         page.tables |= _narrow(page.tables)
         page.fill(target)
     return _made(page)
@@ -220,9 +219,9 @@ def _learning(page: Page) -> None:
 
 def _ablations(page: Page, main: Means | None) -> None:
     found = {
-        path.parent.name: means
+        path.parent.name: Means.read(path)
         for path in page.folder.glob("ablations/*/evaluation")
-        if (means := _means(path)) is not None
+        if _finished(path)
     }
     if not found:
         return
@@ -263,10 +262,8 @@ def _people(page: Page) -> None:
     page.add("Drivers and power", text, figures=drawn)
 
 
-def _means(folder: Path) -> Means | None:
-    """Read the means of an evaluation, if it is there and finished."""
-    finished = any((folder / name).exists() for name in (WINDOWS, EPISODES))
-    return Means.read(folder) if finished else None
+def _finished(evaluation: Path) -> bool:
+    return any((evaluation / name).exists() for name in (WINDOWS, EPISODES))
 
 
 def _made(page: Page) -> Path:
