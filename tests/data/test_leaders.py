@@ -259,7 +259,10 @@ def test_impossible_mixtures() -> None:
         ({}, "names no source"),
         ({"more": 3}, r"leader\.more must be a source of leaders"),
         ({"cycles": source, "weights": {"cycle": 1}}, "'cycle'.*Did you mean 'cycles'"),
-        ({"cycles": source, "weights": {"cycles": 0}}, r"weights\.cycles must be a positive.* got 0"),
+        (
+            {"cycles": source, "weights": {"cycles": 0}},
+            r"weights\.cycles must be a positive.*got 0",
+        ),
     ):
         with pytest.raises(ConfigError, match=words):
             Mixture(**settings)
