@@ -57,7 +57,11 @@ def test_help_names_the_version_and_every_command(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("words", "unused", "printed"),
     [
-        (["lcc_rl.cli.train", "--help"], HEAVY | TABLES, "calibration: both, global, local"),
+        (
+            ["lcc_rl.cli.train", "--help"],
+            HEAVY | TABLES,
+            "calibration: both, energy, global, local",
+        ),
         (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
         (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
     ],

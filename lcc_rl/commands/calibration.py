@@ -20,7 +20,7 @@ from lcc_rl.drivers.calibrator import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import build_source
-from lcc_rl.figures.calibration import calibration_figure, joint_figure
+from lcc_rl.figures.calibration import calibration_figure, joint_figure, twins_figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.cells import MISSING
@@ -37,7 +37,8 @@ ERRORS = (
 def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
     """Calibrate the drivers of ``cfg.data`` as ``cfg.calibration`` says.
 
-    Writes ``config.yaml``, ``drivers.parquet``, ``calibration.png`` and ``joint_distribution.png``.
+    Writes ``config.yaml``, ``twins.parquet``, ``drivers.parquet``, ``calibration.png``,
+    ``joint_distribution.png`` and ``twins.png``.
 
     Args:
         cfg: configuration of the entry point ``calibrate``.
@@ -91,6 +92,13 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
     formats = cfg.figure_formats
     save(calibration_figure(result.drivers), folder / "calibration.png", formats=formats)
     save(joint_figure(result.drivers), folder / "joint_distribution.png", formats=formats)
+    save(twins_figure(result.twins), folder / "twins.png", formats=formats)
+    twins = [
+        measured.table.assign(episode=result.episodes, mode=mode, driver=who)
+        for mode, found in result.twins.items()
+        for who, measured in found.items()
+    ]
+    write_parquet(pd.concat(twins, ignore_index=True), folder / "twins.parquet", metadata)
     # Last: who finds it finds a finished calibration.
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 

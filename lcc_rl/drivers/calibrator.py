@@ -16,7 +16,17 @@ from lcc_rl.drivers.fit_error import GAP, GAP_SHARE, SPEED, FitError, Objective
 from lcc_rl.drivers.genetic import Evolution, GeneticSettings, Progress, minimise
 from lcc_rl.drivers.genetic import Objective as Minimised
 from lcc_rl.drivers.observed import Observed, Selection, observe
-from lcc_rl.drivers.parameters import COLUMNS, MODEL, Bounds, Mode, Model, at_bound, fitted
+from lcc_rl.drivers.parameters import (
+    COLUMNS,
+    MODEL,
+    REACTION,
+    Bounds,
+    Mode,
+    Model,
+    at_bound,
+    fitted,
+)
+from lcc_rl.drivers.twins import Measured, compare
 from lcc_rl.errors import DataError, unknown_name
 from lcc_rl.functional.driver_models import DriverConstants
 from lcc_rl.functional.laws import LAWS
@@ -38,10 +48,15 @@ class Calibration:
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
         report: what was dropped, chosen and found, in plain lines.
+        twins: by mode, what :func:`lcc_rl.drivers.twins.compare` measured of the recorded and of
+            the calibrated drivers, in the order of ``episodes``.
+        episodes: the episodes of the measured drivers.
     """
 
     drivers: pd.DataFrame
     report: list[str]
+    twins: dict[str, dict[str, Measured]]
+    episodes: pd.Series
 
 
 class Constants(Settings):
@@ -73,6 +88,9 @@ class Calibrator(Settings):
     holdout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     bounds: given_as(Bounds) = field(default_factory=Bounds)  # type: ignore[valid-type]
     constants: given_as(Constants) = field(default_factory=Constants)  # type: ignore[valid-type]
+    # Choose a reaction delay and a noise of the acceleration that all drivers share, so that they
+    # need the energy of the recorded ones; see lcc_rl.drivers.twins.
+    reaction: bool = False
     choose_constants: bool = False  # local: choose them by the mean error of all drivers first
     selection: given_as(Selection) = field(default_factory=Selection)  # type: ignore[valid-type]
     local_genetic: given_as(GeneticSettings) = field(  # type: ignore[valid-type]
@@ -116,11 +134,17 @@ class Calibrator(Settings):
         if not isinstance(observed, Observed):
             observed = observe(observed, self.selection)
         parts, report = [], list(observed.report)
+        twins: dict[str, dict[str, Measured]] = {}
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
+            reaction, twins[mode], more = compare(observed, drivers, self.reaction)
+            if self.reaction:
+                own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
+                drivers = drivers.assign(**own)
             parts.append(drivers)
-            report += [f"{mode}: {line}" for line in lines]
-        return Calibration(pd.concat(parts, ignore_index=True), report)
+            report += [f"{mode}: {line}" for line in [*lines, *more]]
+        table = pd.concat(parts, ignore_index=True)
+        return Calibration(table, report, twins, observed.identity["episode"])
 
 
 class _Fit:

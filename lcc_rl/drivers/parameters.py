@@ -36,6 +36,12 @@ PLAUSIBLE = {
     "speed_gain": (0.001, 20.0),
     "leader_deceleration": (0.05, 20.0),
 }
+# What the drivers of a table share where they react late or stray from their model: its column and
+# its plausible range.
+REACTION = {
+    "delay": ("reaction_delay_s", 0.0, 3.0),
+    "noise": ("acceleration_noise_mps2", 0.0, 3.0),
+}
 IDM = "idm"
 MODEL = "model"  # the column that names a driver's model; a table without it is of the IDM
 # A parameter this close to a bound, as a share of the range, counts as being on it.

@@ -23,12 +23,13 @@ from lcc_rl.drivers.parameters import (
     at_bound,
     users,
 )
-from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of
+from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of, reaction_of
 from lcc_rl.errors import LAST_SEED, ConfigError, DataError
+from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.memory import require_memory
-from lcc_rl.settings import Count, Positive, checked
+from lcc_rl.settings import Count, NonNegative, Positive, checked
 
 DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, and its name
 
@@ -46,6 +47,7 @@ class DriverPopulation:
         ids: the drivers' identities, one per driver.
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
         models: the model of every driver; None: the IDM of all.
+        reaction: delay and noise, which the drivers share.
         own: further parameters by name, ``[drivers]``, where drivers have other models; NaN
             where a driver's model lacks one.
 
@@ -60,6 +62,7 @@ class DriverPopulation:
     at_bound: Tensor
     models: tuple[str, ...] | None = None
     own: Mapping[str, Tensor] = field(default_factory=dict)
+    reaction: Reaction = field(default_factory=Reaction)
 
     def __post_init__(self) -> None:
         if not self.ids:
@@ -94,6 +97,7 @@ class DriverPopulation:
             self.at_bound[index],
             self.models and tuple(self.models[place] for place in index.tolist()),
             {name: values[index] for name, values in self.own.items()},
+            self.reaction,
         )
 
     def summary(self) -> dict[str, float]:
@@ -128,7 +132,11 @@ class DriverPopulation:
 
 @checked
 def bootstrap(
-    path: str | Path | None = None, mode: str | None = None, least_speed: Positive | None = None
+    path: str | Path | None = None,
+    mode: str | None = None,
+    least_speed: Positive | None = None,
+    reaction_delay: NonNegative | None = None,
+    acceleration_noise: NonNegative | None = None,
 ) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
 
@@ -137,11 +145,17 @@ def bootstrap(
         mode: see :func:`load_drivers`.
         least_speed: to which lower desired speeds are raised, for faster leaders than those of
             the calibration [m/s]; None raises none. Time gaps stay.
+        reaction_delay: of all drivers [s]; None: as the table says, 0 where it says nothing.
+        acceleration_noise: standard deviation [m/s²], likewise; see
+            :class:`lcc_rl.functional.driver_models.Reaction`.
 
     Raises:
         DataError: if the table is not sound.
     """
     found = from_table(load_drivers(path, mode))
+    given = {"delay": reaction_delay, "noise": acceleration_noise}
+    changes = {name: value for name, value in given.items() if value is not None}
+    found = replace(found, reaction=replace(found.reaction, **changes))
     if least_speed is None:
         return found
     raised = found.desired_speed < least_speed
@@ -169,6 +183,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
         constants=constants.with_(**varying),
         ids=_identities(table),
         at_bound=_flags(table),
+        reaction=reaction_of(table, "driver table"),
     )
     if shared:
         return found
@@ -241,7 +256,8 @@ def kde(
     drawn = {column: np.full(drivers, table[column].iloc[0]) for column in columns.values()}
     for name, row in zip(names, draws, strict=True):
         drawn[COLUMNS[name]] = row.clip(*getattr(limits, name))
-    return from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
+    found = from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
+    return replace(found, reaction=reaction_of(table, "driver table"))
 
 
 @checked
@@ -251,6 +267,8 @@ def fixed(
     acceleration: float = 1.0,
     deceleration: float = 1.5,
     min_gap: float = 2.0,
+    reaction_delay: NonNegative = 0.0,
+    acceleration_noise: NonNegative = 0.0,
 ) -> DriverPopulation:
     """Population of one given driver.
 
@@ -260,6 +278,8 @@ def fixed(
         acceleration: a [m/s²].
         deceleration: b [m/s²].
         min_gap: s0 [m].
+        reaction_delay: [s].
+        acceleration_noise: standard deviation [m/s²].
     """
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
@@ -267,4 +287,5 @@ def fixed(
         constants=IDMConstants(acceleration, deceleration, min_gap),
         ids=("fixed",),
         at_bound=torch.zeros(1, dtype=torch.bool),
+        reaction=Reaction(reaction_delay, acceleration_noise),
     )

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, PLAUSIBLE, users
+from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, PLAUSIBLE, REACTION, users
 from lcc_rl.errors import DataError, ResultsError
+from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
 
@@ -102,6 +103,25 @@ def check_drivers(frame: pd.DataFrame, name: str) -> None:
                 f"got {frame[column].iloc[row]}"
             )
     _check_identities(frame, name)
+
+
+def reaction_of(frame: pd.DataFrame, name: str) -> Reaction:
+    """Return the delay and noise that the drivers of a table share; without the columns, none.
+
+    Raises:
+        DataError: naming the table and column, if one differs by driver or is implausible.
+    """
+    found = {}
+    for part, (column, low, high) in REACTION.items():
+        if column in frame.columns:
+            values = pd.to_numeric(frame[column], errors="coerce").unique()
+            if len(values) != 1 or not low <= values[0] <= high:
+                raise DataError(
+                    f"{name}: column {column!r} must be {low:g} to {high:g}, the same for all "
+                    f"drivers, got {', '.join(map(str, frame[column].unique()[:3]))}"
+                )
+            found[part] = float(values[0])
+    return Reaction(**found)
 
 
 def _check_identities(frame: pd.DataFrame, name: str) -> None:

@@ -25,7 +25,7 @@ from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.pieces.controllers import Population
 
 log = logging.getLogger("lcc_rl")
@@ -39,7 +39,6 @@ FILTERED = "_filtered"
 # Settings that make the controller of each baseline.
 BASELINES = {
     "idm": ("variant=idm",),
-    "human": ("variant=idm", f"{AUTO}.desired_speed=null", f"{AUTO}.time_gap=null"),
     **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
     **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
     # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
@@ -48,6 +47,7 @@ BASELINES = {
     "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
 }
 DIRECT = "direct"  # a string without automated vehicles
+PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
@@ -112,6 +112,8 @@ def baseline(cfg: StudyConfig, name: str) -> Strategy:
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
+    if name == PEOPLE:
+        return Strategy(name, without_filter(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
     behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
     require(behind or not named, f"{name} drives behind the safety filter: add +filter=cbf")
     controller = baseline_controller(name, suffix := FILTERED * (behind and name in TUNED))
@@ -127,7 +129,7 @@ def rules() -> tuple[str, ...]:
     """Return the names of all baselines and of the files of conf/controller."""
     shipped = Path(str(files("lcc_rl.conf"))) / "controller"
     found = sorted(path.stem for path in shipped.glob("*.yaml") if path.stem not in NEEDY)
-    return tuple(dict.fromkeys([DIRECT, *BASELINES, *found]))
+    return tuple(dict.fromkeys([DIRECT, PEOPLE, *BASELINES, *found]))
 
 
 @cache

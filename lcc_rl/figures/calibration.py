@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lcc_rl.drivers.twins import REACTING, RECORDED, TWINS, Measured, ratios
 from lcc_rl.errors import DataError
 from lcc_rl.figures.drawing import INK, SOFT, footnote, grid, new_figure, style, unbox
 from lcc_rl.functional.laws import LAWS
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
+DRIVERS = {RECORDED: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
+RATIOS = {"energy": "energy\nper km", "lost": "lost to\naccelerating", "distance": "distance"}
 PARAMETERS = {
     "desired_speed": ("desired_speed_mps", "desired speed $v_0$ [m/s]"),
     "time_gap": ("time_gap_s", "time gap $T$ [s]"),
@@ -105,6 +109,43 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
         fontsize=11,
         color=INK,
     )
+    return figure
+
+
+def twins_figure(twins: Mapping[str, Mapping[str, Measured]]) -> Figure:
+    """Calibrated drivers beside the recorded ones whose leaders they follow, a row per mode.
+
+    Args:
+        twins: by mode, and within by who drives, what was measured; see
+            :func:`lcc_rl.drivers.twins.compare`.
+    """
+    figure = new_figure(10.0, 0.5 + 3.1 * len(twins))
+    axes = np.atleast_2d(figure.subplots(len(twins), 3))
+    for (mode, found), row in zip(twins.items(), axes, strict=True):
+        spectra, share, gaps = row
+        for who, one in found.items():
+            look: dict[str, Any] = {"color": DRIVERS[who], "label": who, "linewidth": 1.6}
+            long = np.isfinite(one.density[0])
+            spectra.semilogy(one.frequency, one.density[:, long].mean(1), **look)
+            ordered = np.sort(one.table["gap_m"])
+            gaps.plot(ordered, np.linspace(0.0, 1.0, len(ordered)), **look)
+            if who != RECORDED:
+                near = ratios(one, found[RECORDED])
+                places = [100.0 * (near[name] - 1.0) for name in RATIOS]
+                share.plot(places, range(len(RATIOS)), "o", color=DRIVERS[who], label=who)
+        share.axvline(0.0, color=DRIVERS[RECORDED], linewidth=1.0)
+        share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
+        share.set_ylim(len(RATIOS) - 0.5, -0.5)
+        style(spectra, "frequency [Hz]", "acceleration [m²/s⁴/Hz]")
+        style(share, "difference from recorded [%]", "")
+        style(gaps, "mean gap [m]", "share of drivers")
+        spectra.set_title(f"spectrum ({mode} calibration)", fontsize=10, color=INK)
+        share.set_title("sums over all drivers", fontsize=10, color=INK)
+        gaps.set_title("distribution of gaps", fontsize=10, color=INK)
+        gaps.set_xlim(left=0.0)
+        spectra.legend(fontsize=8, frameon=False)
+        for axis in row:
+            grid(axis)
     return figure
 
 

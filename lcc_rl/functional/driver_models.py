@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
@@ -39,6 +40,32 @@ class DriverConstants:
         """Return a copy with the mean in place of what varies by driver."""
         varying = {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
         return self.with_(**{name: float(x.mean()) for name, x in varying.items()})
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """How drivers lag behind their model and stray from it; all drivers of a population share it.
+
+    Args:
+        delay: age of the speed, gap and relative speed that a driver reacts to [s].
+        noise: standard deviation of an Ornstein–Uhlenbeck noise of the acceleration, correlated
+            over :data:`NOISE_TIME` [m/s²].
+    """
+
+    delay: float = 0.0
+    noise: float = 0.0
+
+
+NOISE_TIME = 1.0  # time over which the noise of the acceleration is correlated [s]
+
+
+def noise_factors(noise: float, time_step: float) -> tuple[float, float]:
+    """Return ρ and ε of the noise xₖ = ρ xₖ₋₁ + ε N(0, 1), whose standard deviation is ``noise``.
+
+    It is the exact step of an Ornstein–Uhlenbeck process of correlation time :data:`NOISE_TIME`.
+    """
+    kept = math.exp(-time_step / NOISE_TIME)
+    return kept, noise * math.sqrt(1.0 - kept * kept)
 
 
 def limit(acceleration: Tensor, constants: DriverConstants) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw
+from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, Reaction, noise_factors
 from lcc_rl.functional.gipps import GIPPS_LAW
 from lcc_rl.functional.idm import IDM_LAW
 from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
@@ -36,7 +36,8 @@ class Drivers(Controller):
     desired_speed [m/s], desired_time_gap [s]; of other models than the IDM behind a leader also
     equilibrium_gap, at which the driver follows at the leader's first speed [m]. With a delay,
     ``(role, "motion_history")``, ``[*batch, n, 3 · delay]``, holds past speeds [m/s], gaps [m] and
-    relative speeds [m/s], latest first.
+    relative speeds [m/s], latest first; with a correlated noise ``(role, "acceleration_noise")``,
+    ``[*batch, n, 1]``, is its latest value [m/s²].
     """
 
     # Largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each step from
@@ -44,8 +45,11 @@ class Drivers(Controller):
     noise: Share = 0.05
     wiener: NonNegative = 0.0  # standard deviation of a random walk of the speed [m/s per √s]
     # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
-    # those at the start of the episode.
-    delay: Annotated[int, Field(ge=0, le=MOST_DELAY)] = 0
+    # those at the start of the episode. None: the reaction delay of the population.
+    delay: Annotated[int, Field(ge=0, le=MOST_DELAY)] | None = None
+    # Standard deviation of an Ornstein–Uhlenbeck noise of the acceleration, correlated over 1 s
+    # [m/s²]; None: of the population.
+    acceleration_noise: NonNegative | None = None
 
     name = HUMAN
     law: ClassVar[DriverLaw] = IDM_LAW
@@ -60,9 +64,15 @@ class Drivers(Controller):
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         kept = ["driver", "desired_speed", "desired_time_gap"]
+        reaction = self.reaction(world)
+        late, strays = self.delay, self.acceleration_noise
+        self.late = round(reaction.delay / world.time_step) if late is None else late
+        self.strays = reaction.noise if strays is None else strays
+        self.kept_noise, self.new_noise = noise_factors(self.strays, world.time_step)
         self.starts = self.tells_gap and not world.string.ring
         constants = [(role, name) for name in [*kept, *["equilibrium_gap"] * self.starts]]
-        history = [(role, "motion_history")] * (self.delay > 0)
+        history = [(role, "motion_history")] * (self.late > 0)
+        history += [(role, "acceleration_noise")] * (self.strays > 0)
         names = [*MOTION, *(".".join(key) for key in constants[1:3]), "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         names += [".".join(key) for key in history]
@@ -71,6 +81,7 @@ class Drivers(Controller):
         self.spread = self.wiener / world.time_step**0.5
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
+        self.stray_stream = stream_id(f"{stream_name(role)}.acceleration_noise")
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
         self.register_buffer("desired_speeds", speeds)
         self.register_buffer("time_gaps", time_gaps)
@@ -87,6 +98,10 @@ class Drivers(Controller):
         population = world.population
         return population.desired_speed, population.time_gap, population.constants
 
+    def reaction(self, world: World) -> Reaction:
+        """Return the reaction of the population's drivers; none where it says nothing."""
+        return getattr(world.population, "reaction", Reaction())
+
     def command(
         self,
         speed: Tensor,
@@ -98,23 +113,30 @@ class Drivers(Controller):
         step: Tensor,
         *more: Tensor,
     ) -> Any:
-        """Return the commands, and the history where it is kept."""
+        """Return the commands, then the history and the noise where they are kept."""
         motion = (speed, gap, relative_speed)
-        kept = None
-        if self.delay:
+        kept: list[Tensor] = []
+        strayed = torch.zeros_like(speed)
+        if self.strays:
+            *more, before = more  # type: ignore[assignment]
+            drawn = normal(seed, step, self.stray_stream + self.index)
+            later = self.kept_noise * before + self.new_noise * drawn
+            strayed = torch.where(step == 0, self.strays * drawn, later)
+            kept.append(strayed)
+        if self.late:
             *more, history = more  # type: ignore[assignment]
             now = torch.cat(motion, -1)
             # Before the first step nothing else was ever seen.
-            past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.delay), history)
+            past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
             motion = past[..., -3:].split(1, -1)
-            kept = torch.cat([now, past[..., :-3]], -1)
+            kept.insert(0, torch.cat([now, past[..., :-3]], -1))
         command = self.acceleration(*motion, desired_speed, time_gap, *more)
         if self.noise:
             draw = uniform(seed, step, self.noise_stream + self.index)
             command = command * (1.0 + self.noise * draw)
         if self.spread:
             command = command + self.spread * normal(seed, step, self.wiener_stream + self.index)
-        return command if kept is None else (command, kept)
+        return (command + strayed, *kept) if kept else command
 
     def acceleration(
         self,
@@ -139,8 +161,8 @@ class Drivers(Controller):
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         specs = super().written_specs(batch, device)
         for key in self.targets[1:]:
-            shape = (*batch, self.event_shape[0], 3 * self.delay)
-            specs[key] = Unbounded(shape=shape, device=device)
+            width = 3 * self.late if key[-1] == "motion_history" else 1
+            specs[key] = Unbounded(shape=(*batch, self.event_shape[0], width), device=device)
         return specs
 
     def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
@@ -183,6 +205,10 @@ class DriverModel(Drivers):
     def __post_init__(self) -> None:
         if (self.desired_speed is None) != (self.time_gap is None):
             raise ValueError("desired_speed and time_gap belong together: give both or none")
+
+    def reaction(self, world: World) -> Reaction:
+        """Return the population's reaction; drivers of given (v0, T) have none."""
+        return super().reaction(world) if self.desired_speed is None else Reaction()
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
         """Return the drivers, see :class:`Drivers`; refuse those calibrated by other models."""

@@ -40,7 +40,9 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     out = io.StringIO()
     drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     names = sorted(path.name for path in (tmp_path / "run").iterdir())
-    assert names == ["calibration.png", "config.yaml", "drivers.parquet", "joint_distribution.png"]
+    tables = ["drivers.parquet", "twins.parquet"]
+    figures = ["calibration.png", "joint_distribution.png", "twins.png"]
+    assert names == sorted(["config.yaml", *tables, *figures])
     written = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
     pd.testing.assert_frame_equal(written, drivers, check_dtype=False)
     metadata = parquet_metadata(tmp_path / "run" / "drivers.parquet")

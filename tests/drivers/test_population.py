@@ -9,6 +9,7 @@ import torch
 
 from lcc_rl.drivers.population import bootstrap, fixed, from_table, kde, load_drivers
 from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
@@ -105,6 +106,17 @@ def test_drivers_of_several_models_are_a_population(table, written):
         kde(written(table))
     with pytest.raises(DataError, match="row 1, column 'leader_deceleration_mps2'"):
         from_table(table.assign(leader_deceleration_mps2=99.0))
+
+
+def test_a_table_says_how_its_drivers_react(table, written):
+    reacting = table.assign(reaction_delay_s=0.7, acceleration_noise_mps2=0.2)
+    assert bootstrap(written(table)).reaction == Reaction()
+    assert bootstrap(written(reacting)).reaction == Reaction(0.7, 0.2)
+    assert bootstrap(written(reacting), acceleration_noise=0.0).reaction == Reaction(0.7, 0.0)
+    assert kde(written(reacting), drivers=9).reaction == Reaction(0.7, 0.2)
+    reacting.loc[3, "reaction_delay_s"] = 0.5
+    with pytest.raises(DataError, match=r"'reaction_delay_s' must be 0 to 3, the same for all"):
+        bootstrap(written(reacting))
 
 
 def test_tables_of_one_mode_or_none_are_read(table, written):

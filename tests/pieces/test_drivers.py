@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import MIXED, POPULATION, compose, wavy_profiles
@@ -12,6 +14,7 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
 
 MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
@@ -100,6 +103,29 @@ def test_noise_is_that_of_the_paper_for_every_model(model) -> None:
     same = rolled(human(MODELS[model], QUIET), steps=1, batch=256)
     added = (moved["next", "command", "human"] - same["next", "command", "human"]) * 0.1**0.5
     assert added.std().item() == pytest.approx(0.5, rel=0.1)
+
+
+def test_drivers_react_as_their_population_does() -> None:
+    cfg, reacting = human("human", QUIET), replace(POPULATION, reaction=Reaction(0.3, 0.25))
+    data = rolled(cfg, population=reacting, batch=256, steps=20)
+    assert data["human", "motion_history"].shape[-1] == 3 * 3
+    noise = data["next", "human", "acceleration_noise"][..., 0]
+    assert noise.std().item() == pytest.approx(0.25, rel=0.05)
+    # Correlated over 1 s: e^−½ after 5 steps, from the first step on; each car has its own.
+    later = (noise[:, 5:] * noise[:, :-5]).mean() / noise.square().mean()
+    assert later.item() == pytest.approx(0.607, abs=0.05)
+    assert noise[:, 0].std().item() == pytest.approx(0.25, rel=0.12)
+    assert abs(float((noise[..., 0] * noise[..., 1]).mean())) < 0.01
+    # It is what is added to the late law.
+    late = rolled(human("human", QUIET, "scenario.controllers.human.delay=3"), batch=256, steps=1)
+    command = data["next", "command", "human"][:, 0, :, 0]
+    assert torch.allclose(command, late["next", "command", "human"][:, 0, :, 0] + noise[:, 0])
+    # Settings of the controller come first; a driver of given (v0, T) is not of the population.
+    own = [f"scenario.controllers.human.{x}=0" for x in ("delay", "acceleration_noise")]
+    given = [f"scenario.controllers.human.{x}" for x in ("desired_speed=20", "time_gap=1.2")]
+    for more in (own, given):
+        keys = rolled(human("human", QUIET, *more), population=reacting).keys(True, True)
+        assert not {("human", "motion_history"), ("human", "acceleration_noise")} & set(keys)
 
 
 def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:

@@ -1,0 +1,294 @@
+"""Twins: calibrated drivers, each behind the leader of the driver that it was fitted to.
+
+A calibration that minimises the error of speed or gap finds drivers that accelerate too little,
+because it punishes every acceleration at the wrong moment. How true drivers are in energy is seen
+when each drives where the recorded one did. The reaction that the fit leaves out, a delay and a
+noise that all drivers share, is chosen by the spectrum of the acceleration and by the energy lost
+to accelerating.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lcc_rl.drivers.observed import Observed
+from lcc_rl.drivers.parameters import COLUMNS
+from lcc_rl.energy import PaperMotor
+from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, Reaction, noise_factors
+from lcc_rl.functional.kinematics import advance_gap, advance_speed
+from lcc_rl.functional.laws import LAWS
+
+SMOOTHING = 3.1  # moving average of the speeds before their energy is computed [s]
+BAND = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
+WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
+LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
+REPEATS = 4  # draws of the noise of every driver
+AT_ONCE = 20_000  # trajectories side by side; more would only take memory
+FOLDS = 5  # parts of the drivers; each is judged by a reaction chosen on the others
+DELAYS = tuple(round(0.1 * number, 1) for number in range(11))  # among which is chosen [s]
+NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4)  # likewise [m/s²]
+RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is compared of drivers in motion.
+
+    Args:
+        table: a row per driver: energy_j, its part lost_j, distance_m, mean gap_m and
+            long_gap_share of the time.
+        density: power spectral density of the acceleration within :data:`BAND`,
+            ``[frequencies, drivers]``; NaN for records shorter than :data:`WINDOW`.
+        frequency: of its rows [Hz].
+    """
+
+    table: pd.DataFrame
+    density: Array
+    frequency: Array
+
+
+def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: float) -> Measured:
+    """Measure drivers in motion, means over the draws of their noise.
+
+    Speeds are smoothed by a moving average over :data:`SMOOTHING` before their energy is computed:
+    that of the paper's motor (A2) without the kinetic energy stored at the end.
+
+    Args:
+        speed: ``[time, draws, drivers]`` [m/s].
+        gap: the same [m].
+        samples: of every record, ``[drivers]``.
+        time_step: [s].
+    """
+    width = round(SMOOTHING / time_step)
+    total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
+    smooth = (total[width:] - total[:-width]) / width
+    inside = np.arange(len(smooth) - 1)[:, None] < samples - width
+    motion = (torch.from_numpy(smooth[:-1]), torch.from_numpy(np.diff(smooth, axis=0) / time_step))
+    motor = PaperMotor()
+    of = {
+        "energy_j": motor.path_power(*motion).numpy(),
+        "lost_j": motor.acceleration_loss(*motion).numpy(),
+        "distance_m": 0.5 * (smooth[1:] + smooth[:-1]),
+    }
+    table = {name: (x * time_step * inside[:, None]).sum(0).mean(0) for name, x in of.items()}
+    alive = (np.arange(len(speed))[:, None] < samples)[:, None]
+    table["gap_m"] = (gap * alive).mean(1).sum(0) / samples
+    moving = alive & (speed > 1.0)
+    far = moving & (gap > LONG_GAP * speed)
+    table["long_gap_share"] = far.sum((0, 1)) / np.maximum(moving.sum((0, 1)), 1)
+    return Measured(pd.DataFrame(table), *_spectrum(speed, samples, time_step))
+
+
+def _spectrum(speed: Array, samples: NDArray[np.int64], time_step: float) -> tuple[Array, Any]:
+    """Return the acceleration's density by Welch's method, and its frequencies, within the band."""
+    acceleration, width = np.diff(speed, axis=0) / time_step, round(WINDOW / time_step)
+    frequency = np.fft.rfftfreq(width, time_step)
+    inside = (frequency >= BAND[0]) & (frequency <= BAND[1])
+    taper = np.hanning(width)[:, None, None]
+    total, count = np.zeros((int(inside.sum()), speed.shape[-1])), np.zeros(speed.shape[-1])
+    for start in range(0, len(acceleration) - width + 1, width // 2):
+        part = acceleration[start : start + width]
+        power = np.abs(np.fft.rfft((part - part.mean(0)) * taper, axis=0)[inside]) ** 2
+        whole = samples > start + width
+        total += power.mean(1) * whole
+        count += whole
+    scale = 2.0 * time_step / (taper**2).sum()
+    return scale * total / np.where(count > 0, count, np.nan), frequency[inside]
+
+
+def recorded(observed: Observed) -> Measured:
+    """Measure the recorded drivers."""
+    series = (observed.follower_speed, observed.gaps)
+    speed, gap = (x.double().cpu().numpy()[:, None] for x in series)
+    return measure(speed, gap, observed.samples, observed.time_step)
+
+
+def drive(
+    observed: Observed,
+    drivers: pd.DataFrame,
+    reactions: Sequence[Reaction],
+    repeats: int = REPEATS,
+    seed: int = 0,
+) -> list[Measured]:
+    """Drive twins: calibrated drivers from the first speed and gap of the recorded ones.
+
+    Args:
+        observed: the records.
+        drivers: their calibrated parameters by one model, a row for each episode.
+        reactions: of one delay; all meet the same draws of the noise.
+        repeats: draws of the noise.
+        seed: of the noise.
+
+    Returns:
+        What was measured, for every reaction.
+    """
+    law, own, constants = _parameters(observed, drivers)
+    series = (observed.leader_speed, observed.follower_speed, observed.gaps)
+    leader, truth, gaps = (x.double().cpu() for x in series)
+    generator, step = torch.Generator().manual_seed(seed), observed.time_step
+    shape = (len(reactions), repeats, observed.count)
+    level = torch.tensor([one.noise for one in reactions]).double().view(-1, 1, 1)
+    kept, new = noise_factors(1.0, step)
+
+    def draw() -> Tensor:
+        return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
+
+    speed, gap, noise = truth[0].expand(shape), gaps[0].expand(shape), draw()
+    seen = [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
+    motion = [(speed, gap)]
+    for before, after in pairwise(leader):
+        seen = [*seen[1:], (speed, gap, before)]
+        old_speed, old_gap, ahead = seen[0]
+        command = law.acceleration(old_speed, old_gap, old_speed - ahead, *own, constants)
+        reached, _ = advance_speed(speed, command + level * noise, step)
+        gap = advance_gap(gap, before, speed, after, reached, step)
+        speed, noise = reached, kept * noise + new * draw()
+        motion.append((speed, gap))
+    speeds, distances = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
+    pairs = zip(speeds, distances, strict=True)
+    return [measure(*pair, observed.samples, step) for pair in pairs]
+
+
+def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> float:
+    """Return the standard deviation of what a model leaves open of the next acceleration [m/s²].
+
+    The model acts on the recorded state, as old as the delay; the logarithm of this number is, but
+    for a constant, the negative likelihood of a sample.
+    """
+    law, own, constants = _parameters(observed, drivers)
+    series = (observed.leader_speed, observed.follower_speed, observed.gaps)
+    leader, speed, gap = (x.double().cpu() for x in series)
+    late = round(delay / observed.time_step)
+    wish = law.acceleration(speed, gap, speed - leader, *own, constants)
+    left = speed.diff(dim=0)[late:] / observed.time_step - wish[: len(wish) - 1 - late]
+    last = torch.tensor(observed.samples) - 1 - late
+    inside = torch.arange(len(left)).unsqueeze(-1) < last
+    return float((left.square() * inside).sum().div(inside.sum()).sqrt())
+
+
+def _parameters(
+    observed: Observed, drivers: pd.DataFrame
+) -> tuple[DriverLaw, tuple[Tensor, Tensor], DriverConstants]:
+    """Return model, (v0, T) and constants of the drivers in the order of the records."""
+    table = drivers.set_index("episode").loc[observed.identity["episode"]]
+    law = LAWS[str(table["model"].iloc[0])]
+    own = {x: torch.tensor(table[COLUMNS[x]].to_numpy(np.float64)) for x in law.parameters}
+    constants = law.constants().with_(**{name: own[name] for name in law.shared})
+    return law, (own["desired_speed"], own["time_gap"]), constants
+
+
+def ratios(twins: Measured, records: Measured, rows: Rows | None = None) -> dict[str, float]:
+    """Compare drivers with the recorded ones, as ratios of sums over them.
+
+    Args:
+        twins, records: what was measured of both.
+        rows: which drivers, ``[drivers]``; None for all.
+
+    Returns:
+        ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, and ``spectrum``: the
+        root of the mean square of the logarithm of the ratio of both densities.
+    """
+    chosen = np.ones(len(records.table), bool) if rows is None else rows
+    one, other = (x.table[chosen].sum() for x in (twins, records))
+    distance = one["distance_m"] / other["distance_m"]
+    long = chosen & np.isfinite(records.density[0])
+    densities = (x.density[:, long].sum(1) for x in (twins, records))
+    apart = np.log(np.divide(*densities)) if long.any() else np.zeros(1)
+    return {
+        "energy": float(one["energy_j"] / other["energy_j"] / distance),
+        "lost": float(one["lost_j"] / other["lost_j"] / distance),
+        "distance": float(distance),
+        "spectrum": float(np.sqrt(np.mean(apart**2))),
+    }
+
+
+def tried(observed: Observed, drivers: pd.DataFrame) -> dict[Reaction, Measured]:
+    """Drive twins with all of :data:`DELAYS` × :data:`NOISES`."""
+    found: dict[Reaction, Measured] = {}
+    together = max(1, AT_ONCE // (REPEATS * observed.count))
+    for delay in DELAYS:
+        every = [Reaction(delay, noise) for noise in NOISES]
+        for start in range(0, len(every), together):
+            reactions = every[start : start + together]
+            found |= dict(zip(reactions, drive(observed, drivers, reactions), strict=True))
+    return found
+
+
+def choose(
+    twins: Mapping[Reaction, Measured], records: Measured, rows: Rows | None = None
+) -> Reaction:
+    """Choose the reaction with which some drivers come closest to the recorded ones.
+
+    The distance adds up those of the spectra and of the energy lost to accelerating, as logarithms.
+    """
+
+    def distance(reaction: Reaction) -> float:
+        near = ratios(twins[reaction], records, rows)
+        return float(near["spectrum"] + abs(np.log(near["lost"])))
+
+    return min(twins, key=distance)
+
+
+def judged(twins: Mapping[Reaction, Measured], records: Measured) -> Measured:
+    """Return drivers who each have the reaction that was chosen on other drivers."""
+    drivers = len(records.table)
+    whole, fold = twins[Reaction()], np.arange(drivers) % FOLDS
+    table, density = whole.table.copy(), whole.density.copy()
+    for number in range(min(FOLDS, drivers) if drivers > 1 else 0):
+        own = fold == number
+        chosen = twins[choose(twins, records, ~own)]
+        table.loc[own] = chosen.table[own]
+        density[:, own] = chosen.density[:, own]
+    return replace(whole, table=table, density=density)
+
+
+def compare(
+    observed: Observed, drivers: pd.DataFrame, react: bool
+) -> tuple[Reaction, dict[str, Measured], list[str]]:
+    """Compare calibrated drivers with the recorded ones.
+
+    Args:
+        observed: the records.
+        drivers: see :func:`drive`.
+        react: also choose a reaction that all drivers share.
+
+    Returns:
+        The reaction; what was measured of the recorded drivers, of their twins and of those with
+        the reaction, each as it was chosen on other drivers; and lines on both.
+    """
+    found = {RECORDED: recorded(observed)}
+    if not react:
+        found[TWINS] = drive(observed, drivers, [Reaction()], 1)[0]
+        return Reaction(), found, [_line(TWINS, found, one_step_error(observed, drivers, 0.0))]
+    twins = tried(observed, drivers)
+    reaction = choose(twins, found[RECORDED])
+    found |= {TWINS: twins[Reaction()], REACTING: judged(twins, found[RECORDED])}
+    errors = {
+        who: one_step_error(observed, drivers, delay)
+        for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
+    }
+    line = (
+        f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s² "
+        f"chosen; below, each driver has what was chosen on others"
+    )
+    return reaction, found, [line, *(_line(who, found, one) for who, one in errors.items())]
+
+
+def _line(who: str, found: Mapping[str, Measured], one_step: float) -> str:
+    near = ratios(found[who], found[RECORDED])
+    return (
+        f"drivers {who}: {near['energy']:.3f} of the recorded energy per km, {near['lost']:.2f} of "
+        f"what accelerating loses; spectrum off by a factor {np.exp(near['spectrum']):.2f}, "
+        f"one-step error {one_step:.2f} m/s²"
+    )

@@ -1,0 +1,126 @@
+"""Twins: what is measured of them, and which reaction is found in drivers that have one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from lcc_rl.drivers.calibrator import Calibrator
+from lcc_rl.drivers.observed import observe
+from lcc_rl.drivers.parameters import COLUMNS
+from lcc_rl.drivers.twins import (
+    BAND,
+    RECORDED,
+    Reaction,
+    choose,
+    drive,
+    measure,
+    one_step_error,
+    ratios,
+    recorded,
+    tried,
+)
+from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.power import acceleration_loss
+
+STEP, SAMPLES = 0.1, 601
+
+
+def followed(delay: float, noise: float, drivers: int = 40) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Drive late and straying IDM drivers; return their episodes and their parameters.
+
+    A plain loop by the equations (A3, A4), in numpy.
+    """
+    chance, late = np.random.default_rng(3), round(delay / STEP)
+    v0, headway = chance.uniform(15, 30, drivers), chance.uniform(0.8, 2.0, drivers)
+    time = np.arange(SAMPLES)[:, None] * STEP
+    waves = 2.0 * np.pi * time / chance.uniform(15, 40, drivers) + chance.uniform(0, 6, drivers)
+    leader = 9.0 + 2.0 * np.sin(waves) + 1.0 * np.sin(2.3 * waves)
+    speed, gap = np.empty((2, SAMPLES, drivers))
+    speed[0], gap[0] = leader[0], 3.0 + headway * leader[0]
+    x, kept = noise * chance.standard_normal(drivers), math.exp(-STEP)
+    for k in range(SAMPLES - 1):
+        seen = max(k - late, 0)
+        v, s = speed[seen], gap[seen]
+        wish = 2.0 + np.maximum(0.0, v * headway + v * (v - leader[seen]) / (2 * math.sqrt(1.5)))
+        command = 1.0 - (v / v0) ** 4 - (wish / s) ** 2 + x
+        speed[k + 1] = np.maximum(0.0, speed[k] + STEP * command)
+        gap[k + 1] = gap[k] + 0.5 * STEP * (leader[k] + leader[k + 1] - speed[k] - speed[k + 1])
+        x = kept * x + noise * math.sqrt(1 - kept**2) * chance.standard_normal(drivers)
+    number = np.repeat(np.arange(drivers), SAMPLES)
+    table = pd.DataFrame({"episode": number, "time_s": np.tile(time[:, 0], drivers)})
+    series = {"leader_speed_mps": leader, "follower_speed_mps": speed, "gap_m": gap}
+    table = table.assign(**{name: values.T.ravel() for name, values in series.items()})
+    own = IDMConstants()
+    known = pd.DataFrame({"episode": range(drivers), "model": "idm"}).assign(
+        **{COLUMNS["desired_speed"]: v0, COLUMNS["time_gap"]: headway},
+        **{COLUMNS[x]: getattr(own, x) for x in ("acceleration", "deceleration", "min_gap")},
+    )
+    return table, known
+
+
+@pytest.mark.parametrize(("delay", "noise"), [(0.0, 0.0), (0.6, 0.25)])
+def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
+    episodes, known = followed(delay, noise)
+    observed = observe(episodes)
+    records, twins = recorded(observed), tried(observed, known)
+    found = choose(twins, records)
+    assert found.delay == pytest.approx(delay, abs=0.11)
+    assert found.noise == pytest.approx(noise, abs=0.06)
+    near = ratios(twins[found], records)
+    assert near["lost"] == pytest.approx(1.0, abs=0.08)
+    assert near["energy"] == pytest.approx(1.0, abs=0.02)
+    # The one-step error alone tells the delay, too: it is least there.
+    errors = {late: one_step_error(observed, known, late) for late in (0.0, 0.3, 0.6, 0.9)}
+    assert min(errors, key=errors.get) == delay
+    assert errors[delay] == pytest.approx(noise, abs=0.03)
+
+
+def test_calibration_smooths_drivers_and_the_reaction_restores_them() -> None:
+    episodes, _ = followed(0.6, 0.25)
+    result = Calibrator(reaction=True)(episodes)
+    plain, reacting = (
+        ratios(result.twins["local"][who], result.twins["local"][RECORDED])
+        for who in ("as calibrated", "with reaction")
+    )
+    assert plain["lost"] < 0.9
+    assert abs(reacting["lost"] - 1.0) < 0.5 * abs(plain["lost"] - 1.0)
+    assert reacting["spectrum"] < 0.5 * plain["spectrum"]
+    columns = result.drivers[["reaction_delay_s", "acceleration_noise_mps2"]]
+    assert (columns.nunique() == 1).all()
+    assert (columns.iloc[0] > 0.0).all()
+    assert any("reaction delay" in line for line in result.report)
+
+
+def test_measures_by_hand() -> None:
+    # 10 + sin(2π 0.1 t) m/s, six periods after smoothing: a² has the mean (0.2π)²/2; an
+    # average over 3.1 s damps it by sin(0.31π)/(0.31π), twice. Its density lies at 0.1 Hz.
+    samples = np.array([631])
+    time = np.arange(631) * STEP
+    speed = (10.0 + np.sin(0.2 * np.pi * time))[:, None, None]
+    found = measure(speed, 30.0 + 0.0 * speed, samples, STEP)
+    row, seconds = found.table.iloc[0], 60.0
+    damped = np.sinc(0.31)
+    assert row["distance_m"] == pytest.approx(10.0 * seconds, rel=0.01)
+    assert row["gap_m"] == pytest.approx(30.0)
+    assert row["long_gap_share"] == pytest.approx(np.mean(2.5 * speed < 30.0))
+    squares = (0.2 * np.pi * damped) ** 2 / 2.0 * seconds
+    per_square = acceleration_loss(torch.tensor(10.0), torch.tensor(1.0)).item()
+    assert row["lost_j"] == pytest.approx(per_square * squares, rel=0.01)
+    assert found.frequency[found.density[:, 0].argmax()] == pytest.approx(0.1)
+    assert BAND[0] <= found.frequency.min() <= found.frequency.max() <= BAND[1]
+
+
+def test_twins_of_one_delay_meet_the_same_noise() -> None:
+    episodes, known = followed(0.0, 0.0, drivers=3)
+    observed = observe(episodes)
+    quiet, loud = drive(observed, known, [Reaction(), Reaction(0.0, 0.3)])
+    alone = drive(observed, known, [Reaction(0.0, 0.3)])[0]
+    pd.testing.assert_frame_equal(loud.table, alone.table)
+    # Without reaction they are the drivers themselves.
+    pd.testing.assert_frame_equal(quiet.table, recorded(observed).table, rtol=1e-9)
+    assert (loud.table["lost_j"] > quiet.table["lost_j"]).all()
