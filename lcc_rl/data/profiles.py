@@ -35,6 +35,8 @@ class Profiles:
         weights: how often a training draws each record, relative to the others, ``[profiles]``,
             float64; None: all alike.
         sources: the source of each record, where there are several; empty for one.
+        followers: speed [m/s] and gap [m] of the driver recorded behind each leader,
+            ``[samples, 2]``, float32; None where there is none.
     """
 
     speeds: Tensor
@@ -46,6 +48,7 @@ class Profiles:
     reach: Tensor | None = None
     weights: Tensor | None = None
     sources: tuple[str, ...] = ()
+    followers: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -55,6 +58,12 @@ class Profiles:
         start = int(self.offsets[index])
         return self.speeds[start : start + int(self.lengths[index])]
 
+    def follower(self, index: int) -> Tensor | None:
+        """Return the recorded follower, ``[samples, 2]``, see ``followers``."""
+        start = int(self.offsets[index])
+        whole = self.followers
+        return None if whole is None else whole[start : start + int(self.lengths[index])]
+
     def select(self, indices: Iterable[int]) -> Profiles:
         """Return the records with the given indices, in that order."""
         chosen = [int(i) for i in indices]
@@ -63,9 +72,11 @@ class Profiles:
         index = torch.tensor(chosen)
         reach = self.lengths if self.reach is None else self.reach
         spans = torch.stack([self.offsets[index], self.offsets[index] + reach[index]], 1).tolist()
+        behind = self.followers
         return replace(
             self,
             speeds=torch.cat([self.speeds[first:end] for first, end in spans]),
+            followers=None if behind is None else torch.cat([behind[a:b] for a, b in spans]),
             offsets=torch.cumsum(reach[index], 0) - reach[index],
             lengths=self.lengths[index],
             names=tuple(self.names[i] for i in chosen),
@@ -100,6 +111,7 @@ class Profiles:
             [f"{self.names[i]}+{start * self.time_step:g}s" for i, start in cuts],
             [self.recordings[i] for i, _ in cuts],
             self.time_step,
+            None if self.followers is None else [self.follower(i)[start:] for i, start in cuts],  # type: ignore[index]
         )
         played = torch.full_like(whole.lengths, horizon + 1)
         return replace(whole, lengths=played, reach=whole.lengths)
@@ -147,8 +159,9 @@ def from_records(
     names: Sequence[str],
     recordings: Sequence[str],
     time_step: float,
+    followers: Sequence[Tensor] | None = None,
 ) -> Profiles:
-    """Build profiles from separate speed records.
+    """Build profiles from separate speed records; arguments as in :class:`Profiles`.
 
     Raises:
         DataError: if there is none, or one holds a negative or missing speed.
@@ -166,6 +179,7 @@ def from_records(
         names=tuple(names),
         recordings=tuple(recordings),
         time_step=time_step,
+        followers=None if followers is None else torch.cat(list(followers)).to(torch.float32),
     )
 
 
@@ -179,6 +193,7 @@ def join(parts: Sequence[Profiles]) -> Profiles:
     """Put several profiles of one step into one collection."""
     sizes = [len(part.speeds) for part in parts]
     known = [part.lengths if part.reach is None else part.reach for part in parts]
+    behind = [part.followers for part in parts if part.followers is not None]
     return Profiles(
         speeds=torch.cat([part.speeds for part in parts]),
         offsets=torch.cat([part.offsets + sum(sizes[:i]) for i, part in enumerate(parts)]),
@@ -187,11 +202,12 @@ def join(parts: Sequence[Profiles]) -> Profiles:
         recordings=tuple(name for part in parts for name in part.recordings),
         time_step=parts[0].time_step,
         reach=None if all(part.reach is None for part in parts) else torch.cat(known),
+        followers=torch.cat(behind) if len(behind) == len(parts) else None,
     )
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
-    """Take the leader's speed record of every episode.
+    """Take the leader's speed record of every episode, and its follower's speed and gap.
 
     Args:
         episodes: the SI table of episodes (see :mod:`lcc_rl.data.episodes`).
@@ -200,7 +216,7 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
     Raises:
         DataError: if the table is sampled at another step, or holds no episode.
     """
-    records, names, recordings = [], [], []
+    records, names, recordings, followers = [], [], [], []
     for number, episode in episodes.groupby("episode", sort=True):
         time = episode["time_s"].to_numpy()
         if len(time) > 1 and not np.allclose(np.diff(time), time_step, atol=0.1 * time_step):
@@ -212,7 +228,9 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
         records.append(torch.tensor(episode["leader_speed_mps"].to_numpy(np.float32)))
         names.append(f"{recording}/{leader}@{time[0]:.1f}s")
         recordings.append(recording)
-    return from_records(records, names, recordings, time_step)
+        behind = episode[["follower_speed_mps", "gap_m"]].to_numpy(np.float32)
+        followers.append(torch.from_numpy(behind))
+    return from_records(records, names, recordings, time_step, followers)
 
 
 def resample(
@@ -247,11 +265,16 @@ def at_step(profiles: Profiles, time_step: float) -> Profiles:
     """Interpolate every record to another step [s]."""
     if time_step == profiles.time_step:
         return profiles
-    records = []
-    for index in range(len(profiles)):
-        speed = profiles.record(index).numpy().astype(float)
-        records.append(resample(np.arange(len(speed)) * profiles.time_step, speed, time_step))
-    return from_records(records, profiles.names, profiles.recordings, time_step)
+
+    def changed(series: Tensor) -> Tensor:
+        values = series.numpy().astype(float)
+        return resample(np.arange(len(values)) * profiles.time_step, values, time_step)
+
+    numbers, followers = range(len(profiles)), None
+    if profiles.followers is not None:
+        followers = [changed(profiles.follower(index)) for index in numbers]  # type: ignore[arg-type]
+    records = [changed(profiles.record(index)) for index in numbers]
+    return from_records(records, profiles.names, profiles.recordings, time_step, followers)
 
 
 class Split(Settings):

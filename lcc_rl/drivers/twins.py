@@ -27,7 +27,9 @@ from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, Reaction
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.laws import LAWS
 
-SMOOTHING = 3.1  # moving average of the speeds before their energy is computed [s]
+# Moving averages of the speeds before their energy is computed; the first one counts for the choice
+# of a reaction: shorter ones leave the noise of records, longer ones take what drivers do [s].
+SMOOTHINGS = (1.1, 3.1)
 BAND = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
 WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
 LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
@@ -35,7 +37,7 @@ REPEATS = 4  # draws of the noise of every driver
 AT_ONCE = 20_000  # trajectories side by side; more would only take memory
 FOLDS = 5  # parts of the drivers; each is judged by a reaction chosen on the others
 DELAYS = tuple(round(0.1 * number, 1) for number in range(11))  # among which is chosen [s]
-NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4)  # likewise [m/s²]
+NOISES = (0.0, 0.05, 0.1, 0.125, 0.15, 0.175, 0.2, 0.25, 0.3, 0.4)  # likewise [m/s²]
 RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -46,8 +48,9 @@ class Measured:
     """What is compared of drivers in motion.
 
     Args:
-        table: a row per driver: energy_j, its part lost_j, distance_m, mean gap_m and
-            long_gap_share of the time.
+        table: a row per driver: mean gap_m, long_gap_share of the time and, for each of
+            :data:`SMOOTHINGS`, such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and
+            distance_1.1s_m.
         density: power spectral density of the acceleration within :data:`BAND`,
             ``[frequencies, drivers]``; NaN for records shorter than :data:`WINDOW`.
         frequency: of its rows [Hz].
@@ -61,8 +64,7 @@ class Measured:
 def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: float) -> Measured:
     """Measure drivers in motion, means over the draws of their noise.
 
-    Speeds are smoothed by a moving average over :data:`SMOOTHING` before their energy is computed:
-    that of the paper's motor (A2) without the kinetic energy stored at the end.
+    The energy is that of the paper's motor (A2) without the kinetic energy stored at the end.
 
     Args:
         speed: ``[time, draws, drivers]`` [m/s].
@@ -70,18 +72,21 @@ def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: flo
         samples: of every record, ``[drivers]``.
         time_step: [s].
     """
-    width = round(SMOOTHING / time_step)
+    table, motor = {}, PaperMotor()
     total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
-    smooth = (total[width:] - total[:-width]) / width
-    inside = np.arange(len(smooth) - 1)[:, None] < samples - width
-    motion = (torch.from_numpy(smooth[:-1]), torch.from_numpy(np.diff(smooth, axis=0) / time_step))
-    motor = PaperMotor()
-    of = {
-        "energy_j": motor.path_power(*motion).numpy(),
-        "lost_j": motor.acceleration_loss(*motion).numpy(),
-        "distance_m": 0.5 * (smooth[1:] + smooth[:-1]),
-    }
-    table = {name: (x * time_step * inside[:, None]).sum(0).mean(0) for name, x in of.items()}
+    for smoothing in SMOOTHINGS:
+        width = round(smoothing / time_step)
+        smooth = (total[width:] - total[:-width]) / width
+        inside = np.arange(len(smooth) - 1)[:, None] < samples - width
+        accelerations = torch.from_numpy(np.diff(smooth, axis=0) / time_step)
+        motion = (torch.from_numpy(smooth[:-1]), accelerations)
+        of = {
+            f"energy_{smoothing}s_j": motor.path_power(*motion).numpy(),
+            f"lost_{smoothing}s_j": motor.acceleration_loss(*motion).numpy(),
+            f"distance_{smoothing}s_m": 0.5 * (smooth[1:] + smooth[:-1]),
+        }
+        for name, rate in of.items():
+            table[name] = (rate * time_step * inside[:, None]).sum(0).mean(0)
     alive = (np.arange(len(speed))[:, None] < samples)[:, None]
     table["gap_m"] = (gap * alive).mean(1).sum(0) / samples
     moving = alive & (speed > 1.0)
@@ -188,12 +193,18 @@ def _parameters(
     return law, (own["desired_speed"], own["time_gap"]), constants
 
 
-def ratios(twins: Measured, records: Measured, rows: Rows | None = None) -> dict[str, float]:
+def ratios(
+    twins: Measured,
+    records: Measured,
+    rows: Rows | None = None,
+    smoothing: float = SMOOTHINGS[0],
+) -> dict[str, float]:
     """Compare drivers with the recorded ones, as ratios of sums over them.
 
     Args:
         twins, records: what was measured of both.
         rows: which drivers, ``[drivers]``; None for all.
+        smoothing: one of :data:`SMOOTHINGS` [s].
 
     Returns:
         ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, and ``spectrum``: the
@@ -201,13 +212,16 @@ def ratios(twins: Measured, records: Measured, rows: Rows | None = None) -> dict
     """
     chosen = np.ones(len(records.table), bool) if rows is None else rows
     one, other = (x.table[chosen].sum() for x in (twins, records))
-    distance = one["distance_m"] / other["distance_m"]
+    energy, lost, distance = (
+        one[name] / other[name]
+        for name in (f"energy_{smoothing}s_j", f"lost_{smoothing}s_j", f"distance_{smoothing}s_m")
+    )
     long = chosen & np.isfinite(records.density[0])
     densities = (x.density[:, long].sum(1) for x in (twins, records))
     apart = np.log(np.divide(*densities)) if long.any() else np.zeros(1)
     return {
-        "energy": float(one["energy_j"] / other["energy_j"] / distance),
-        "lost": float(one["lost_j"] / other["lost_j"] / distance),
+        "energy": float(energy / distance),
+        "lost": float(lost / distance),
         "distance": float(distance),
         "spectrum": float(np.sqrt(np.mean(apart**2))),
     }
@@ -286,9 +300,11 @@ def compare(
 
 
 def _line(who: str, found: Mapping[str, Measured], one_step: float) -> str:
-    near = ratios(found[who], found[RECORDED])
+    each = [ratios(found[who], found[RECORDED], smoothing=width) for width in SMOOTHINGS]
+    energies = ", ".join(f"{one['energy']:.3f}" for one in each)
+    losses = ", ".join(f"{one['lost']:.2f}" for one in each)
     return (
-        f"drivers {who}: {near['energy']:.3f} of the recorded energy per km, {near['lost']:.2f} of "
-        f"what accelerating loses; spectrum off by a factor {np.exp(near['spectrum']):.2f}, "
-        f"one-step error {one_step:.2f} m/s²"
+        f"drivers {who}: {energies} of the recorded energy per km, {losses} of what accelerating "
+        f"loses (speeds smoothed over {', '.join(map(str, SMOOTHINGS))} s); spectrum off by a "
+        f"factor {np.exp(each[0]['spectrum']):.2f}, one-step error {one_step:.2f} m/s²"
     )

