@@ -3,8 +3,9 @@
 A calibration that minimises the error of speed or gap finds drivers that accelerate too little,
 because it punishes every acceleration at the wrong moment. How true drivers are in energy is seen
 when each drives where the recorded one did. The reaction that the fit leaves out, a delay and a
-noise that all drivers share, is chosen by the spectrum of the acceleration and by the energy lost
-to accelerating.
+noise that all drivers share, is chosen by the spectrum of the acceleration, by the energy lost to
+accelerating, and so that energy does not grow along a string of such drivers: a delay alone would
+do for the first driver, whose successors then amplify what it does until they collide.
 """
 
 from __future__ import annotations
@@ -33,14 +34,19 @@ SMOOTHINGS = (1.1, 3.1)
 BAND = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
 WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
 LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
-REPEATS = 4  # draws of the noise of every driver
+REPEATS = 2  # draws of the noise of every driver
 AT_ONCE = 20_000  # trajectories side by side; more would only take memory
 FOLDS = 5  # parts of the drivers; each is judged by a reaction chosen on the others
-DELAYS = tuple(round(0.1 * number, 1) for number in range(11))  # among which is chosen [s]
-NOISES = (0.0, 0.05, 0.1, 0.125, 0.15, 0.175, 0.2, 0.25, 0.3, 0.4)  # likewise [m/s²]
+DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # among which is chosen [s]
+NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
+TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose
+CARS = 5  # drivers in a row, along whom energy must not grow
+CAP = 3.0  # bounds the gaps that they start at, see lcc_rl.functional.idm.equilibrium_gap [s]
+ENERGY, DISTANCE = f"energy_{SMOOTHINGS[0]}s_j", f"distance_{SMOOTHINGS[0]}s_m"
 RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
+People = tuple[DriverLaw, tuple[Tensor, Tensor], DriverConstants]  # model, (v0, T), the rest
 
 
 @dataclass(frozen=True)
@@ -138,19 +144,65 @@ def drive(
     Returns:
         What was measured, for every reaction.
     """
-    law, own, constants = _parameters(observed, drivers)
-    series = (observed.leader_speed, observed.follower_speed, observed.gaps)
-    leader, truth, gaps = (x.double().cpu() for x in series)
-    generator, step = torch.Generator().manual_seed(seed), observed.time_step
-    shape = (len(reactions), repeats, observed.count)
+    series = (observed.leader_speed, observed.follower_speed[0], observed.gaps[0])
+    leader, *start = (x.double().cpu() for x in series)
+    generator = torch.Generator().manual_seed(seed)
+    who, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
+    motion = _follow(who, leader, start, reactions, shape, generator, observed.time_step)
+    return [measure(*one, observed.samples, observed.time_step) for one in motion]
+
+
+def growth(
+    observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reaction], seed: int = 0
+) -> list[float]:
+    """Return how much more energy the last of :data:`CARS` drivers needs than the first.
+
+    Behind every recorded leader, drivers follow one another, drawn from all of them, from their
+    own equilibrium. What is returned is the logarithm of the ratio of both energies per distance,
+    for every reaction; infinity if anybody collides.
+    """
+    law, own, constants = _people(observed, drivers)
+    leader = observed.leader_speed.double().cpu()
+    generator, chance = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
+    shape, step = (len(reactions), 1, observed.count), observed.time_step
+    energies, collided = [], np.zeros(len(reactions), bool)
+    for _ in range(CARS):
+        order = torch.from_numpy(chance.permutation(observed.count))
+        shared = {name: getattr(constants, name)[order] for name in law.shared}
+        who = (law, (own[0][order], own[1][order]), constants.with_(**shared))
+        gap = law.equilibrium_gap(leader[0], *who[1], who[2], CAP)
+        motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
+        inside = (np.arange(len(leader))[:, None] < observed.samples)[:, None]
+        collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
+        sums = [measure(*one, observed.samples, step).table.sum() for one in motion]
+        energies.append([one[ENERGY] / one[DISTANCE] for one in sums])
+        leader = torch.from_numpy(np.stack([speed for speed, _ in motion], 1))
+    grown = np.log(np.divide(energies[-1], energies[0]))
+    return [float(x) for x in np.where(collided, np.inf, grown)]
+
+
+def _follow(
+    who: People,
+    leader: Tensor,
+    start: Sequence[Tensor],
+    reactions: Sequence[Reaction],
+    shape: tuple[int, int, int],
+    generator: torch.Generator,
+    step: float,
+) -> list[tuple[Array, Array]]:
+    """Drive followers; return speeds and gaps ``[time, draws, drivers]`` for every reaction.
+
+    The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
+    """
+    law, own, constants = who
     level = torch.tensor([one.noise for one in reactions]).double().view(-1, 1, 1)
     kept, new = noise_factors(1.0, step)
 
     def draw() -> Tensor:
         return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
 
-    speed, gap, noise = truth[0].expand(shape), gaps[0].expand(shape), draw()
-    seen = [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
+    speed, gap = (x.expand(shape) for x in start)
+    noise, seen = draw(), [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
     motion = [(speed, gap)]
     for before, after in pairwise(leader):
         seen = [*seen[1:], (speed, gap, before)]
@@ -160,9 +212,8 @@ def drive(
         gap = advance_gap(gap, before, speed, after, reached, step)
         speed, noise = reached, kept * noise + new * draw()
         motion.append((speed, gap))
-    speeds, distances = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
-    pairs = zip(speeds, distances, strict=True)
-    return [measure(*pair, observed.samples, step) for pair in pairs]
+    speeds, gaps = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
+    return list(zip(speeds, gaps, strict=True))
 
 
 def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> float:
@@ -171,7 +222,7 @@ def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> f
     The model acts on the recorded state, as old as the delay; the logarithm of this number is, but
     for a constant, the negative likelihood of a sample.
     """
-    law, own, constants = _parameters(observed, drivers)
+    law, own, constants = _people(observed, drivers)
     series = (observed.leader_speed, observed.follower_speed, observed.gaps)
     leader, speed, gap = (x.double().cpu() for x in series)
     late = round(delay / observed.time_step)
@@ -182,9 +233,7 @@ def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> f
     return float((left.square() * inside).sum().div(inside.sum()).sqrt())
 
 
-def _parameters(
-    observed: Observed, drivers: pd.DataFrame
-) -> tuple[DriverLaw, tuple[Tensor, Tensor], DriverConstants]:
+def _people(observed: Observed, drivers: pd.DataFrame) -> People:
     """Return model, (v0, T) and constants of the drivers in the order of the records."""
     table = drivers.set_index("episode").loc[observed.identity["episode"]]
     law = LAWS[str(table["model"].iloc[0])]
@@ -227,41 +276,58 @@ def ratios(
     }
 
 
-def tried(observed: Observed, drivers: pd.DataFrame) -> dict[Reaction, Measured]:
+@dataclass(frozen=True)
+class Tried:
+    """Twins with one reaction: what was measured of them, and :func:`growth`."""
+
+    twins: Measured
+    growth: float
+
+
+def tried(observed: Observed, drivers: pd.DataFrame) -> dict[Reaction, Tried]:
     """Drive twins with all of :data:`DELAYS` × :data:`NOISES`."""
-    found: dict[Reaction, Measured] = {}
+    found: dict[Reaction, Tried] = {}
     together = max(1, AT_ONCE // (REPEATS * observed.count))
     for delay in DELAYS:
         every = [Reaction(delay, noise) for noise in NOISES]
         for start in range(0, len(every), together):
             reactions = every[start : start + together]
-            found |= dict(zip(reactions, drive(observed, drivers, reactions), strict=True))
+            twins = drive(observed, drivers, reactions)
+            grown = growth(observed, drivers, reactions)
+            found |= dict(zip(reactions, map(Tried, twins, grown), strict=True))
     return found
 
 
 def choose(
-    twins: Mapping[Reaction, Measured], records: Measured, rows: Rows | None = None
+    tries: Mapping[Reaction, Tried], records: Measured, rows: Rows | None = None
 ) -> Reaction:
     """Choose the reaction with which some drivers come closest to the recorded ones.
 
-    The distance adds up those of the spectra and of the energy lost to accelerating, as logarithms.
+    What is minimised is the sum of squares of three logarithms, each over its
+    :data:`TOLERANCES`: of the energy lost to accelerating and of the spectrum, both over the
+    recorded, and of the growth of energy along a string of such drivers.
     """
 
     def distance(reaction: Reaction) -> float:
-        near = ratios(twins[reaction], records, rows)
-        return float(near["spectrum"] + abs(np.log(near["lost"])))
+        near = ratios(tries[reaction].twins, records, rows)
+        errors = {
+            "lost": np.log(near["lost"]),
+            "spectrum": near["spectrum"],
+            "growth": tries[reaction].growth,
+        }
+        return float(sum((errors[name] / size) ** 2 for name, size in TOLERANCES.items()))
 
-    return min(twins, key=distance)
+    return min(tries, key=distance)
 
 
-def judged(twins: Mapping[Reaction, Measured], records: Measured) -> Measured:
+def judged(tries: Mapping[Reaction, Tried], records: Measured) -> Measured:
     """Return drivers who each have the reaction that was chosen on other drivers."""
     drivers = len(records.table)
-    whole, fold = twins[Reaction()], np.arange(drivers) % FOLDS
+    whole, fold = tries[Reaction()].twins, np.arange(drivers) % FOLDS
     table, density = whole.table.copy(), whole.density.copy()
     for number in range(min(FOLDS, drivers) if drivers > 1 else 0):
         own = fold == number
-        chosen = twins[choose(twins, records, ~own)]
+        chosen = tries[choose(tries, records, ~own)].twins
         table.loc[own] = chosen.table[own]
         density[:, own] = chosen.density[:, own]
     return replace(whole, table=table, density=density)
@@ -285,16 +351,17 @@ def compare(
     if not react:
         found[TWINS] = drive(observed, drivers, [Reaction()], 1)[0]
         return Reaction(), found, [_line(TWINS, found, one_step_error(observed, drivers, 0.0))]
-    twins = tried(observed, drivers)
-    reaction = choose(twins, found[RECORDED])
-    found |= {TWINS: twins[Reaction()], REACTING: judged(twins, found[RECORDED])}
+    tries = tried(observed, drivers)
+    reaction = choose(tries, found[RECORDED])
+    found |= {TWINS: tries[Reaction()].twins, REACTING: judged(tries, found[RECORDED])}
     errors = {
         who: one_step_error(observed, drivers, delay)
         for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
     }
     line = (
         f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s² "
-        f"chosen; below, each driver has what was chosen on others"
+        f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
+        f"{CARS}th in a row); below, each driver has what was chosen on others"
     )
     return reaction, found, [line, *(_line(who, found, one) for who, one in errors.items())]
 

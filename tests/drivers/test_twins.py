@@ -71,7 +71,7 @@ def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
     found = choose(twins, records)
     assert found.delay == pytest.approx(delay, abs=0.11)
     assert found.noise == pytest.approx(noise, abs=0.08)
-    near = ratios(twins[found], records)
+    near = ratios(twins[found].twins, records)
     assert near["lost"] == pytest.approx(1.0, abs=0.08)
     assert near["energy"] == pytest.approx(1.0, abs=0.02)
     # The one-step error alone tells the delay, too: it is least there.
