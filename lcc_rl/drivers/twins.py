@@ -24,7 +24,7 @@ from torch import Tensor
 from lcc_rl.drivers.observed import Observed
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.energy import PaperMotor
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, Reaction, noise_factors
+from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.laws import LAWS
 
@@ -196,13 +196,14 @@ def _follow(
     """
     law, own, constants = who
     level = torch.tensor([one.noise for one in reactions]).double().view(-1, 1, 1)
-    kept, new = noise_factors(1.0, step)
+    noise_step = NoiseStep.of(step)
 
     def draw() -> Tensor:
         return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
 
     speed, gap = (x.expand(shape) for x in start)
-    noise, seen = draw(), [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
+    noise, last = noise_step.start(draw(), draw())
+    seen = [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
     motion = [(speed, gap)]
     for before, after in pairwise(leader):
         seen = [*seen[1:], (speed, gap, before)]
@@ -210,7 +211,7 @@ def _follow(
         command = law.acceleration(old_speed, old_gap, old_speed - ahead, *own, constants)
         reached, _ = advance_speed(speed, command + level * noise, step)
         gap = advance_gap(gap, before, speed, after, reached, step)
-        speed, noise = reached, kept * noise + new * draw()
+        speed, noise, last = reached, noise_step.next(noise, last, draw()), noise
         motion.append((speed, gap))
     speeds, gaps = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
     return list(zip(speeds, gaps, strict=True))

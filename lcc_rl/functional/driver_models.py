@@ -48,24 +48,49 @@ class Reaction:
 
     Args:
         delay: age of the speed, gap and relative speed that a driver reacts to [s].
-        noise: standard deviation of an Ornstein–Uhlenbeck noise of the acceleration, correlated
-            over :data:`NOISE_TIME` [m/s²].
+        noise: standard deviation of a noise of the acceleration, see :class:`NoiseStep` [m/s²].
     """
 
     delay: float = 0.0
     noise: float = 0.0
 
 
-NOISE_TIME = 1.0  # time over which the noise of the acceleration is correlated [s]
+NOISE_TIME = 0.7  # time constant of the noise of the acceleration [s]
 
 
-def noise_factors(noise: float, time_step: float) -> tuple[float, float]:
-    """Return ρ and ε of the noise xₖ = ρ xₖ₋₁ + ε N(0, 1), whose standard deviation is ``noise``.
+@dataclass(frozen=True)
+class NoiseStep:
+    """A step of the noise of the acceleration, exact for any time step.
 
-    It is the exact step of an Ornstein–Uhlenbeck process of correlation time :data:`NOISE_TIME`.
+    The noise is white noise behind two low-passes of the time constant :data:`NOISE_TIME`, so that
+    it has a finite jerk, as a pedal has; an Ornstein–Uhlenbeck process has one low-pass only. With
+    z ~ N(0, 1), xₖ = 2ρ xₖ₋₁ − ρ² xₖ₋₂ + c z has the standard deviation 1; neighbours have the
+    correlation ``linked``.
+
+    Args:
+        kept: ρ.
+        new: c.
+        linked: correlation of neighbouring values.
     """
-    kept = math.exp(-time_step / NOISE_TIME)
-    return kept, noise * math.sqrt(1.0 - kept * kept)
+
+    kept: float
+    new: float
+    linked: float
+
+    @classmethod
+    def of(cls, time_step: float) -> Self:
+        """Return the step of a time step [s]."""
+        kept = math.exp(-time_step / NOISE_TIME)
+        new = math.sqrt((1.0 - kept * kept) ** 3 / (1.0 + kept * kept))
+        return cls(kept, new, 2.0 * kept / (1.0 + kept * kept))
+
+    def start(self, drawn: Tensor, further: Tensor) -> tuple[Tensor, Tensor]:
+        """Return a first value and the one before it, from two independent draws of N(0, 1)."""
+        return drawn, self.linked * drawn + math.sqrt(1.0 - self.linked**2) * further
+
+    def next(self, latest: Tensor, before: Tensor, drawn: Tensor) -> Tensor:
+        """Return the value after two others."""
+        return 2.0 * self.kept * latest - self.kept**2 * before + self.new * drawn
 
 
 def limit(acceleration: Tensor, constants: DriverConstants) -> Tensor:

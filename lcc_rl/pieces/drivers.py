@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, Reaction, noise_factors
+from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GIPPS_LAW
 from lcc_rl.functional.idm import IDM_LAW
 from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
@@ -36,8 +36,8 @@ class Drivers(Controller):
     desired_speed [m/s], desired_time_gap [s]; of other models than the IDM behind a leader also
     equilibrium_gap, at which the driver follows at the leader's first speed [m]. With a delay,
     ``(role, "motion_history")``, ``[*batch, n, 3 · delay]``, holds past speeds [m/s], gaps [m] and
-    relative speeds [m/s], latest first; with a correlated noise ``(role, "acceleration_noise")``,
-    ``[*batch, n, 1]``, is its latest value [m/s²].
+    relative speeds [m/s], latest first; with a noise of the acceleration ``(role,
+    "acceleration_noise")``, ``[*batch, n, 2]``, holds its latest values [m/s²].
     """
 
     # Largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each step from
@@ -47,8 +47,8 @@ class Drivers(Controller):
     # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
     # those at the start of the episode. None: the reaction delay of the population.
     delay: Annotated[int, Field(ge=0, le=MOST_DELAY)] | None = None
-    # Standard deviation of an Ornstein–Uhlenbeck noise of the acceleration, correlated over 1 s
-    # [m/s²]; None: of the population.
+    # Standard deviation of a smooth noise of the acceleration, see
+    # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
 
     name = HUMAN
@@ -68,7 +68,7 @@ class Drivers(Controller):
         late, strays = self.delay, self.acceleration_noise
         self.late = round(reaction.delay / world.time_step) if late is None else late
         self.strays = reaction.noise if strays is None else strays
-        self.kept_noise, self.new_noise = noise_factors(self.strays, world.time_step)
+        self.noise_step = NoiseStep.of(world.time_step)
         self.starts = self.tells_gap and not world.string.ring
         constants = [(role, name) for name in [*kept, *["equilibrium_gap"] * self.starts]]
         history = [(role, "motion_history")] * (self.late > 0)
@@ -81,7 +81,9 @@ class Drivers(Controller):
         self.spread = self.wiener / world.time_step**0.5
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
-        self.stray_stream = stream_id(f"{stream_name(role)}.acceleration_noise")
+        self.stray_streams = [
+            stream_id(f"{stream_name(role)}.acceleration_noise{end}") for end in ("", ".before")
+        ]
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
         self.register_buffer("desired_speeds", speeds)
         self.register_buffer("time_gaps", time_gaps)
@@ -116,13 +118,9 @@ class Drivers(Controller):
         """Return the commands, then the history and the noise where they are kept."""
         motion = (speed, gap, relative_speed)
         kept: list[Tensor] = []
-        strayed = torch.zeros_like(speed)
         if self.strays:
             *more, before = more  # type: ignore[assignment]
-            drawn = normal(seed, step, self.stray_stream + self.index)
-            later = self.kept_noise * before + self.new_noise * drawn
-            strayed = torch.where(step == 0, self.strays * drawn, later)
-            kept.append(strayed)
+            kept.append(self._strayed(before, seed, step))
         if self.late:
             *more, history = more  # type: ignore[assignment]
             now = torch.cat(motion, -1)
@@ -136,7 +134,19 @@ class Drivers(Controller):
             command = command * (1.0 + self.noise * draw)
         if self.spread:
             command = command + self.spread * normal(seed, step, self.wiener_stream + self.index)
-        return (command + strayed, *kept) if kept else command
+        if self.strays:
+            command = command + kept[-1][..., :1]
+        return (command, *kept) if kept else command
+
+    def _strayed(self, before: Tensor, seed: Tensor, step: Tensor) -> Tensor:
+        """Return the latest two values of the noise from those before [m/s²]."""
+        drawn, further = (
+            self.strays * normal(seed, step, stream + self.index) for stream in self.stray_streams
+        )
+        first = torch.cat(self.noise_step.start(drawn, further), -1)
+        latest, last = before.split(1, -1)
+        later = torch.cat([self.noise_step.next(latest, last, drawn), latest], -1)
+        return torch.where(step == 0, first, later)
 
     def acceleration(
         self,
@@ -161,7 +171,7 @@ class Drivers(Controller):
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         specs = super().written_specs(batch, device)
         for key in self.targets[1:]:
-            width = 3 * self.late if key[-1] == "motion_history" else 1
+            width = 3 * self.late if key[-1] == "motion_history" else 2
             specs[key] = Unbounded(shape=(*batch, self.event_shape[0], width), device=device)
         return specs
 
