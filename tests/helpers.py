@@ -56,6 +56,16 @@ def wavy_profiles(count: int = 4, samples: int = 400) -> Profiles:
     return from_records(records, names, [f"rec{i % 2}" for i in range(count)], 0.1)
 
 
+def followed_profiles() -> Profiles:
+    """The same leaders with recorded followers, who drive a second behind, 10 to 20 m away."""
+    leaders = wavy_profiles()
+    each = [leaders.record(number) for number in range(len(leaders))]
+    behind = [
+        torch.stack([torch.cat([x[:1].expand(10), x[:-10]]), 15.0 + 0.4 * x], -1) for x in each
+    ]
+    return from_records(each, leaders.names, leaders.recordings, 0.1, behind)
+
+
 def string(pattern: str) -> str:
     """Return the override that makes a pattern the string of vehicles."""
     return f"scenario.string='{pattern}'"

@@ -93,12 +93,7 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
     save(calibration_figure(result.drivers), folder / "calibration.png", formats=formats)
     save(joint_figure(result.drivers), folder / "joint_distribution.png", formats=formats)
     save(twins_figure(result.twins), folder / "twins.png", formats=formats)
-    twins = [
-        measured.table.assign(episode=result.episodes, mode=mode, driver=who)
-        for mode, found in result.twins.items()
-        for who, measured in found.items()
-    ]
-    write_parquet(pd.concat(twins, ignore_index=True), folder / "twins.parquet", metadata)
+    write_parquet(result.twins, folder / "twins.parquet", metadata)
     # Last: who finds it finds a finished calibration.
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 

@@ -26,7 +26,7 @@ from lcc_rl.drivers.parameters import (
     at_bound,
     fitted,
 )
-from lcc_rl.drivers.twins import Measured, compare
+from lcc_rl.drivers.twins import compare
 from lcc_rl.errors import DataError, unknown_name
 from lcc_rl.functional.driver_models import DriverConstants
 from lcc_rl.functional.laws import LAWS
@@ -48,15 +48,13 @@ class Calibration:
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
         report: what was dropped, chosen and found, in plain lines.
-        twins: by mode, what :func:`lcc_rl.drivers.twins.compare` measured of the recorded and of
-            the calibrated drivers, in the order of ``episodes``.
-        episodes: the episodes of the measured drivers.
+        twins: what :func:`lcc_rl.drivers.twins.compare` measured of the recorded and of the
+            calibrated drivers, with the column mode.
     """
 
     drivers: pd.DataFrame
     report: list[str]
-    twins: dict[str, dict[str, Measured]]
-    episodes: pd.Series
+    twins: pd.DataFrame
 
 
 class Constants(Settings):
@@ -133,18 +131,18 @@ class Calibrator(Settings):
         observed = episodes
         if not isinstance(observed, Observed):
             observed = observe(observed, self.selection)
-        parts, report = [], list(observed.report)
-        twins: dict[str, dict[str, Measured]] = {}
+        parts, twins, report = [], [], list(observed.report)
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
-            reaction, twins[mode], more = compare(observed, drivers, self.reaction)
+            reaction, measured, more = compare(observed, drivers, self.reaction)
+            twins.append(measured.assign(mode=mode))
             if self.reaction:
                 own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
                 drivers = drivers.assign(**own)
             parts.append(drivers)
             report += [f"{mode}: {line}" for line in [*lines, *more]]
-        table = pd.concat(parts, ignore_index=True)
-        return Calibration(table, report, twins, observed.identity["episode"])
+        tables = (pd.concat(tables, ignore_index=True) for tables in (parts, twins))
+        return Calibration(next(tables), report, next(tables))
 
 
 class _Fit:

@@ -11,9 +11,8 @@ do for the first driver, whose successors then amplify what it does until they c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,31 +42,14 @@ TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see ch
 CARS = 5  # drivers in a row, along whom energy must not grow
 CAP = 3.0  # bounds the gaps that they start at, see lcc_rl.functional.idm.equilibrium_gap [s]
 ENERGY, DISTANCE = f"energy_{SMOOTHINGS[0]}s_j", f"distance_{SMOOTHINGS[0]}s_m"
+DENSITY, HERTZ = "density_", "hz"  # around the frequency in the name of a column
 RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 People = tuple[DriverLaw, tuple[Tensor, Tensor], DriverConstants]  # model, (v0, T), the rest
 
 
-@dataclass(frozen=True)
-class Measured:
-    """What is compared of drivers in motion.
-
-    Args:
-        table: a row per driver: mean gap_m, long_gap_share of the time and, for each of
-            :data:`SMOOTHINGS`, such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and
-            distance_1.1s_m.
-        density: power spectral density of the acceleration within :data:`BAND`,
-            ``[frequencies, drivers]``; NaN for records shorter than :data:`WINDOW`.
-        frequency: of its rows [Hz].
-    """
-
-    table: pd.DataFrame
-    density: Array
-    frequency: Array
-
-
-def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: float) -> Measured:
+def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: float) -> pd.DataFrame:
     """Measure drivers in motion, means over the draws of their noise.
 
     The energy is that of the paper's motor (A2) without the kinetic energy stored at the end.
@@ -77,6 +59,12 @@ def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: flo
         gap: the same [m].
         samples: of every record, ``[drivers]``.
         time_step: [s].
+
+    Returns:
+        A row per driver: mean gap_m and long_gap_share of the time; for each of :data:`SMOOTHINGS`,
+        such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and distance_1.1s_m; and for each
+        frequency within :data:`BAND`, such as 0.1 Hz, density_0.1hz of the acceleration [m²/s⁴/Hz],
+        NaN for records shorter than :data:`WINDOW`.
     """
     table, motor = {}, PaperMotor()
     total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
@@ -98,11 +86,11 @@ def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: flo
     moving = alive & (speed > 1.0)
     far = moving & (gap > LONG_GAP * speed)
     table["long_gap_share"] = far.sum((0, 1)) / np.maximum(moving.sum((0, 1)), 1)
-    return Measured(pd.DataFrame(table), *_spectrum(speed, samples, time_step))
+    return pd.DataFrame(table | _spectrum(speed, samples, time_step))
 
 
-def _spectrum(speed: Array, samples: NDArray[np.int64], time_step: float) -> tuple[Array, Any]:
-    """Return the acceleration's density by Welch's method, and its frequencies, within the band."""
+def _spectrum(speed: Array, samples: NDArray[np.int64], time_step: float) -> dict[str, Array]:
+    """Return the acceleration's density by Welch's method, ``[drivers]`` for each frequency."""
     acceleration, width = np.diff(speed, axis=0) / time_step, round(WINDOW / time_step)
     frequency = np.fft.rfftfreq(width, time_step)
     inside = (frequency >= BAND[0]) & (frequency <= BAND[1])
@@ -115,10 +103,19 @@ def _spectrum(speed: Array, samples: NDArray[np.int64], time_step: float) -> tup
         total += power.mean(1) * whole
         count += whole
     scale = 2.0 * time_step / (taper**2).sum()
-    return scale * total / np.where(count > 0, count, np.nan), frequency[inside]
+    density = scale * total / np.where(count > 0, count, np.nan)
+    names = [f"{DENSITY}{hertz:g}{HERTZ}" for hertz in frequency[inside]]
+    return dict(zip(names, density, strict=True))
 
 
-def recorded(observed: Observed) -> Measured:
+def densities(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the densities of measured drivers, by frequency [Hz]; without short records."""
+    found = [name for name in table if str(name).startswith(DENSITY)]
+    named = {name: float(str(name)[len(DENSITY) : -len(HERTZ)]) for name in found}
+    return table[found].rename(columns=named).dropna()
+
+
+def recorded(observed: Observed) -> pd.DataFrame:
     """Measure the recorded drivers."""
     series = (observed.follower_speed, observed.gaps)
     speed, gap = (x.double().cpu().numpy()[:, None] for x in series)
@@ -131,7 +128,7 @@ def drive(
     reactions: Sequence[Reaction],
     repeats: int = REPEATS,
     seed: int = 0,
-) -> list[Measured]:
+) -> list[pd.DataFrame]:
     """Drive twins: calibrated drivers from the first speed and gap of the recorded ones.
 
     Args:
@@ -142,14 +139,22 @@ def drive(
         seed: of the noise.
 
     Returns:
-        What was measured, for every reaction.
+        What was measured, for every reaction, with the error of the speed rmspe (A6).
     """
     series = (observed.leader_speed, observed.follower_speed[0], observed.gaps[0])
     leader, *start = (x.double().cpu() for x in series)
     generator = torch.Generator().manual_seed(seed)
     who, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
     motion = _follow(who, leader, start, reactions, shape, generator, observed.time_step)
-    return [measure(*one, observed.samples, observed.time_step) for one in motion]
+    truth = observed.follower_speed.double().cpu().numpy()[:, None]
+    alive = (np.arange(len(truth))[:, None] < observed.samples)[:, None]
+    norm = (truth**2).sum(0)
+    found = []
+    for speed, gap in motion:
+        share = np.sqrt((((speed - truth) * alive) ** 2).sum(0) / norm).mean(0)
+        table = measure(speed, gap, observed.samples, observed.time_step)
+        found.append(table.assign(rmspe=share))
+    return found
 
 
 def growth(
@@ -174,7 +179,7 @@ def growth(
         motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
         inside = (np.arange(len(leader))[:, None] < observed.samples)[:, None]
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
-        sums = [measure(*one, observed.samples, step).table.sum() for one in motion]
+        sums = [measure(*one, observed.samples, step).sum() for one in motion]
         energies.append([one[ENERGY] / one[DISTANCE] for one in sums])
         leader = torch.from_numpy(np.stack([speed for speed, _ in motion], 1))
     grown = np.log(np.divide(energies[-1], energies[0]))
@@ -244,31 +249,26 @@ def _people(observed: Observed, drivers: pd.DataFrame) -> People:
 
 
 def ratios(
-    twins: Measured,
-    records: Measured,
-    rows: Rows | None = None,
-    smoothing: float = SMOOTHINGS[0],
+    twins: pd.DataFrame, records: pd.DataFrame, smoothing: float = SMOOTHINGS[0]
 ) -> dict[str, float]:
     """Compare drivers with the recorded ones, as ratios of sums over them.
 
     Args:
-        twins, records: what was measured of both.
-        rows: which drivers, ``[drivers]``; None for all.
+        twins, records: what was measured of both, see :func:`measure`; the same drivers.
         smoothing: one of :data:`SMOOTHINGS` [s].
 
     Returns:
         ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, and ``spectrum``: the
-        root of the mean square of the logarithm of the ratio of both densities.
+        root of the mean square of the logarithm of the ratio of both densities, 0 if all records
+        are too short.
     """
-    chosen = np.ones(len(records.table), bool) if rows is None else rows
-    one, other = (x.table[chosen].sum() for x in (twins, records))
+    one, other = twins.sum(numeric_only=True), records.sum(numeric_only=True)
     energy, lost, distance = (
         one[name] / other[name]
         for name in (f"energy_{smoothing}s_j", f"lost_{smoothing}s_j", f"distance_{smoothing}s_m")
     )
-    long = chosen & np.isfinite(records.density[0])
-    densities = (x.density[:, long].sum(1) for x in (twins, records))
-    apart = np.log(np.divide(*densities)) if long.any() else np.zeros(1)
+    density = densities(twins).sum() / densities(records).sum()
+    apart = np.log(density.fillna(1.0).to_numpy())
     return {
         "energy": float(energy / distance),
         "lost": float(lost / distance),
@@ -281,7 +281,7 @@ def ratios(
 class Tried:
     """Twins with one reaction: what was measured of them, and :func:`growth`."""
 
-    twins: Measured
+    twins: pd.DataFrame
     growth: float
 
 
@@ -299,9 +299,7 @@ def tried(observed: Observed, drivers: pd.DataFrame) -> dict[Reaction, Tried]:
     return found
 
 
-def choose(
-    tries: Mapping[Reaction, Tried], records: Measured, rows: Rows | None = None
-) -> Reaction:
+def choose(tries: Mapping[Reaction, Tried], records: pd.DataFrame, rows: Rows) -> Reaction:
     """Choose the reaction with which some drivers come closest to the recorded ones.
 
     What is minimised is the sum of squares of three logarithms, each over its
@@ -310,7 +308,7 @@ def choose(
     """
 
     def distance(reaction: Reaction) -> float:
-        near = ratios(tries[reaction].twins, records, rows)
+        near = ratios(tries[reaction].twins[rows], records[rows])
         errors = {
             "lost": np.log(near["lost"]),
             "spectrum": near["spectrum"],
@@ -321,22 +319,19 @@ def choose(
     return min(tries, key=distance)
 
 
-def judged(tries: Mapping[Reaction, Tried], records: Measured) -> Measured:
+def judged(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.DataFrame:
     """Return drivers who each have the reaction that was chosen on other drivers."""
-    drivers = len(records.table)
-    whole, fold = tries[Reaction()].twins, np.arange(drivers) % FOLDS
-    table, density = whole.table.copy(), whole.density.copy()
-    for number in range(min(FOLDS, drivers) if drivers > 1 else 0):
-        own = fold == number
-        chosen = tries[choose(tries, records, ~own)].twins
-        table.loc[own] = chosen.table[own]
-        density[:, own] = chosen.density[:, own]
-    return replace(whole, table=table, density=density)
+    fold = np.arange(len(records)) % FOLDS
+    parts = []
+    for own in (fold == number for number in range(min(FOLDS, len(records)))):
+        others = ~own if (~own).any() else own
+        parts.append(tries[choose(tries, records, others)].twins[own])
+    return pd.concat(parts).sort_index()
 
 
 def compare(
     observed: Observed, drivers: pd.DataFrame, react: bool
-) -> tuple[Reaction, dict[str, Measured], list[str]]:
+) -> tuple[Reaction, pd.DataFrame, list[str]]:
     """Compare calibrated drivers with the recorded ones.
 
     Args:
@@ -345,16 +340,18 @@ def compare(
         react: also choose a reaction that all drivers share.
 
     Returns:
-        The reaction; what was measured of the recorded drivers, of their twins and of those with
-        the reaction, each as it was chosen on other drivers; and lines on both.
+        The reaction; what was measured (:func:`measure`, with the columns episode and driver) of
+        the recorded drivers, of their twins and of those with the reaction, each as it was chosen
+        on other drivers; and lines on both.
     """
-    found = {RECORDED: recorded(observed)}
+    records = recorded(observed)
     if not react:
-        found[TWINS] = drive(observed, drivers, [Reaction()], 1)[0]
-        return Reaction(), found, [_line(TWINS, found, one_step_error(observed, drivers, 0.0))]
+        found = {RECORDED: records, TWINS: drive(observed, drivers, [Reaction()], 1)[0]}
+        line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
+        return Reaction(), _together(found, observed), [line]
     tries = tried(observed, drivers)
-    reaction = choose(tries, found[RECORDED])
-    found |= {TWINS: tries[Reaction()].twins, REACTING: judged(tries, found[RECORDED])}
+    reaction = choose(tries, records, np.ones(len(records), bool))
+    found = {RECORDED: records, TWINS: tries[Reaction()].twins, REACTING: judged(tries, records)}
     errors = {
         who: one_step_error(observed, drivers, delay)
         for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
@@ -364,15 +361,24 @@ def compare(
         f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
         f"{CARS}th in a row); below, each driver has what was chosen on others"
     )
-    return reaction, found, [line, *(_line(who, found, one) for who, one in errors.items())]
+    lines = [line, *(_line(who, found, one) for who, one in errors.items())]
+    return reaction, _together(found, observed), lines
 
 
-def _line(who: str, found: Mapping[str, Measured], one_step: float) -> str:
+def _together(found: Mapping[str, pd.DataFrame], observed: Observed) -> pd.DataFrame:
+    episode = observed.identity["episode"]
+    parts = [part.assign(episode=episode, driver=who) for who, part in found.items()]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
     each = [ratios(found[who], found[RECORDED], smoothing=width) for width in SMOOTHINGS]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
+    error = 100.0 * found[who]["rmspe"].mean()
     return (
-        f"drivers {who}: {energies} of the recorded energy per km, {losses} of what accelerating "
-        f"loses (speeds smoothed over {', '.join(map(str, SMOOTHINGS))} s); spectrum off by a "
-        f"factor {np.exp(each[0]['spectrum']):.2f}, one-step error {one_step:.2f} m/s²"
+        f"drivers {who}: RMSPE {error:.1f} %; {energies} of the recorded energy per km, {losses} "
+        f"of what accelerating loses (speeds smoothed over {', '.join(map(str, SMOOTHINGS))} s); "
+        f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "
+        f"{one_step:.2f} m/s²"
     )

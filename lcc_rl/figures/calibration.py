@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.drivers.twins import REACTING, RECORDED, TWINS, Measured, ratios
+from lcc_rl.drivers.twins import REACTING, RECORDED, TWINS, densities, ratios
 from lcc_rl.errors import DataError
 from lcc_rl.figures.drawing import INK, SOFT, footnote, grid, new_figure, style, unbox
 from lcc_rl.functional.laws import LAWS
@@ -112,22 +111,23 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
     return figure
 
 
-def twins_figure(twins: Mapping[str, Mapping[str, Measured]]) -> Figure:
+def twins_figure(twins: pd.DataFrame) -> Figure:
     """Calibrated drivers beside the recorded ones whose leaders they follow, a row per mode.
 
     Args:
-        twins: by mode, and within by who drives, what was measured; see
-            :func:`lcc_rl.drivers.twins.compare`.
+        twins: what was measured, see :class:`lcc_rl.drivers.calibrator.Calibration`.
     """
-    figure = new_figure(10.0, 0.5 + 3.1 * len(twins))
-    axes = np.atleast_2d(figure.subplots(len(twins), 3))
-    for (mode, found), row in zip(twins.items(), axes, strict=True):
+    modes = list(dict.fromkeys(twins["mode"]))
+    figure = new_figure(10.0, 0.5 + 3.1 * len(modes))
+    for mode, row in zip(modes, np.atleast_2d(figure.subplots(len(modes), 3)), strict=True):
+        part = twins[twins["mode"] == mode]
+        found = {who: part[part["driver"] == who] for who in dict.fromkeys(part["driver"])}
         spectra, share, gaps = row
         for who, one in found.items():
             look: dict[str, Any] = {"color": DRIVERS[who], "label": who, "linewidth": 1.6}
-            long = np.isfinite(one.density[0])
-            spectra.semilogy(one.frequency, one.density[:, long].mean(1), **look)
-            ordered = np.sort(one.table["gap_m"])
+            density = densities(one).mean()
+            spectra.semilogy(density.index, density, **look)
+            ordered = np.sort(one["gap_m"])
             gaps.plot(ordered, np.linspace(0.0, 1.0, len(ordered)), **look)
             if who != RECORDED:
                 near = ratios(one, found[RECORDED])

@@ -13,10 +13,12 @@ from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.twins import (
-    BAND,
+    REACTING,
     RECORDED,
+    TWINS,
     Reaction,
     choose,
+    densities,
     drive,
     measure,
     one_step_error,
@@ -77,7 +79,7 @@ def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
     episodes, known = followed(delay, noise)
     observed = observe(episodes)
     records, twins = recorded(observed), tried(observed, known)
-    found = choose(twins, records)
+    found = choose(twins, records, np.ones(len(records), bool))
     assert found.delay == pytest.approx(delay, abs=0.11)
     assert found.noise == pytest.approx(noise, abs=0.08)
     near = ratios(twins[found].twins, records)
@@ -90,10 +92,8 @@ def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
 def test_calibration_smooths_drivers_and_the_reaction_restores_them() -> None:
     episodes, _ = followed(0.6, 0.25)
     result = Calibrator(reaction=True)(episodes)
-    plain, reacting = (
-        ratios(result.twins["local"][who], result.twins["local"][RECORDED])
-        for who in ("as calibrated", "with reaction")
-    )
+    found = dict(list(result.twins.groupby("driver")))
+    plain, reacting = (ratios(found[who], found[RECORDED]) for who in (TWINS, REACTING))
     assert plain["lost"] < 0.9
     assert abs(reacting["lost"] - 1.0) < 0.5 * abs(plain["lost"] - 1.0)
     assert reacting["spectrum"] < 0.5 * plain["spectrum"]
@@ -110,7 +110,7 @@ def test_measures_by_hand() -> None:
     time = np.arange(631) * STEP
     speed = (10.0 + np.sin(0.2 * np.pi * time))[:, None, None]
     found = measure(speed, 30.0 + 0.0 * speed, samples, STEP)
-    row, seconds = found.table.iloc[0], 60.0
+    row, seconds = found.iloc[0], 60.0
     damped = np.sinc(0.31)
     assert row["distance_3.1s_m"] == pytest.approx(10.0 * seconds, rel=0.01)
     assert row["gap_m"] == pytest.approx(30.0)
@@ -118,8 +118,7 @@ def test_measures_by_hand() -> None:
     squares = (0.2 * np.pi * damped) ** 2 / 2.0 * seconds
     per_square = acceleration_loss(torch.tensor(10.0), torch.tensor(1.0)).item()
     assert row["lost_3.1s_j"] == pytest.approx(per_square * squares, rel=0.01)
-    assert found.frequency[found.density[:, 0].argmax()] == pytest.approx(0.1)
-    assert BAND[0] <= found.frequency.min() <= found.frequency.max() <= BAND[1]
+    assert densities(found).iloc[0].idxmax() == pytest.approx(0.1)
 
 
 def test_twins_of_one_delay_meet_the_same_noise() -> None:
@@ -127,7 +126,8 @@ def test_twins_of_one_delay_meet_the_same_noise() -> None:
     observed = observe(episodes)
     quiet, loud = drive(observed, known, [Reaction(), Reaction(0.0, 0.3)])
     alone = drive(observed, known, [Reaction(0.0, 0.3)])[0]
-    pd.testing.assert_frame_equal(loud.table, alone.table)
+    pd.testing.assert_frame_equal(loud, alone)
     # Without reaction they are the drivers themselves.
-    pd.testing.assert_frame_equal(quiet.table, recorded(observed).table, rtol=1e-9)
-    assert (loud.table["lost_1.1s_j"] > quiet.table["lost_1.1s_j"]).all()
+    assert (quiet.pop("rmspe") < 1e-9).all()
+    pd.testing.assert_frame_equal(quiet, recorded(observed), rtol=1e-9)
+    assert (loud["lost_1.1s_j"] > quiet["lost_1.1s_j"]).all()

@@ -20,8 +20,8 @@ from helpers import (
     POPULATION,
     REWARD,
     TERMS,
+    followed_profiles,
     small_env,
-    wavy_profiles,
 )
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
@@ -76,6 +76,8 @@ from lcc_rl.pieces import (
     PISaturation,
     Places,
     RangeReward,
+    RecordedDriver,
+    RecordedStart,
     RewardPiece,
     RewardTerm,
     SafetyReward,
@@ -119,8 +121,8 @@ ROLES = (
     *("late", "optimal", "difference", "gipps", "calibrated", "calibrated"),
 )
 STRINGS = {
-    "open": VehicleString(ROLES),
-    "drawn": VehicleString(ROLES, drawn=True),
+    "open": VehicleString((*ROLES, "recorded")),
+    "drawn": VehicleString((*ROLES, "recorded"), drawn=True),
     "ring": VehicleString(ROLES, ring=True),
 }
 SCALES = {
@@ -133,7 +135,7 @@ FILTERED = "Action, filtered"
 DRIVEN = ("human", "handover", "late", "optimal", "difference", "gipps", "calibrated")
 ACTIONS = {ACTION: (2, 1), ("plain", "action"): (1, 1), ("hybrid", "action"): (2, 1)}
 BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, DriverModel)
-STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
+STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart, RecordedStart)
 
 
 def leading() -> dict[str, Piece]:
@@ -182,6 +184,7 @@ def motion(string: VehicleString) -> StringMotion:
     start = {role: TimeGapStart() for role in string.names}
     start |= {role: EquilibriumStart() for role in DRIVEN}
     start |= {role: HeadwayStart() for role in CONNECTED}
+    start |= {} if string.ring else {"recorded": RecordedStart()}
     length = 30.0 * len(string) if string.ring else None
     return StringMotion(start=start, circumference=length, initial_speed=8.0)
 
@@ -240,6 +243,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
     pieces: dict[str, tuple[str | None, Piece]] = {
         **{name: (None, piece) for name, piece in first.items()},
         **controllers(),
+        **({} if string.ring else {"RecordedDriver": ("recorded", RecordedDriver())}),
         **{name: (None, piece) for name, piece in unnamed.items()},
         **terms,
         "TotalReward": (None, TotalReward(terms=listed)),
@@ -251,7 +255,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
 
 
 def world_of(road: str, label: str) -> World:
-    world = World(STRINGS[road], T, HORIZON, wavy_profiles(), POPULATION)
+    world = World(STRINGS[road], T, HORIZON, followed_profiles(), POPULATION)
     if label == "CalibratedDrivers":
         return replace(world, population=MIXED)
     mixed = label.endswith("mixed") or label == "EnergyClasses"

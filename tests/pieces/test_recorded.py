@@ -1,0 +1,104 @@
+"""The driver recorded behind the leader: as a controller, as a start and as a strategy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION, compose, composed, followed_profiles, wavy_profiles
+
+from lcc_rl.data.episodes import validate_episodes
+from lcc_rl.data.profiles import at_step, join, leader_profiles
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import Inputs
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.episodes import evaluate
+from lcc_rl.evaluation.strategies import applies, baseline, baselines
+
+
+def drive(*overrides: str):
+    """Play 20 steps behind two leaders from a chosen sample."""
+    cfg = compose("idm", "controller@scenario.controllers.automated=recorded", *overrides)
+    cfg.scenario.pieces["leader"]["start"] = "first"
+    profiles = followed_profiles()
+    env = build_env(cfg, profiles, POPULATION, 4, 0, nominal=True)
+    return env.rollout(20, break_when_any_done=False), profiles
+
+
+def test_every_recorded_speed_is_reached() -> None:
+    data, profiles = drive()
+    for episode in range(4):
+        own = profiles.follower(int(data["leader", "profile"][episode, 0]))
+        torch.testing.assert_close(
+            data["next", "vehicles", "speed"][episode, 1:, 0, 0], own[2:21, 0], rtol=0, atol=1e-5
+        )
+
+
+def test_vehicles_start_as_recorded() -> None:
+    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}")
+    for episode in range(4):
+        own = profiles.follower(int(data["leader", "profile"][episode, 0]))
+        assert data["vehicles", "speed"][episode, 0, 0, 0] == own[0, 0]
+        assert data["vehicles", "gap"][episode, 0, 0, 0] == own[0, 1]
+
+
+def test_the_strategy_starts_and_drives_as_recorded() -> None:
+    cfg = composed("variant=idm", "scenario.horizon=30")
+    windows = followed_profiles().windows(30)
+    inputs = Inputs(windows, windows, POPULATION)
+    rows, _ = evaluate(baseline(cfg, "recorded"), inputs, 2, 64, seed=0)
+    for window, distance in zip(rows["profile_id"], rows["cav_distance_m"], strict=True):
+        speed = windows.follower(window)[:, 0].double()
+        expected = 0.1 * float((speed[1:] + speed[:-1]).sum()) / 2.0
+        assert distance == pytest.approx(expected, rel=1e-4)
+    assert applies(cfg, "recorded")
+    assert not applies(composed("variant=idm", "scenario.string=human automated"), "recorded")
+    assert not applies(composed("variant=reference", "scenario=ring"), "recorded")
+    cfg.evaluation.baselines = ["direct", "recorded"]
+    assert [one.name for one in baselines(cfg)] == ["direct", "recorded"]
+
+
+@pytest.mark.parametrize(
+    ("what", "overrides"),
+    [
+        ("controllers", ["controller@scenario.controllers.automated=recorded"]),
+        ("start", ["scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}"]),
+    ],
+)
+def test_leaders_without_followers_are_refused(what, overrides) -> None:
+    cfg = compose("idm", *overrides)
+    with pytest.raises(ConfigError, match=rf"scenario\.{what}\.automated: nobody was recorded"):
+        build_env(cfg, wavy_profiles(), POPULATION, 2)
+
+
+def test_followers_stay_beside_their_leaders() -> None:
+    rows = 400
+    time = 0.1 * np.arange(rows)
+    table = pd.DataFrame(
+        {
+            "episode": np.repeat([0, 1], rows),
+            "recording": "a",
+            "follower_id": np.repeat([1, 2], rows),
+            "leader_id": np.repeat([3, 4], rows),
+            "time_s": np.tile(time, 2),
+            "leader_speed_mps": np.tile(10.0 + np.sin(time), 2),
+            "follower_speed_mps": np.concatenate([10.0 + np.cos(time), 9.0 + np.cos(time)]),
+            "gap_m": np.concatenate([20.0 + time, 30.0 + time]),
+            "follower_position_m": 0.0,
+            "leader_position_m": 0.0,
+            "leader_length_m": 0.0,
+        }
+    )
+    profiles = leader_profiles(validate_episodes(table, "made"), 0.1)
+    cut = profiles.windows(100).select([4, 1])
+    # Windows of 101 samples: three of each episode; the fifth is the second of the second one.
+    for index, (episode, start) in enumerate(((1, 101), (0, 101))):
+        expected = table[table.episode == episode].iloc[start : start + 101]
+        own = cut.follower(index).numpy()
+        np.testing.assert_allclose(own[:, 0], expected["follower_speed_mps"], rtol=1e-6)
+        np.testing.assert_allclose(own[:, 1], expected["gap_m"], rtol=1e-6)
+    slower = at_step(profiles, 0.2)
+    np.testing.assert_allclose(slower.follower(1), profiles.follower(1)[::2], rtol=1e-6)
+    assert join([profiles, slower]).followers.shape == (4 * 300, 2)
+    assert join([profiles, wavy_profiles()]).followers is None
