@@ -28,8 +28,10 @@ from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.savings import UNTRAINED as UNTRAINED  # the baselines, in their order
 from lcc_rl.runs.interrupts import SIGNALS
+
+# The baselines of an evaluation by default, in their order.
+UNTRAINED = ("direct", "idm", "human", "idm tuned", "acc tuned")
 
 # Data that take a fraction of a second to generate; enough for every entry point.
 DATA = ("data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]")

@@ -22,7 +22,7 @@ from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
-VARIANTS = ("alcc", "reference", "own_energy", "cbf", "idm", "direct", *PLATOON)
+VARIANTS = ("alcc", "reference", "own_energy", "rule", "cbf", "idm", "direct", *PLATOON)
 POPULATION = bootstrap()
 # Two drivers of each model, all parameters of their own.
 MIXED = from_table(

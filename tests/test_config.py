@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from helpers import POPULATION, VARIANTS, wavy_profiles
+from helpers import POPULATION, VARIANTS, followed_profiles
 
 import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
@@ -44,7 +44,7 @@ def options(group: str) -> list[str]:
 def test_every_variant_and_controller_drives(words) -> None:
     cfg = load("train", [*words, "scenario.horizon=20"])
     policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
-    env = build_env(cfg, wavy_profiles(), POPULATION, 2)
+    env = build_env(cfg, followed_profiles(), POPULATION, 2)
     rows = env.rollout(3, policy, break_when_any_done=False)["next"]
     assert rows["vehicles", "acceleration"].isfinite().all()
 

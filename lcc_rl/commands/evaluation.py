@@ -16,11 +16,12 @@ from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy
-from lcc_rl.errors import ConfigError, Interrupted, unknown_name
+from lcc_rl.errors import ConfigError, Interrupted, require, unknown_name
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
 from lcc_rl.evaluation.strategies import (
     POLICY,
+    RECORDED,
     Strategy,
     baselines,
     check_distinct,
@@ -177,7 +178,7 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     for line in inputs.report:
         log.info(line)
     check_evaluation(cfg, inputs)
-    strategies = baselines(cfg, rivals)
+    strategies = [one for one in baselines(cfg, rivals) if _is_played(one, inputs, rivals)]
     strategies += [trained(cfg, path, compared[path], inputs.population) for path in paths]
     if own:
         strategies += studied(cfg, policy, inputs.population)
@@ -186,6 +187,18 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     strategies = named_apart(strategies)
     check_distinct(strategies)
     return strategies, inputs
+
+
+def _is_played(strategy: Strategy, inputs: Inputs, rivals: Sequence[str]) -> bool:
+    """Whether a baseline can be played: a recorded follower only where one was recorded."""
+    if strategy.name != RECORDED or inputs.evaluation.followers is not None:
+        return True
+    require(
+        RECORDED not in rivals,
+        f"compare={RECORDED}: nobody was recorded behind these leaders; use trajectories of "
+        "several vehicles",
+    )
+    return False
 
 
 def evaluate_and_write(

@@ -19,7 +19,7 @@ from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
 from lcc_rl.config import load, root_key
-from lcc_rl.config.nodes import with_defaults
+from lcc_rl.config.nodes import TARGET, with_defaults
 from lcc_rl.config.schemas import (
     KINDS,
     CalibrateConfig,
@@ -32,7 +32,7 @@ from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
-from lcc_rl.figures.main_page import as_rich, caption_of, write_page
+from lcc_rl.figures.main_page import as_rich, caption_of, verdict, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
@@ -55,6 +55,8 @@ PATIENCE = 20.0  # a training ends after the iteration at hand [s]
 COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last one and its folder
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
+NETWORKS, RULE = ("reference", "alcc"), "rule"  # trained by default; the rule by the gradient
+ANALYTIC = "lcc_rl.agents.Analytic"
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
@@ -78,12 +80,13 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     folder = Path(folder)
     with claim(folder):
         if cfg.resume is None:
-            check_folder(cfg, folder)
             trainings, final = composed(cfg, overrides)
+            cfg.variants = list(trainings)
+            check_folder(cfg, folder)
             command = " ".join(["lcc-rl run", *overrides])
         elif (folder / COMMAND).is_file():
             cfg = load_config(folder, cfg.trust)
-            trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants}
+            trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants or ()}
             final = load_config(folder / PARTS / FINAL, cfg.trust)
             command = read_text(folder / COMMAND)
         else:
@@ -110,8 +113,11 @@ def composed(
                 f"{item} has no effect on lcc-rl run, which trains several: use variants=[…]"
             )
     shared = [item for item in overrides if root_key(item) not in OWN]
-    trainings = {name: load("train", [*shared, f"variant={name}"]) for name in cfg.variants}
-    final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={cfg.variants[-1]}"])
+    names = cfg.variants or NETWORKS
+    trainings = {name: load("train", [*shared, f"variant={name}"]) for name in names}
+    if cfg.variants is None and str(trainings[names[-1]].agent[TARGET]) == ANALYTIC:
+        trainings = {RULE: load("train", [*shared, f"variant={RULE}"]), **trainings}
+    final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
     for part in (*trainings.values(), final):
         part.data = cfg.data
     return trainings, final
@@ -129,10 +135,10 @@ def _run(
     for part in (*trainings.values(), final):
         part.data = with_defaults(_episodes(cfg, folder))
         part.drivers = with_defaults({"_target_": BOOTSTRAP, "path": str(drivers)})
-    tell(f"training {', '.join(cfg.variants)}, {cfg.jobs} at a time; details in */train.log")
+    tell(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
     _train_all(trainings, folder, cfg.jobs)
     final.compare = [
-        str(folder / name) for name in cfg.variants if (folder / name / "policy.pt").exists()
+        str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()
     ]
     tell("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
@@ -147,6 +153,7 @@ def _run(
         page, table = write_page(folder, [command], caption)
         title = "A leader, the car, and a human driver behind it: held-out windows"
         show(as_rich(table, title, caption))
+        tell(verdict(table))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

@@ -184,7 +184,7 @@ class PipelineConfig(TrainConfig):
     """``lcc-rl run``."""
 
     calibration: Node
-    variants: Variants  # at least one
+    variants: Variants | None = None  # at least one
     jobs: Parallel
 
 

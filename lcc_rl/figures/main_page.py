@@ -15,41 +15,45 @@ from lcc_rl.figures.page import Page
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.savings import UNTRAINED
-from lcc_rl.results.tables import PATH, ROWS, summary
+from lcc_rl.results.tables import PATH, PER_KM, ROWS, summary
 
 TITLE = "lcc_rl: data → drivers → policies → results"
 WHO = {
     "idm": "one human driver (IDM)",
-    "human": "human drivers of the data",
-    "acc tuned": "cruise control, tuned",
-    "idm tuned": "IDM as cruise control, tuned",
-    "reference": "network, for its own energy",
-    "alcc": "network, for the energy of both",
+    "human": "simulated human drivers",
+    "recorded": "recorded drivers",
+    "constant_filtered": "safety filter alone",
+    "acc tuned": "ACC tuned on I-80",
+    "idm tuned": "IDM tuned on I-80",
+    "rule": "IDM tuned on these data",
+    "reference": "network for its own car",
+    "alcc": "network for both cars",
 }
 # Column of the summary, as a percentage, and its name in the table.
 SHARES = {
     "unsafe_ttc_pct": "share_ttc_unsafe",
     "long_time_gap_pct": "share_time_gap_long_moving",
 }
-AGAINST = ("human", "idm tuned")
+HUMAN, NETWORK = "human", "alcc"
+RULES = ("rule", "idm tuned")  # whom a network is compared with: the first that there is
 HEADINGS = {
     "who": "the car is driven by",
-    "path_energy_kj": "path\nenergy\n[kJ]",
-    "saved_against_human_pct": "saved against\nhuman drivers\n[%]",
-    "saved_against_idm_tuned_pct": "saved against\ntuned IDM\n[%]",
+    "energy_kj_per_km": "energy\n[kJ/km]",
+    "saved_against_human_pct": "saved against\nhumans [%]",
+    "distance_pct": "dis-\ntance\n[%]",
     "unsafe_ttc_pct": "unsafe\nTTC\n[%]",
-    "long_time_gap_pct": "long\ntime gap\n[%]",
+    "long_time_gap_pct": "long\ngap\n[%]",
     "collisions": "colli-\nsions",
 }
 CAPTION = (
-    "Energy of both cars per episode without what their motion stores; 95 % intervals over "
-    "windows. Shares of the time: time-to-collision < 4 s; time gap > 2.5 s above 1 m/s."
+    "Energy of both cars per km without what their motion stores; 95 % intervals over windows; "
+    "distance against that of human drivers. Shares of the time: time-to-collision < 4 s; time gap "
+    "> 2.5 s above 1 m/s."
 )
 LIMIT = "efficiency"
 HELD_TO = (
     f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
-    "time; rows with more save by falling back. Tuned rules are tuned on NGSIM I-80, not on these "
-    "data."
+    "time; rows with more save by falling back."
 )
 # Files of figures, in the job's folder and without their ending, and their captions.
 RESULTS = {
@@ -81,22 +85,53 @@ def headline(found: pd.DataFrame) -> pd.DataFrame:
         found: of :func:`lcc_rl.results.tables.summary`.
 
     Returns:
-        A row per strategy with a controlled car, those that draw most first: path energy [kJ], the
-        shares saved [%] against a human and the tuned rules with their intervals, the shares of
-        the time [%] with an unsafe time-to-collision and a long time gap, and collisions.
+        A row per strategy with a controlled car, those that draw most first: path energy per km
+        [kJ/km], the shares saved [%] against human drivers and the tuned rule with their
+        intervals, the distance [%] against that of human drivers, the shares of the time [%] with
+        an unsafe time-to-collision and a long time gap, and collisions.
     """
-    cars = found[found[PATH].notna()].sort_values(PATH, ascending=False, kind="stable")
+    cars = found[found[PATH].notna()].sort_values(PER_KM, ascending=False, kind="stable")
     table = pd.DataFrame({"strategy": cars["strategy"]})
     table["who"] = [WHO.get(str(name), str(name)) for name in cars["strategy"]]
-    table["path_energy_kj"] = cars[PATH]
-    for baseline in (name for name in AGAINST if name in set(cars["strategy"])):
+    table["energy_kj_per_km"] = cars[PER_KM]
+    for column, baseline in _against(cars["strategy"]).items():
         for end in ("", "_low", "_high"):
-            name = f"saved_against_{baseline.replace(' ', '_')}_pct{end}"
-            table[name] = 100.0 * cars[f"path_saving_vs_{baseline}{end}"]
+            table[f"{column}{end}"] = 100.0 * cars[f"km_saving_vs_{baseline}{end}"]
+    if HUMAN in set(cars["strategy"]):
+        human = cars.loc[cars["strategy"] == HUMAN, "distance_m"].iloc[0]
+        table["distance_pct"] = 100.0 * (cars["distance_m"] / human - 1.0)
     for name, column in SHARES.items():
         table[name] = 100.0 * cars[column]
     table["collisions"] = cars["collisions"]
     return table.reset_index(drop=True)
+
+
+def _against(strategies: Iterable[object]) -> dict[str, str]:
+    """Return the baselines that there are, by the column of what is saved against them."""
+    known = set(strategies)
+    rule = next((name for name in RULES if name in known), None)
+    found = {"saved_against_human_pct": HUMAN, "saved_against_rule_pct": rule}
+    return {column: name for column, name in found.items() if name is not None and name in known}
+
+
+def verdict(table: pd.DataFrame) -> str:
+    """Return in a sentence what came out for the network, from a headline; empty without one."""
+    rows = table.set_index("strategy")
+    against = _against(rows.index)
+    if NETWORK not in rows.index or not against:
+        return ""
+    column, baseline = list(against.items())[-1]
+    own, other = rows.loc[NETWORK], rows.loc[baseline]
+    saved, low, high = (own[f"{column}{end}"] for end in ("", "_low", "_high"))
+    less = "less" if saved >= 0.0 else "more"
+    sure = low > 0.0 or high < 0.0
+    within = "" if sure else ", which is within the uncertainty"
+    long = "long_time_gap_pct"
+    return (
+        f"The {own['who']} needs {abs(saved):.1f} % {less} energy per km than the {other['who']} "
+        f"({low:.1f} … {high:.1f}){within}, with long time gaps for {own[long]:.2f} % of the time "
+        f"against {other[long]:.2f} %."
+    )
 
 
 def as_rich(table: pd.DataFrame, title: str, caption: str = CAPTION) -> Table:
@@ -145,14 +180,15 @@ def write_page(
         return [("", caption, path) for path, caption in paths.items() if path.exists()]
 
     shown = table.rename(columns={"who": HEADINGS["who"]})
-    page.add("Results", caption, [("", "Held-out windows", shown)], figures(RESULTS))
+    words = f"{verdict(table)}\n\n{caption}"
+    page.add("Results", words, [("", "Held-out windows", shown)], figures(RESULTS))
     learned = [str(name) for name in table["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
             f"{own} against {name}, driver by driver"
         )
         for own in learned[-1:]
-        for name in AGAINST
+        for name in _against(table["strategy"]).values()
     }
     for heading, names in {"By driver": improvements, "Drivers": DRIVERS}.items():
         if drawn := figures(names):

@@ -11,8 +11,11 @@ from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
-BASELINES = ("idm", "human", "idm tuned", "reference")
-UNTRAINED = ("direct", "idm", "human", "idm tuned", "acc tuned")
+BASELINES = ("idm", "human", "idm tuned", "rule", "reference")
+UNTRAINED = (
+    *("direct", "idm", "human", "recorded", "constant_filtered", "idm tuned", "acc tuned"),
+    "rule",
+)
 NOTHING = Estimate(np.nan)
 # Prefix of a saving, and of which energy: the path's, which leaves out what the motion stores
 # and with it what ending slower saves; and as drawn (A2).

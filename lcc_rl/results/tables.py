@@ -15,6 +15,7 @@ from lcc_rl.results.savings import BASELINES, KINDS, NOTHING, savings
 from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
+PER_KM = "path_energy_kj_per_km"  # of both cars; who falls back gains nothing by it
 FASTER = "share_leader_faster"
 WIDEST = 10_000  # characters
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
@@ -55,6 +56,9 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     means = list(dict.fromkeys([*columns, *(f"total_{column}" for column in KINDS.values())]))
     found = Totals(episodes, means, ["min_ttc_s"], PATH, BASELINES, source)
     windows, every, sums = found.per_window(), found.mean(), found.sums()
+    # By the mean distance of the strategy, so that savings are those of the totals.
+    ways = every[["cav_distance_m", "hdv_distance_m"]].sum(axis=1).replace(0.0, np.nan)
+    windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
     rows = []
     for strategy in found.strategies:
         mean, total = every.loc[strategy].to_dict(), sums.loc[strategy].to_dict()
@@ -66,9 +70,12 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         kilometres = (total["cav_distance_m"] + total["hdv_distance_m"]) / 1e3
         whose = "hdv" if np.isnan(mean["total_energy_kj"]) else "total"
         row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
+        row[PER_KM] = total[PATH] / kilometres if kilometres else np.nan
+        row["distance_m"] = 1e3 * kilometres / total["rows"]
+        energies = {kind: f"total_{column}" for kind, column in KINDS.items()} | {"km_": PER_KM}
         for baseline in BASELINES:
-            for kind, column in KINDS.items():
-                names = (f"total_{column}", strategy, baseline)
+            for kind, column in energies.items():
+                names = (column, strategy, baseline)
                 share = savings(windows, *names) if strategy != baseline else NOTHING
                 row |= share.columns(f"{kind}saving_vs_{baseline}")
             worse = found.worse_off(strategy, baseline)
@@ -95,6 +102,8 @@ def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
 ROWS = (
     ("path energy [kJ]", PATH, "{:.1f}"),
     ("  lost to accelerating [kJ]", LOST, "{:.1f}"),
+    ("  per km [kJ]", PER_KM, "{:.1f}"),
+    ("distance of all vehicles [m]", "distance_m", "{:.0f}"),
     ("energy as drawn [kJ]", "total_energy_kj", "{:.1f}"),
     ("  CAV [kJ]", "cav_energy_kj", "{:.1f}"),
     ("  HDV [kJ]", "hdv_energy_kj", "{:.1f}"),

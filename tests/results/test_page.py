@@ -14,7 +14,7 @@ from rich.console import Console
 from study_frames import episodes
 
 from lcc_rl.figures.drawing import new_figure
-from lcc_rl.figures.main_page import as_rich, headline
+from lcc_rl.figures.main_page import as_rich, headline, verdict
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.cells import as_markdown, heading
@@ -90,7 +90,13 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     table = headline(found)
     cars = found.set_index("strategy").loc[table["strategy"]]
     assert list(table["strategy"]) == ["idm", "reference", "alcc"]
-    np.testing.assert_array_equal(table["path_energy_kj"], cars["total_path_energy_kj"])
+    np.testing.assert_array_equal(table["energy_kj_per_km"], cars["path_energy_kj_per_km"])
+    # Who falls back gains nothing by it: alcc drives 290 m, the others 300 m.
+    per_km = cars["total_path_energy_kj"] / np.array([0.3, 0.3, 0.29])
+    np.testing.assert_allclose(table["energy_kj_per_km"], per_km)
+    saved = 1.0 - per_km["alcc"] / per_km["reference"]
+    assert cars.loc["alcc", "km_saving_vs_reference"] == pytest.approx(saved)
+    assert verdict(table) == ""  # nobody to compare with
     table["saved_against_human_pct"] = [np.nan, 1.0, 1.0]
     table["saved_against_human_pct_low"] = table["saved_against_human_pct_high"] = 1.0
     console = Console(width=120)
@@ -99,3 +105,20 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     assert "title [x]" in shown.get()
     assert "–" in shown.get()
     assert "nan" not in shown.get()
+
+
+def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
+    frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})
+    frame["total_path_energy_kj"] += np.random.default_rng(0).normal(size=len(frame))
+    table = headline(summary(frame))
+    own, rule = (table.set_index("strategy").loc[x] for x in ("alcc", "rule"))
+    saved = 100.0 * (1.0 - own["energy_kj_per_km"] / rule["energy_kj_per_km"])
+    assert own["saved_against_rule_pct"] == pytest.approx(saved)
+    words = verdict(table)
+    assert words.startswith(
+        f"The network for both cars needs {saved:.1f} % less energy per km than"
+    )
+    assert "the IDM tuned on these data (" in words
+    assert "for 0.40 % of the time against 0.40 %" in words
+    assert "uncertainty" not in words
+    assert "uncertainty" in verdict(table.assign(saved_against_rule_pct_low=-1.0))
