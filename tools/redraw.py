@@ -1,8 +1,8 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
 The tables of docs/{alcc,hcfs,tasks}.md, docs/reports, and of docs/figures: fleets.png,
-fleets_ring.png, limits.png, record.png and ring.png. The other figures need runs that were not
-kept, recorded data, or tools of earlier commits.
+fleets_ring.png, limits.png, measured.png, record.png, ring.png and twins.png. The other figures
+need runs that were not kept, recorded data, or tools of earlier commits.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import fleets
 import leaderboard
+import measured_energy
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -23,6 +24,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.data.leaders import stretch
+from lcc_rl.figures.calibration import twins_figure
 from lcc_rl.figures.drawing import in_words, legend_above, new_figure, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
@@ -31,6 +33,7 @@ from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
 from lcc_rl.studies.reproduce import REPORTS
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
+MEASURED = measured_energy.KEPT.name
 RING = "tasks/ring_steps.parquet"
 SHOWN = ("human", "pi_saturation", "alcc")
 EVERY = 10  # steps between the rows kept
@@ -100,7 +103,9 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
     save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
     drawn = {
         "limits.png": figure_of_limits(read_parquet(reference / "limits" / "windows.parquet")),
+        "measured.png": measured_energy.figure_of(read_parquet(reference / MEASURED)),
         "record.png": figure_of_record(),
+        "twins.png": twins_figure(read_parquet(reference / "twins.parquet")),
     }
     for name, figure in drawn.items():
         save(figure, figures / name)

@@ -89,10 +89,10 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     found = summary(episodes())
     table = headline(found)
     cars = found.set_index("strategy").loc[table["strategy"]]
-    assert list(table["strategy"]) == ["idm", "reference", "alcc"]
+    assert list(table["strategy"]) == ["idm", "alcc", "reference"]
     np.testing.assert_array_equal(table["energy_kj_per_km"], cars["path_energy_kj_per_km"])
     # Who falls back gains nothing by it: alcc drives 290 m, the others 300 m.
-    per_km = cars["total_path_energy_kj"] / np.array([0.3, 0.3, 0.29])
+    per_km = cars["total_path_energy_kj"] / np.array([0.3, 0.29, 0.3])
     np.testing.assert_allclose(table["energy_kj_per_km"], per_km)
     saved = 1.0 - per_km["alcc"] / per_km["reference"]
     assert cars.loc["alcc", "km_saving_vs_reference"] == pytest.approx(saved)
@@ -115,10 +115,8 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     saved = 100.0 * (1.0 - own["energy_kj_per_km"] / rule["energy_kj_per_km"])
     assert own["saved_against_rule_pct"] == pytest.approx(saved)
     words = verdict(table)
-    assert words.startswith(
-        f"The network for both cars needs {saved:.1f} % less energy per km than"
-    )
-    assert "the IDM tuned on these data (" in words
+    assert words.startswith(f"The network for both cars needs {saved:.1f} % less energy per km ")
+    assert "than the IDM tuned on these data (" in words
     assert "for 0.40 % of the time against 0.40 %" in words
     assert "uncertainty" not in words
     assert "uncertainty" in verdict(table.assign(saved_against_rule_pct_low=-1.0))

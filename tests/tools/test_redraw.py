@@ -24,6 +24,8 @@ def test_everything_is_drawn_again_and_the_page_is_the_same(tmp_path) -> None:
         "ring.png",
         "record.png",
         "limits.png",
+        "measured.png",
+        "twins.png",
     }
     for image in images:
         pixels = imread(image)[..., :3].reshape(-1, 3)

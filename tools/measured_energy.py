@@ -1,0 +1,181 @@
+"""Compare energy models with measurements: python tools/measured_energy.py --bench … --electric …
+
+Two tables with a row per sample are read. Fuel on an engine bench: setting, position, sample,
+time_s, speed_mps, fuel_g_per_s. Battery of an electric car: trip, time_s, speed_mps, elevation_m,
+battery_v, battery_a (discharge negative), heating_kw, aircon_kw. Every run becomes a row of
+outputs/reference/measured_energy.parquet, from which --draw alone draws docs/figures/measured.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from lcc_rl.cli.entry import main_guard
+from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel
+from lcc_rl.figures.drawing import INK, grid, new_figure, save, style
+from lcc_rl.io.files import read_parquet, write_parquet
+
+KEPT, DRAWN = Path("outputs/reference/measured_energy.parquet"), Path("docs/figures/measured.png")
+SMOOTHING = 1.1  # moving average of the speeds before they are differentiated [s]
+FUELS = {"Compact": "#0072b2", "midBase": "#d55e00", "midSUV": "#999999"}
+ELECTRIC = "electric"
+GRAVITY = 9.81  # [m/s²]
+WARM = 15.0  # ambient temperature above which a trip counts as summer [°C]
+SEASONS = {"summer": "#d55e00", "winter": "#0072b2"}
+LABELS = {"summer": "summer", "winter": "winter, with the heating"}
+RUN = ["setting", "position", "sample"]
+Array = NDArray[np.float64]
+
+
+def motion(frame: pd.DataFrame) -> tuple[Array, Array, float]:
+    """Return smoothed speed [m/s], acceleration [m/s²] and the time step [s] of a run."""
+    time = frame["time_s"].to_numpy(float)
+    step = float(np.median(np.diff(time)))
+    width = max(1, round(SMOOTHING / step))
+    padded = np.pad(frame["speed_mps"].to_numpy(float), width // 2, mode="edge")
+    speed = np.convolve(padded, np.ones(width) / width, mode="valid")[: len(time)]
+    return speed, np.gradient(speed, step), step
+
+
+def energy_of(model: EnergyModel, speed: Array, acceleration: Array, step: float) -> float:
+    """Return what a model draws on a run [J]."""
+    power = model.power(torch.from_numpy(speed), torch.from_numpy(acceleration))
+    return float(power.sum()) * step
+
+
+def of_bench(bench: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per run on the bench: distance, and measured and modelled fuel [g]."""
+    models = {name: CirclesFuel(vehicle=name) for name in FUELS}
+    rows = []
+    for key, run in bench.groupby(RUN, observed=True):
+        speed, acceleration, step = motion(run)
+        row = dict(zip(RUN, key, strict=True)) | {"distance_m": float(speed.sum()) * step}
+        row["measured"] = float(run["fuel_g_per_s"].sum()) * step
+        for name, model in models.items():
+            drawn = energy_of(model, speed, acceleration, step)
+            row[name] = drawn / model.heating_value
+        rows.append(row)
+    return pd.DataFrame(rows).assign(kind="bench")
+
+
+def of_trips(trips: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per trip: distance, and measured and modelled energy of the battery [kWh].
+
+    The model has the grade's potential energy added and its auxiliaries measured: heating and air
+    conditioning.
+    """
+    model = ElectricCar()
+    rows = []
+    for trip, run in trips.groupby("trip", observed=True):
+        speed, acceleration, step = motion(run)
+        height = run["elevation_m"].to_numpy(float)
+        comfort = 1e3 * run[["heating_kw", "aircon_kw"]].fillna(0.0).to_numpy().sum() * step
+        drawn = energy_of(model, speed, acceleration, step)
+        lifted = model.mass * GRAVITY * (height[-1] - height[0]) / model.efficiency
+        measured = -float((run["battery_v"] * run["battery_a"]).sum()) * step
+        rows.append(
+            {
+                "setting": "summer" if run["ambient_c"].mean() > WARM else "winter",
+                "trip": str(trip),
+                "distance_m": float(speed.sum()) * step,
+                "measured": measured / 3.6e6,
+                ELECTRIC: (drawn + lifted + comfort) / 3.6e6,
+                f"{ELECTRIC}_bare": (drawn + lifted) / 3.6e6,
+            }
+        )
+    return pd.DataFrame(rows).assign(kind="battery")
+
+
+def agreement(rows: pd.DataFrame, model: str) -> tuple[float, float]:
+    """Return level and correlation of runs: modelled over measured in total, and r of both."""
+    level = rows[model].sum() / rows["measured"].sum()
+    return float(level), float(np.corrcoef(rows[model], rows["measured"])[0, 1])
+
+
+def along(bench: pd.DataFrame, column: str) -> float:
+    """Return the fuel per km of the last car of a platoon over that of the first."""
+    sums = bench.groupby("position")[[column, "distance_m"]].sum()
+    per_km = sums[column] / sums["distance_m"]
+    return float(per_km.iloc[-1] / per_km.iloc[0])
+
+
+def figure_of(table: pd.DataFrame) -> Figure:
+    """Draw modelled over measured energy per km, a dot for each run."""
+    bench, trips = (table[table["kind"] == kind] for kind in ("bench", "battery"))
+    figure = new_figure(9.0, 4.2)
+    left, right = figure.subplots(1, 2)
+    for model, colour in FUELS.items():
+        _dots(left, bench, model, colour, 1e3)
+    for season, colour in SEASONS.items():
+        part = trips[trips["setting"] == season]
+        model = ELECTRIC if season == "winter" else f"{ELECTRIC}_bare"
+        _dots(right, part, model, colour, 1e6, label=LABELS[season])
+    style(left, "measured fuel [g/km]", "modelled fuel [g/km]")
+    style(right, "measured energy [Wh/km]", "modelled energy [Wh/km]")
+    left.set_title("Renault 1.3 TCe on an engine bench", fontsize=10, color=INK)
+    right.set_title("BMW i3 on the road", fontsize=10, color=INK)
+    for axis in (left, right):
+        ends = [*axis.get_xlim(), *axis.get_ylim()]
+        axis.plot([min(ends), max(ends)], [min(ends), max(ends)], color=INK, linewidth=0.8)
+        axis.legend(fontsize=8, frameon=False)
+        grid(axis)
+    return figure
+
+
+def _dots(
+    axis: Axes, rows: pd.DataFrame, model: str, colour: str, scale: float, label: str | None = None
+) -> None:
+    level, together = agreement(rows, model)
+    text = f"{label or model}: level {level:.2f}, r = {together:.2f}"
+    per_km = scale * rows[["measured", model]].div(rows["distance_m"], axis=0)
+    axis.plot(per_km["measured"], per_km[model], ".", color=colour, label=text)
+
+
+def lines(table: pd.DataFrame) -> list[str]:
+    """Return the agreement of every model with all runs of its kind and with each setting."""
+    found = []
+    for kind, models in {"bench": [*FUELS], "battery": [ELECTRIC, f"{ELECTRIC}_bare"]}.items():
+        whole = table[table["kind"] == kind]
+        for setting, rows in [("all", whole), *whole.groupby("setting")]:
+            for model in models:
+                level, together = agreement(rows, model)
+                runs = f"{kind}, {setting}, {model}: {len(rows)} runs"
+                found.append(f"{runs}, level {level:.3f}, r {together:.3f}")
+            if kind == "bench" and setting != "all":
+                cars = ", ".join(f"{name} {along(rows, name):.3f}" for name in ["measured", *FUELS])
+                found.append(f"last over first car, {setting}: {cars}")
+    return found
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Measure where files are given, print the agreement, and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bench", type=Path, help="table of the engine bench")
+    parser.add_argument("--electric", type=Path, help="table of the electric car")
+    parser.add_argument("--draw", action="store_true", help="only draw what was kept")
+    parser.add_argument("--kept", type=Path, default=KEPT, help="table of runs")
+    parser.add_argument("--figure", type=Path, default=DRAWN, help="where to draw")
+    options = parser.parse_args(words)
+    if not options.draw:
+        if options.bench is None or options.electric is None:
+            parser.error("give --bench and --electric, or --draw")
+        parts = (of_bench(read_parquet(options.bench)), of_trips(read_parquet(options.electric)))
+        write_parquet(pd.concat(parts, ignore_index=True), options.kept)
+    table = read_parquet(options.kept)
+    print(*lines(table), sep="\n")
+    save(figure_of(table), options.figure)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_guard(main)())
