@@ -24,6 +24,7 @@ from lcc_rl.figures.drawing import (
     save,
     style,
 )
+from lcc_rl.figures.main_page import WHO
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
@@ -82,7 +83,7 @@ def study_figures(
     diagram = space_time(steps, [*names[:1], *names[-2:]], cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and "idm" in names and cars[-1] not in UNTRAINED:
+    if len(steps) and {"human", "idm"} & set(names) and cars[-1] not in UNTRAINED:
         yield "overview", overview(episodes, steps, cars[-1])
     for name in cars:
         if len(steps) and (steps["strategy"] == name).any():
@@ -116,7 +117,7 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 
 def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
-    """Speeds of one episode, and the mean energies of both cars by strategy."""
+    """Speeds of one episode, and the mean energies of both cars per km by strategy."""
     figure = new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _over_time(left, _one_episode(steps, strategy), "speed")
@@ -138,22 +139,26 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
 def _mean_energies(axis: Axes, cars: pd.DataFrame) -> None:
     """Draw a bar per strategy: the mean energies of car and human driver, one after the other."""
     present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_path_energy_kj" in cars]
-    means = cars.groupby("strategy", sort=False)[[f"{x}_path_energy_kj" for x in present]].mean()
+    columns = [f"{x}_{end}" for x in present for end in ("path_energy_kj", "distance_m")]
+    means = cars.groupby("strategy", sort=False)[columns].mean()
+    kilometres = means[[f"{x}_distance_m" for x in present]].sum(axis=1) / 1e3
+    baseline = next((name for name in ("human", "idm") if name in means.index), None)
     totals, places = pd.Series(0.0, means.index), np.arange(len(means))
     for vehicle in present:
         name, hue = VEHICLES[vehicle]
-        value = means[f"{vehicle}_path_energy_kj"]
+        value = means[f"{vehicle}_path_energy_kj"] / kilometres
         axis.barh(places, value, left=totals, color=hue, label=name)
         totals = totals + value
     for place, (label, total) in enumerate(totals.items()):
-        known = label != "idm" and "idm" in totals
-        change = f" ({100 * (total / totals['idm'] - 1):+.1f} %)" if known else ""
-        axis.annotate(f" {total:.0f}{change}", (total, place), va="center", fontsize=8)
-    rows_of(axis, list(map(str, totals.index)))
+        saved = ""
+        if baseline not in (None, label):
+            saved = f" ({100 * (1.0 - total / totals[baseline]):+.1f} %)".replace("-", "−")
+        axis.annotate(f" {total:.0f}{saved}", (total, place), va="center", fontsize=8)
+    rows_of(axis, [WHO.get(str(name), str(name)) for name in totals.index])
     axis.tick_params(axis="y", labelsize=9)
     axis.set_xlim(0.0, 1.4 * totals.max())
-    against = "\nin brackets: against idm" if "idm" in totals else ""
-    style(axis, f"path energy [kJ per episode]{against}")
+    against = f"\nin brackets: saved against {baseline}" if baseline else ""
+    style(axis, f"path energy [kJ/km]{against}")
     legend_above(axis)
     title = (
         f"{cars['profile_id'].nunique()} held-out profiles × {cars['driver_id'].nunique()} drivers"

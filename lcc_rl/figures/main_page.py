@@ -101,7 +101,7 @@ def headline(found: pd.DataFrame) -> pd.DataFrame:
         human = cars.loc[cars["strategy"] == HUMAN, "distance_m"].iloc[0]
         table["distance_pct"] = 100.0 * (cars["distance_m"] / human - 1.0)
     for name, column in SHARES.items():
-        table[name] = 100.0 * cars[column]
+        table[name] = (100.0 * cars[column]).round(2)
     table["collisions"] = cars["collisions"]
     return table.reset_index(drop=True)
 

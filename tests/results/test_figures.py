@@ -129,7 +129,11 @@ def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tm
     frame = episodes().assign(strategy=lambda x: x["strategy"].replace("alcc", "own_energy"))
     figure = run_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
     right = figure.axes[1]
-    assert [x.get_text() for x in right.get_yticklabels()] == ["idm", "own energy", "reference"]
+    assert [x.get_text() for x in right.get_yticklabels()] == [
+        "one human driver (IDM)",
+        "own energy",
+        "network for its own car",
+    ]
     image = pixels(figure, tmp_path / "x.png")
     assert all(count(image, run_figures.VEHICLES[name][1]) > 500 for name in ("cav", "hdv"))
     for axis in figure.axes:  # the legend covers no data
