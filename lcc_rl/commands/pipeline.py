@@ -28,6 +28,7 @@ from lcc_rl.config.schemas import (
     TrainConfig,
 )
 from lcc_rl.data.episodes import write_episodes
+from lcc_rl.drivers.calibrator import IMPLAUSIBLE_FIT
 from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
@@ -184,7 +185,7 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
         said = StringIO()
         found = calibration.run(own, drivers.parent, Console(file=said, width=100))
         for line in said.getvalue().splitlines():
-            log.info(line)
+            (tell if IMPLAUSIBLE_FIT in line else log.info)(line)
         tell(f"drivers: {len(found)} calibrated, mean RMSPE {100.0 * found['rmspe'].mean():.2f} %")
     return drivers
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -39,6 +39,10 @@ INNER = GeneticSettings(population=16, generations=8)
 # Columns of the errors; those of the part held out end in ``_out``.
 ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
 OUT = "_out"
+NOTABLE = 0.05  # share of drivers with a parameter on a bound from which on the report says so
+IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
+IMPLAUSIBLE_FIT = "IMPLAUSIBLE FIT"
+CONGESTED = "congested traffic does not tell how fast these drivers would like to go"
 
 
 @dataclass(frozen=True)
@@ -176,7 +180,7 @@ class _Fit:
         error, genetic = self.error(constants), getattr(self.settings, f"{self.mode}_genetic")
         found = self.search(error, self.names, self.observed.count, genetic, self.progress)
         drivers = self.table(found.best.to("cpu", torch.float64), constants)
-        return drivers, lines + _findings(drivers, self.limits["desired_speed"])
+        return drivers, lines + _findings(drivers, self.names, self.limits)
 
     def error(self, constants: DriverConstants) -> FitError:
         """Return what is minimised, as a function of the fitted parameters."""
@@ -252,7 +256,7 @@ class _Fit:
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
 
-def _findings(drivers: pd.DataFrame, limits: tuple[float, float]) -> list[str]:
+def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, Any]) -> list[str]:
     """Lines on the quality of the fit and on what it could not identify."""
     error = 100.0 * drivers["rmspe"]
     lines = [
@@ -263,11 +267,19 @@ def _findings(drivers: pd.DataFrame, limits: tuple[float, float]) -> list[str]:
         if f"gap_rmse_m{OUT}" in drivers:
             speed, gap = 100.0 * drivers[f"rmspe{end}"], drivers[f"gap_rmse_m{end}"]
             lines.append(f"{part}: RMSPE {speed.mean():.2f} %, gap RMSE {gap.mean():.2f} m (means)")
-    share = drivers["desired_speed_at_bound"].mean()
-    if share > 0.0:
-        low, high = limits
+    for name in names:
+        share = drivers[f"{name}_at_bound"].mean()
+        if share >= NOTABLE:
+            low, high = limits[name]
+            why = CONGESTED if name == "desired_speed" else f"calibration.bounds.{name} widens them"
+            lines.append(
+                f"{100 * share:.0f} % of the values of {COLUMNS[name]} lie on a bound ({low:g} or "
+                f"{high:g}): {why}"
+            )
+    off = 100.0 * drivers["gap_nrmse"].median()
+    if off > 100.0 * IMPLAUSIBLE:
         lines.append(
-            f"{100 * share:.0f} % of the desired speeds lie on a bound ({low:g} or {high:g} m/s): "
-            "congested traffic does not tell how fast these drivers would like to go"
+            f"{IMPLAUSIBLE_FIT}: the gap of the median driver is off by {off:.0f} %; are speeds in "
+            "km/h or ft/s, or gaps and positions in feet, in columns of m/s and m (data.units)?"
         )
     return lines

@@ -124,7 +124,7 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
         training,
         windows.spread(cfg.evaluation.profiles),
         population,
-        (*leaders.report, *shortfalls(cfg, available)),
+        (*leaders.report, described(population), *shortfalls(cfg, available)),
         leaders.cases,
         leaders.full_length,
     )
@@ -140,6 +140,16 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
     return TrajectoryLeaders(
         source=loaded, split=split, source_step=cfg.scenario.time_step, least_variation=0.0
     )
+
+
+def described(population: Population) -> str:
+    """Return a line on who drives."""
+    speed, gap = population.desired_speed, population.time_gap
+    line = f"{len(gap)} human drivers: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
+    reaction = getattr(population, "reaction", None)
+    if reaction is None or not (reaction.delay or reaction.noise):
+        return line
+    return f"{line}, reaction delay {reaction.delay:g} s, noise {reaction.noise:g} m/s²"
 
 
 def constant_profiles(

@@ -103,6 +103,16 @@ def test_calibration_smooths_drivers_and_the_reaction_restores_them() -> None:
     assert any("reaction delay" in line for line in result.report)
 
 
+def test_forgotten_units_and_bounds_are_said() -> None:
+    episodes, _ = followed(0.0, 0.0, drivers=6)
+    assert not any("IMPLAUSIBLE" in line for line in Calibrator()(episodes).report)
+    speeds = episodes.filter(like="speed").columns
+    wrong = episodes.assign(**{name: 3.6 * episodes[name] for name in speeds})  # km/h
+    report = "\n".join(Calibrator()(wrong).report)
+    assert "lie on a bound" in report
+    assert "IMPLAUSIBLE FIT: the gap of the median driver is off by" in report
+
+
 def test_measures_by_hand() -> None:
     # 10 + sin(2π 0.1 t) m/s, six periods after smoothing: a² has the mean (0.2π)²/2; an
     # average over 3.1 s damps it by sin(0.31π)/(0.31π), twice. Its density lies at 0.1 Hz.
