@@ -23,6 +23,7 @@ from lcc_rl.evaluation.strategies import (
     POLICY,
     RECORDED,
     Strategy,
+    applies,
     baselines,
     check_distinct,
     named_apart,
@@ -164,6 +165,8 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
     rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
+    for name in rivals:
+        require(applies(cfg, name), f"compare={name}: it has no vehicle to drive in this string")
     check_installed(cfg, rivals)
     task = task_of(cfg)
     paths = [

@@ -8,6 +8,8 @@ import pytest
 import torch
 from helpers import POPULATION, compose, composed, followed_profiles, wavy_profiles
 
+from lcc_rl.commands.evaluation import strategies_of
+from lcc_rl.config import load
 from lcc_rl.data.episodes import validate_episodes
 from lcc_rl.data.profiles import at_step, join, leader_profiles
 from lcc_rl.envs import build_env
@@ -102,3 +104,19 @@ def test_followers_stay_beside_their_leaders() -> None:
     np.testing.assert_allclose(slower.follower(1), profiles.follower(1)[::2], rtol=1e-6)
     assert join([profiles, slower]).followers.shape == (4 * 300, 2)
     assert join([profiles, wavy_profiles()]).followers is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["leader=udds"], "compare=recorded: nobody was recorded behind these leaders"),
+        (["scenario=ring"], "compare=recorded: it has no vehicle to drive in this string"),
+    ],
+)
+def test_a_recorded_rival_that_cannot_be_played_is_an_error(words, message) -> None:
+    small = ["scenario.horizon=40", "evaluation.profiles=2", "evaluation.drivers=2"]
+    cfg = load("evaluate", ["variant=idm", "compare=[recorded]", *words, *small])
+    with pytest.raises(ConfigError, match=message):
+        strategies_of(cfg)
+    cfg.compare, cfg.evaluation.baselines = [], ["idm", "recorded"]
+    assert "recorded" not in [one.name for one in strategies_of(cfg)[0]]
