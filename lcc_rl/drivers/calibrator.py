@@ -39,7 +39,6 @@ INNER = GeneticSettings(population=16, generations=8)
 # Columns of the errors; those of the part held out end in ``_out``.
 ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
 OUT = "_out"
-NOTABLE = 0.05  # share of drivers with a parameter on a bound from which on the report says so
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
 IMPLAUSIBLE_FIT = "IMPLAUSIBLE FIT"
 CONGESTED = "congested traffic does not tell how fast these drivers would like to go"
@@ -269,7 +268,7 @@ def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, 
             lines.append(f"{part}: RMSPE {speed.mean():.2f} %, gap RMSE {gap.mean():.2f} m (means)")
     for name in names:
         share = drivers[f"{name}_at_bound"].mean()
-        if share >= NOTABLE:
+        if share > 0.0:
             low, high = limits[name]
             why = CONGESTED if name == "desired_speed" else f"calibration.bounds.{name} widens them"
             lines.append(

@@ -19,6 +19,7 @@ from lcc_rl.drivers.parameters import (
     IDM,
     MODEL,
     PLAUSIBLE,
+    REACTION,
     Bounds,
     at_bound,
     users,
@@ -75,6 +76,12 @@ class DriverPopulation:
                 found = float(values[wrong][0])
                 raise ConfigError(
                     f"driver population: {name!r} must be {low:g} to {high:g}, got {found:g}"
+                )
+        for name, (_, low, high) in REACTION.items():
+            value = getattr(self.reaction, name)
+            if not low <= value <= high:
+                raise ConfigError(
+                    f"driver population: reaction {name} must be {low:g} to {high:g}, got {value:g}"
                 )
 
     def __len__(self) -> int:

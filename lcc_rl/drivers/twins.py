@@ -41,7 +41,6 @@ NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s
 TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose
 CARS = 5  # drivers in a row, along whom energy must not grow
 CAP = 3.0  # bounds the gaps that they start at, see lcc_rl.functional.idm.equilibrium_gap [s]
-ENERGY, DISTANCE = f"energy_{SMOOTHINGS[0]}s_j", f"distance_{SMOOTHINGS[0]}s_m"
 DENSITY, HERTZ = "density_", "hz"  # around the frequency in the name of a column
 RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
 Array = NDArray[np.float64]
@@ -66,27 +65,40 @@ def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: flo
         frequency within :data:`BAND`, such as 0.1 Hz, density_0.1hz of the acceleration [m²/s⁴/Hz],
         NaN for records shorter than :data:`WINDOW`.
     """
-    table, motor = {}, PaperMotor()
-    total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
+    table: dict[str, Array] = {}
     for smoothing in SMOOTHINGS:
-        width = round(smoothing / time_step)
-        smooth = (total[width:] - total[:-width]) / width
-        inside = np.arange(len(smooth) - 1)[:, None] < samples - width
-        accelerations = torch.from_numpy(np.diff(smooth, axis=0) / time_step)
-        motion = (torch.from_numpy(smooth[:-1]), accelerations)
-        of = {
-            f"energy_{smoothing}s_j": motor.path_power(*motion).numpy(),
-            f"lost_{smoothing}s_j": motor.acceleration_loss(*motion).numpy(),
-            f"distance_{smoothing}s_m": 0.5 * (smooth[1:] + smooth[:-1]),
-        }
-        for name, rate in of.items():
-            table[name] = (rate * time_step * inside[:, None]).sum(0).mean(0)
-    alive = (np.arange(len(speed))[:, None] < samples)[:, None]
+        found = _energies(speed, samples, time_step, smoothing)
+        units = {"energy": "j", "lost": "j", "distance": "m"}
+        table |= {f"{x}_{smoothing}s_{unit}": found[x] for x, unit in units.items()}
+    alive = _inside(len(speed), samples)
     table["gap_m"] = (gap * alive).mean(1).sum(0) / samples
     moving = alive & (speed > 1.0)
     far = moving & (gap > LONG_GAP * speed)
     table["long_gap_share"] = far.sum((0, 1)) / np.maximum(moving.sum((0, 1)), 1)
     return pd.DataFrame(table | _spectrum(speed, samples, time_step))
+
+
+def _inside(length: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which of so many samples belong to a record, ``[length, 1, drivers]``."""
+    return (np.arange(length)[:, None] < samples)[:, None]
+
+
+def _energies(
+    speed: Array, samples: NDArray[np.int64], time_step: float, smoothing: float
+) -> dict[str, Array]:
+    """Return energy [J], its part lost to accelerating [J] and distance [m], each ``[drivers]``."""
+    width, motor = round(smoothing / time_step), PaperMotor()
+    total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
+    smooth = (total[width:] - total[:-width]) / width
+    inside = _inside(len(smooth) - 1, samples - width)
+    accelerations = torch.from_numpy(np.diff(smooth, axis=0) / time_step)
+    motion = (torch.from_numpy(smooth[:-1]), accelerations)
+    rates = {
+        "energy": motor.path_power(*motion).numpy(),
+        "lost": motor.acceleration_loss(*motion).numpy(),
+        "distance": 0.5 * (smooth[1:] + smooth[:-1]),
+    }
+    return {name: (rate * time_step * inside).sum(0).mean(0) for name, rate in rates.items()}
 
 
 def _spectrum(speed: Array, samples: NDArray[np.int64], time_step: float) -> dict[str, Array]:
@@ -147,7 +159,7 @@ def drive(
     who, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
     motion = _follow(who, leader, start, reactions, shape, generator, observed.time_step)
     truth = observed.follower_speed.double().cpu().numpy()[:, None]
-    alive = (np.arange(len(truth))[:, None] < observed.samples)[:, None]
+    alive = _inside(len(truth), observed.samples)
     norm = (truth**2).sum(0)
     found = []
     for speed, gap in motion:
@@ -171,18 +183,19 @@ def growth(
     generator, chance = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     shape, step = (len(reactions), 1, observed.count), observed.time_step
     energies, collided = [], np.zeros(len(reactions), bool)
-    for _ in range(CARS):
+    inside = _inside(len(leader), observed.samples)
+    for car in range(CARS):
         order = torch.from_numpy(chance.permutation(observed.count))
         shared = {name: getattr(constants, name)[order] for name in law.shared}
         who = (law, (own[0][order], own[1][order]), constants.with_(**shared))
         gap = law.equilibrium_gap(leader[0], *who[1], who[2], CAP)
         motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
-        inside = (np.arange(len(leader))[:, None] < observed.samples)[:, None]
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
-        sums = [measure(*one, observed.samples, step).sum() for one in motion]
-        energies.append([one[ENERGY] / one[DISTANCE] for one in sums])
+        if car in (0, CARS - 1):
+            each = [_energies(x, observed.samples, step, SMOOTHINGS[0]) for x, _ in motion]
+            energies.append([one["energy"].sum() / one["distance"].sum() for one in each])
         leader = torch.from_numpy(np.stack([speed for speed, _ in motion], 1))
-    grown = np.log(np.divide(energies[-1], energies[0]))
+    grown = np.log(np.divide(energies[1], energies[0]))
     return [float(x) for x in np.where(collided, np.inf, grown)]
 
 

@@ -123,12 +123,13 @@ def verdict(table: pd.DataFrame) -> str:
     column, baseline = list(against.items())[-1]
     own, other = rows.loc[NETWORK], rows.loc[baseline]
     saved, low, high = (own[f"{column}{end}"] for end in ("", "_low", "_high"))
-    less = "less" if saved >= 0.0 else "more"
-    sure = low > 0.0 or high < 0.0
-    within = "" if sure else ", which is within the uncertainty"
+    less = "less"
+    if saved < 0.0:
+        less, saved, low, high = "more", -saved, -high, -low
+    within = "" if low > 0.0 else ", which is within the uncertainty"
     long = "long_time_gap_pct"
     return (
-        f"The {own['who']} needs {abs(saved):.1f} % {less} energy per km than the {other['who']} "
+        f"The {own['who']} needs {saved:.1f} % {less} energy per km than the {other['who']} "
         f"({low:.1f} … {high:.1f}){within}, with long time gaps for {own[long]:.2f} % of the time "
         f"against {other[long]:.2f} %."
     )

@@ -12,6 +12,7 @@ from lcc_rl.results.intervals import Estimate, saving, share_saved
 KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
 BASELINES = ("idm", "human", "idm tuned", "rule", "reference")
+# Whom networks are compared with; no figures of their own. All but the rule learn nothing.
 UNTRAINED = (
     *("direct", "idm", "human", "recorded", "constant_filtered", "idm tuned", "acc tuned"),
     "rule",

@@ -151,6 +151,8 @@ def test_bad_tables_end_in_one_clear_error(table, written, change, message):
         (lambda: fixed(time_gap=np.inf), "time_gap"),
         (lambda: fixed(min_gap=0.0), "min_gap"),
         (lambda: replace(fixed(), ids=()), "no drivers"),
+        (lambda: bootstrap(reaction_delay=50.0), "reaction delay must be 0 to 3, got 50"),
+        (lambda: fixed(acceleration_noise=9.0), "reaction noise must be 0 to 3, got 9"),
         (lambda: kde(bandwidth=-1.0), "bandwidth"),
         (lambda: kde(drivers=0), "drivers"),
     ],
