@@ -1,8 +1,8 @@
 """Extraction of car-following episodes from trajectories.
 
 A candidate is a maximal stretch of consecutive frames in which a vehicle names the same preceding
-vehicle and both have a row. Each criterion then removes whole candidates, in a fixed order, and
-the report counts how many.
+vehicle, both have a row and the gap is within limits. Each criterion then removes whole
+candidates, in a fixed order, and the report counts how many.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Mask = NDArray[np.bool_]
 class Criteria(Settings):
     """Criteria of a car-following episode; None stands for no limit.
 
-    Gaps are bumper to bumper, at any time. ``passenger_cars_only``: both vehicles are of class 2
-    throughout; where no vehicle has a class this is skipped, with a note in the report. Both
-    vehicles share one lane throughout: ``split`` cuts a candidate where they do not and judges the
-    parts; ``reject`` removes a candidate with any lane change.
+    Gaps are bumper to bumper; a candidate is cut where one is beyond its limits, and the parts are
+    judged. ``passenger_cars_only``: both vehicles are of class 2 throughout; where no vehicle has
+    a class this is skipped, with a note in the report. Both vehicles share one lane throughout:
+    ``split`` cuts a candidate where they do not; ``reject`` removes one with any lane change.
     """
 
     min_duration_s: Annotated[float, Field(ge=FRAME, le=LARGEST)] = 15.0
@@ -109,6 +109,8 @@ def extract(
     report = ExtractionReport()
     follower, leader = _pairs(samples, recording.codes.to_numpy(), criteria, report)
     gap = samples["space_headway_m"][follower] - samples["length_m"][leader]
+    near = _near(gap, criteria, report)
+    follower, leader, gap = follower[near], leader[near], gap[near]
     # A candidate begins after a row left out, or a change of segment, leader or lane.
     cut = np.append(True, np.diff(follower) != 1)
     for name in ("segment", "preceding", *(["lane"] if criteria.lane_changes == "split" else [])):
@@ -118,7 +120,7 @@ def extract(
     report.candidates = len(starts)
     lengths = np.diff(np.append(starts, len(follower)))
     keep = np.ones(len(starts), dtype=bool)
-    for name, passes in _criteria(samples, follower, leader, gap, starts, criteria, report):
+    for name, passes in _criteria(samples, follower, leader, starts, criteria, report):
         report.removed[name] = int((keep & ~passes).sum())
         keep &= passes
         if not keep.any():
@@ -168,11 +170,27 @@ def _pairs(
     return follower, ahead[follower]
 
 
+def _near(gap: NDArray, criteria: Criteria, report: ExtractionReport) -> Mask:
+    """Samples whose gap is neither too short nor too long; candidates are cut at the others."""
+    low, high = criteria.min_gap_m, criteria.max_gap_m
+    keep = np.ones(len(gap), dtype=bool)
+    for name, limit, wrong in (
+        ("min_gap_m", low, low is not None and gap < low),
+        ("max_gap_m", high, high is not None and gap > high),
+    ):
+        count = int(np.sum(wrong))
+        if count:
+            report.left_out[f"have a gap beyond {name}={limit:g}"] = count
+            keep &= ~wrong
+    if not keep.any():
+        raise DataError(f"no sample is left within min_gap_m and max_gap_m:\n{report}")
+    return keep
+
+
 def _criteria(
     samples: dict[str, NDArray],
     follower: NDArray[np.intp],
     leader: NDArray[np.int64],
-    gap: NDArray,
     starts: NDArray[np.intp],
     criteria: Criteria,
     report: ExtractionReport,
@@ -203,8 +221,3 @@ def _criteria(
             "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
             "there is nothing to filter on and every vehicle stays"
         )
-    yield "speeds of at least 0", both(samples["speed_mps"] >= 0)
-    if criteria.min_gap_m is not None:
-        yield f"min_gap_m: {criteria.min_gap_m:g}", always(gap >= criteria.min_gap_m)
-    if criteria.max_gap_m is not None:
-        yield f"max_gap_m: {criteria.max_gap_m:g}", always(gap <= criteria.max_gap_m)

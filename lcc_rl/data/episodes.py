@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,16 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, stem
-from lcc_rl.data.trajectories import stretches
+from lcc_rl.data.tables import (
+    LARGEST_ID,
+    Column,
+    TableFile,
+    checked,
+    lacking,
+    stem,
+    whole_numbers,
+)
+from lcc_rl.data.trajectories import FRAME, HOLE, divided, stretches
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet
 
@@ -28,62 +37,191 @@ SCHEMA: dict[str, str] = {
     "leader_length_m": "float32",
     "gap_m": "float32",
 }
+# What a table of pairs may tell; a configuration names the columns by these keys.
 FIELDS = (
-    Column("episode", least=-(2**31), most=2**31 - 1, whole=True),
+    Column("episode", "text", required=False),
     Column("recording", "text", required=False),
-    Column("follower_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True),
-    Column("leader_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True),
-    Column("time_s", "time"),
-    Column("follower_position_m", "length", required=False),
-    Column("follower_speed_mps", "speed", least=0.0),
-    Column("leader_position_m", "length", required=False),
-    Column("leader_speed_mps", "speed", least=0.0),
-    Column("leader_length_m", "length", least=0.0, required=False),
-    Column("gap_m", "length", least=0.0),
+    Column("follower_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
+    Column("leader_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
+    Column("time", "time"),
+    Column("follower_position", "length", required=False),
+    Column("follower_speed", "speed"),
+    Column("leader_position", "length", required=False),
+    Column("leader_speed", "speed"),
+    Column("leader_length", "length", least=0.0, required=False),
+    Column("gap", "length"),
 )
 COLUMNS = tuple(SCHEMA)
+OWN = dict(zip((column.key for column in FIELDS), COLUMNS, strict=True))  # names by default
+# What a finished table has: every column, episodes are numbers, no speed or gap is negative.
+STRICT = (
+    Column("episode", least=-(2**31), most=2**31 - 1, whole=True),
+    *(
+        replace(
+            x,
+            key=OWN[x.key],
+            required=True,
+            least=0.0 if x.quantity == "speed" or x.key == "gap" else x.least,
+        )
+        for x in FIELDS[1:]
+    ),
+)
 ALIASES = {"event": "episode", "period": "recording"}
 POSITIONS = ("leader_position_m", "follower_position_m")
 DERIVED = "no positions given: those of leaders are the integral of their speeds"
+REGULAR = 0.01  # of a step, by which one may differ: times in float32 are off by some 10 µs
+ONE_ROW = "is of one row; expected at least two"
 
 
 def read_episodes(path: str | Path) -> pd.DataFrame:
-    """Read an episode table from a parquet or CSV file and validate it.
+    """Read a table of pairs from a parquet or CSV file, see :func:`load_episodes`.
 
     Args:
-        path: file with the columns of ``FIELDS``, of which those that are not required may be
-            missing; ``event`` and ``period`` are taken for ``episode`` and ``recording``. Further
-            columns are left out. CSV may be gzipped, see :class:`lcc_rl.data.tables.TableFile`.
+        path: file with the columns of ``SCHEMA``, of which those that are not required in
+            ``FIELDS`` may be missing; ``event`` and ``period`` are taken for ``episode`` and
+            ``recording``. Further columns are left out.
 
     Returns:
         Columns ``SCHEMA`` in SI: episode, recording, follower_id, leader_id, time_s, follower and
         leader position (front bumper), speed, leader length and gap (bumper to bumper).
 
     Raises:
-        DataError: if the file cannot be read or its content is not a valid episode table.
+        DataError: if the file cannot be read or its content is not a valid table.
     """
-    return load_episodes(path)[0]
+    return load_episodes([str(path)])[0]
 
 
-def load_episodes(path: str | Path) -> tuple[pd.DataFrame, list[str]]:
-    """Read an episode table, see :func:`read_episodes`, and lines on what it lacks."""
+def load_episodes(
+    paths: Sequence[str],
+    columns: Mapping[str, str | None] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> tuple[pd.DataFrame, list[str]]:
+    """Read tables of pairs: a row per pair and moment, at any rate and with holes.
+
+    Args:
+        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`.
+        columns: what they call the columns, by the keys of ``FIELDS``; others as in ``SCHEMA``.
+        units: their units by key; SI for those that are not named.
+
+    Returns:
+        The columns ``SCHEMA``, samples 0.1 s apart, and lines on what was read. Holes divide an
+        episode. Speeds and gaps may be negative.
+
+    Raises:
+        DataError: naming file, row and column, if a cell is missing or no number, or rows
+            contradict each other.
+    """
+    tables: list[pd.DataFrame] = []
+    notes: list[str] = []
+    for path in paths:
+        table, lines = _table(path, columns or {}, units or {})
+        if tables:
+            table["episode"] += tables[-1]["episode"].max() + 1 - table["episode"].min()
+        tables.append(table)
+        notes += lines
+    return pd.concat(tables, ignore_index=True), list(dict.fromkeys(notes))
+
+
+def _table(
+    path: str, columns: Mapping[str, str | None], units: Mapping[str, str]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Read one file."""
     file = TableFile(path)
-    names: dict[str, str | None] = {name: name for name in COLUMNS if name in file.header}
+    names: dict[str, str | None] = {key: own for key, own in OWN.items() if own in file.header}
     names |= {new: old for old, new in ALIASES.items() if old in file.header and new not in names}
-    _require([column.key for column in FIELDS if column.required], names, str(path), file.header)
-    read = file.read(FIELDS, names)
-    rows = len(read["episode"])
-    blank = {**dict.fromkeys(COLUMNS, np.zeros(rows)), "recording": np.full(rows, stem(path))}
-    table = _typed({**blank, **read}, str(path))
+    names |= columns
+    missing = [OWN[x.key] for x in FIELDS if x.required and x.key not in names]
+    if missing:
+        raise lacking(path, missing, file.header, "data.columns")
+    read = file.read(FIELDS, names, units, "data.columns")
+    rows = len(read["time"])
+    if not rows:
+        raise DataError(f"{path}: has no episodes; expected at least one row")
     notes = list(file.notes)
-    if "recording" not in names:
-        notes.append(f"no column recording: all of {path} is one")
-    if "leader_length_m" not in names:
-        notes.append("no column leader_length_m: lengths are not known")
-    if not set(POSITIONS) <= set(names):
+    labels = read.get("episode", np.zeros(rows, dtype=str))
+    codes, found = pd.factorize(labels)
+    numbers = whole_numbers(np.asarray(found))
+    if numbers is None or (np.abs(numbers) >= 2**31).any():
+        numbers = np.arange(len(found))
+    follower = 2 * codes + 2
+    values = {
+        **dict.fromkeys(COLUMNS, np.zeros(rows)),
+        "recording": np.full(rows, stem(path)),
+        **{OWN[key]: cells for key, cells in read.items()},
+        "episode": numbers[codes],
+        "follower_id": read.get("follower_id", follower),
+        "leader_id": read.get("leader_id", follower - 1),
+    }
+    for name, words in (
+        ("recording", f"no column recording: all of {path} is one"),
+        ("leader_length", "no column leader_length_m: lengths are not known"),
+    ):
+        if names.get(name) is None:
+            notes.append(words)
+    table = pd.DataFrame(values)
+    table, more = _even(table.assign(row=np.arange(rows)), file, codes)
+    table = table[[*COLUMNS]].astype({**SCHEMA, "recording": str})
+    if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED)
-    return table, notes
+    return table, [*notes, *more]
+
+
+def _even(
+    table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Rows by episode and time, samples 0.1 s apart; holes divide an episode."""
+    notes = []
+    sorted_rows = np.lexsort((table["time_s"], order))
+    if (np.diff(sorted_rows) != 1).any():
+        notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
+        table = table.iloc[sorted_rows].reset_index(drop=True)
+    same = np.append(False, np.diff(table["episode"]) == 0)
+    for name in ("recording", "follower_id", "leader_id"):
+        wrong = same & (table[name] != table[name].shift()).to_numpy()
+        if wrong.any():
+            row = int(table["row"].to_numpy()[wrong].min())
+            raise file.fault(row, name, "changes within an episode; expected one pair")
+    if not same.any():
+        raise file.fault(0, "episode" if "episode" in file.names else "time", ONE_ROW)
+    steps = np.diff(table["time_s"], prepend=0.0)
+    step = float(np.median(steps[same]))
+    short = same & (steps <= step / 2 + 1e-9)
+    if short.any():
+        at = int(np.argmax(short))
+        words = f"is {steps[at]:g} s after the sample before it; expected steps of about {step:g} s"
+        raise file.fault(int(table["row"].iloc[at]), "time", words)
+    hole = same & (steps > HOLE * step)
+    alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
+    count = table["episode"].nunique()
+    if hole.any() or alone.any():
+        table = divided(table, alone, hole, 0.0)
+        notes.append(
+            f"{file.path}: {int(hole.sum()):,} holes divide its {count:,} episodes into "
+            f"{table['episode'].nunique():,}; {int(alone.sum()):,} samples alone are left out"
+        )
+    inner = steps[same & ~hole]
+    off = np.abs(inner - FRAME).max() if len(inner) else 0.0
+    if off <= REGULAR * FRAME:
+        return table, notes
+    parts = [_resampled(part) for _, part in table.groupby("episode", sort=False)]
+    notes.append(f"samples {step:g} s apart were interpolated to {FRAME:g} s")
+    kept = [part for part in parts if len(part) > 1]
+    if not kept:
+        raise DataError(f"{file.path}: no episode lasts {FRAME:g} s; is the time in another unit?")
+    return pd.concat(kept, ignore_index=True), notes
+
+
+def _resampled(part: pd.DataFrame) -> pd.DataFrame:
+    """An episode on a grid of 0.1 s; monotone between its samples."""
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
+    time = part["time_s"].to_numpy(np.float64)
+    grid = time[0] + FRAME * np.arange(int((time[-1] - time[0]) / FRAME + 1e-6) + 1)
+    found = part.iloc[np.searchsorted(time, grid + 1e-6, side="right") - 1].reset_index(drop=True)
+    motion = [name for name in found if str(name).endswith(("_position_m", "_speed_mps", "gap_m"))]
+    found[motion] = PchipInterpolator(time, part[motion].to_numpy(np.float64))(grid)
+    return found.assign(time_s=grid)
 
 
 def derive_positions(episodes: pd.DataFrame) -> None:
@@ -128,9 +266,11 @@ def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
             single row or several pairs, or its time does not advance by one constant step.
     """
     present = [str(name) for name in frame.columns]
-    _require(COLUMNS, present, source, present)
+    missing = [name for name in COLUMNS if name not in present]
+    if missing:
+        raise lacking(source, missing, present, "")
     values = {}
-    for column in FIELDS:
+    for column in STRICT:
         if present.count(column.key) > 1:
             raise DataError(f"{source}: has column {column.key!r} twice; expected it once")
         try:
@@ -143,15 +283,6 @@ def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
 
         values[column.key] = checked(cells, column, fault)
     return _typed(values, source)
-
-
-def _require(
-    names: Sequence[str], present: Collection[str], source: str, header: Sequence[str]
-) -> None:
-    missing = [name for name in names if name not in present]
-    if missing:
-        error = lacking(source, missing, header, "")
-        raise DataError(f"{error}. Tables of other columns or units are read by data=table")
 
 
 def _at(source: str, row: int, name: str, words: str) -> DataError:
@@ -169,7 +300,7 @@ def _typed(values: dict[str, NDArray], source: str) -> pd.DataFrame:
         raise _at(source, row, "episode", "begins again; expected the rows of an episode together")
     if (lengths < 2).any():
         row = int(starts[int(np.argmax(lengths < 2))])
-        raise _at(source, row, "episode", "is of one row; expected at least two")
+        raise _at(source, row, "episode", ONE_ROW)
     for name in ("recording", "follower_id", "leader_id"):
         wrong = values[name] != values[name][np.repeat(starts, lengths)]
         if wrong.any():

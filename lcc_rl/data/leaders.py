@@ -222,13 +222,12 @@ class TrajectoryLeaders(Settings):
 
     source: Any  # where the episodes come from, like the nodes of ``data``
     split: Callable  # how they are divided, like the nodes of ``split``
-    source_step: Positive = 0.1  # step of the episodes [s]
     least_variation: NonNegative = 2.0  # see RecordLeaders
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read everything; see :meth:`RecordLeaders.load`."""
         loaded = self.source.load()
-        profiles = at_step(leader_profiles(loaded.episodes, self.source_step), time_step)
+        profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
         windows = varying(held_out.windows(horizon), self.least_variation)
         return Leaders(training, windows, report=tuple(loaded.report))

@@ -1,13 +1,15 @@
 """Car-following episodes from native OpenACC files: every car behind the car before it.
 
 OpenACC (European Commission, Joint Research Centre; CC BY 4.0) has a row per moment: ``Time``, and
-for car i ``Speed<i>`` [m/s] and ``IVS<i>``, the gap from car i + 1 to car i [m]. Cells are blank
-where a car was not measured.
+for car i ``Speed<i>`` [m/s], ``IVS<i>``, the gap from car i + 1 to car i [m], and in some campaigns
+``Driver<i>``. Cells are blank, or columns absent, where a car was not measured.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -30,6 +32,7 @@ class OpenAccSource(Settings):
     """
 
     path: str | Sequence[str]  # a file, several files, or a pattern
+    driver: Literal["human", "acc"] | None = None  # only followers of whom Driver<i> says so
     criteria: Criteria | None = None  # None for the defaults
     plausible: Plausible | None = None  # None for the defaults
 
@@ -42,39 +45,56 @@ class OpenAccSource(Settings):
         """
         files = find_files(self.path)
         report = ReadReport(files=files)
-        cars = [_cars(TableFile(name), number, report) for number, name in enumerate(files)]
+        cars = [
+            _cars(TableFile(name), number, self.driver, report) for number, name in enumerate(files)
+        ]
         trajectories = to_trajectories(pd.concat(cars), labels(files), report)
         return episodes_of(trajectories, self.criteria, self.plausible)
 
 
-def _cars(table: TableFile, recording: int, report: ReadReport) -> pd.DataFrame:
+def _cars(table: TableFile, recording: int, driver: str | None, report: ReadReport) -> pd.DataFrame:
     """All cars of a file, one below the other; see :func:`to_trajectories`."""
-    count = sum(f"Speed{car}" in table.header for car in range(1, len(table.header) + 1))
-    if count < 2:
+    numbers = [int(name[5:]) for name in table.header if re.fullmatch(r"Speed[1-9]\d?", name)]
+    if len(numbers) < 2:
         raise DataError(f"{table.path}: lacks Speed1 and Speed2; expected a native OpenACC file")
-    speeds = [Column(f"Speed{n}", "speed", least=0.0, blank=True) for n in range(1, count + 1)]
-    gaps = [Column(f"IVS{n}", "length", least=0.0, blank=True) for n in range(1, count)]
-    columns = [Column("Time", "time"), *speeds, *gaps]
+    speeds = {n: Column(f"Speed{n}", "speed", blank=True) for n in numbers}
+    gaps = {n: Column(f"IVS{n - 1}", "length", blank=True) for n in numbers if n - 1 in numbers}
+    gaps = {n: column for n, column in gaps.items() if column.key in table.header}
+    if not gaps:
+        raise DataError(f"{table.path}: lacks IVS1, IVS2 …; expected a native OpenACC file")
+    drivers = {n: Column(f"Driver{n}", "text", blank=True) for n in numbers}
+    drivers = {n: column for n, column in drivers.items() if column.key in table.header}
+    columns = [Column("Time", "time"), *speeds.values(), *gaps.values(), *drivers.values()]
     read = table.read(columns, {column.key: column.key for column in columns})
     rows = len(read["Time"])
+    blank = np.full(rows, np.nan)
     cars = pd.DataFrame(
         {
             "recording": recording,
-            "vehicle": np.repeat(np.arange(1, count + 1), rows),
-            "time": np.tile(read["Time"], count),
-            "speed": np.concatenate([read[column.key] for column in speeds]),
-            "row": np.tile(np.arange(rows), count),
-            "gap": np.concatenate([np.full(rows, np.nan), *(read[c.key] for c in gaps)]),
+            "vehicle": np.repeat(numbers, rows),
+            "time": np.tile(read["Time"], len(numbers)),
+            "speed": np.concatenate([read[f"Speed{n}"] for n in numbers]),
+            "row": np.tile(np.arange(rows), len(numbers)),
+            "gap": np.concatenate([read.get(f"IVS{n - 1}", blank) for n in numbers]),
         }
     )
-    cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     seen = cars.speed.notna()
-    unknown = int((cars.gap.isna() & seen & (cars.vehicle > 1)).sum())
+    unknown = int((cars.gap.isna() & seen & (cars.vehicle > min(numbers))).sum())
     report.rows_read += len(cars)
     report.drop("blank speed", int((~seen).sum()))
     report.notes += table.notes
     order = table.preamble.get("Vehicle_order", "").strip(", ").replace(",", ", ")
-    report.notes.append(f"{table.path}: {count} cars{': ' if order else ''}{order}")
+    report.notes.append(f"{table.path}: {len(numbers)} cars{': ' if order else ''}{order}")
     if unknown:
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow nobody")
+    if driver is not None:
+        none = np.full(rows, "")
+        who = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
+        other = cars.gap.notna() & (np.char.lower(who.astype(str)) != driver)
+        cars["gap"] = cars.gap.mask(other)
+        report.notes.append(
+            f"{table.path}: {int(cars.gap.notna().sum()):,} samples of followers driven by "
+            f"{driver}, {int(other.sum()):,} of others"
+        )
+    cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]

@@ -10,11 +10,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.trajectories import starts_of
+from lcc_rl.data.trajectories import divided, starts_of
 from lcc_rl.errors import LARGEST, DataError
-from lcc_rl.settings import NonNegative, Positive, Settings
+from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
+SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
@@ -25,20 +26,23 @@ Fault = tuple[str, str, NDArray[np.float64], str, Mask]
 
 
 class Plausible(Settings):
-    """Thresholds of recorded motion; a record with a sample outside of one is left out.
+    """Thresholds of recorded motion; records are cut where a sample is outside of one.
 
-    The data are refused where more than ``max_share`` of the records would be left out, or where
+    The data are refused where more than ``max_share`` of the samples would be left out, or where
     gaps change by a factor of more than ``max_mismatch``, either way, of what the speeds say
     (:func:`gap_rate`).
     """
 
     max_speed: Positive = 70.0  # beyond it, a column is rather in km/h or ft/s [m/s]
+    # Slower ones are left out; between this and 0 a speed counts as 0 [m/s].
+    min_speed: Annotated[float, Field(le=0.0)] = -0.5
     max_acceleration: Positive = 10.0  # change of speed between samples, either sign [m/s²]
     min_length: NonNegative = 2.0  # length of a vehicle [m]; 0 counts as not given
     max_length: Positive = 30.0
-    max_gap: Positive = 500.0  # between bumpers [m]
+    min_gap: Number = 0.0  # between bumpers [m]
+    max_gap: Positive = 500.0
     max_step: Positive = 10.0  # time between consecutive samples [s]
-    max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
+    max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1  # of the samples
     max_mismatch: Annotated[float, Field(ge=1.0, le=LARGEST)] = 1.5
 
     def select(
@@ -49,7 +53,7 @@ class Plausible(Settings):
         setting: str = "data.plausible",
         remedy: str = "",
     ) -> tuple[pd.DataFrame, list[str]]:
-        """Leave out the records that hold an implausible sample.
+        """Cut records where a sample is implausible; parts of less than 10 s go as well.
 
         Args:
             table: rows of a record (column ``episode``) lie together, in order of time: time_s
@@ -60,34 +64,51 @@ class Plausible(Settings):
             remedy: what else a user may do about accelerations.
 
         Returns:
-            The other records, and a line for each kind of fault, counted by its first reason.
+            What is left, numbered by :func:`lcc_rl.data.trajectories.divided`, its speeds at least
+            0, and a line for each kind of fault.
 
         Raises:
-            DataError: if more than ``max_share`` of the records, or all, would be left out, or
+            DataError: if more than ``max_share`` of the samples, or all, would be left out, or
                 gaps and speeds contradict each other.
         """
         starts = starts_of(table["episode"].to_numpy())
         first = np.isin(np.arange(len(table)), starts)
-        lengths = np.diff([*starts, len(table)])
-        keep, lines, advice = np.ones(len(starts), dtype=bool), [], ""
-        for column, words, values, name, wrong in self._faults(table, first):
-            bad = np.logical_or.reduceat(wrong, starts) & keep
-            if not bad.any():
+        wrong, lines, advice = np.zeros(len(table), dtype=bool), [], ""
+        for column, words, values, name, found in self._faults(table, first):
+            new = found & ~wrong
+            if name == "max_acceleration":  # not of the change from a sample that is left out
+                new[1:] &= ~wrong[:-1]
+            if not new.any():
                 continue
-            row = int(np.argmax(wrong & np.repeat(bad, lengths)))
+            row = int(np.argmax(new))
             limit = f"{setting}.{name}={getattr(self, name):g}"
             said = f"{place(row, column)} {words.format(values[row])}, {limit}"
-            lines.append(f"left out {int(bad.sum()):,} implausible record(s), the first: {said}")
             more = remedy if name == "max_acceleration" else ""
+            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {said}"
+            lines.append(f"{line}{more and '; to keep it'}{more}")
             advice = advice or f"{said}; mend the file{more}, or raise that threshold"
-            keep &= ~bad
-        if not keep.any() or np.mean(~keep) > self.max_share:
+            wrong |= new
+        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST)
+        lost = 1 - len(kept) / len(table)
+        if lost > self.max_share or kept.empty:
             raise DataError(
-                f"{source}: {int((~keep).sum()):,} of {len(keep):,} records are implausible (at "
-                f"most {setting}.max_share={self.max_share:g} of them may be left out), the first: "
-                f"{advice}"
+                f"{source}: {100 * lost:.3g} % of the samples are implausible or lie within less "
+                f"than {SHORTEST:g} s between such (at most {setting}.max_share="
+                f"{self.max_share:g} of them may), the first: {advice}"
             )
-        kept = table if keep.all() else table[np.repeat(keep, lengths)].reset_index(drop=True)
+        if lines:
+            records = int(np.logical_or.reduceat(wrong, starts).sum())
+            count = len(table) - len(kept)
+            lines.append(
+                f"{records:,} of {len(starts):,} records were cut there: {count:,} samples, "
+                f"{count * usual_step(table):,.0f} s, are left out, with parts shorter than "
+                f"{SHORTEST:g} s"
+            )
+        kept, more_lines = _not_negative(kept)
+        self._check_rate(kept, source, setting)
+        return kept, [*lines, *more_lines]
+
+    def _check_rate(self, kept: pd.DataFrame, source: str, setting: str) -> None:
         rate = gap_rate(kept)
         if rate is not None and not 1 / self.max_mismatch <= rate <= self.max_mismatch:
             raise DataError(
@@ -95,7 +116,6 @@ class Plausible(Settings):
                 f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; are speeds in km/h, mph "
                 "or ft/s, gaps in feet, or leader and follower exchanged?"
             )
-        return kept, lines
 
     def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Fault]:
         """What may be outside of a threshold; ``first`` marks the first row of each record."""
@@ -111,15 +131,35 @@ class Plausible(Settings):
             if name.endswith("speed_mps"):
                 words = "holds {:g} m/s (is it km/h or ft/s?)"
                 yield name, words, values, "max_speed", values > self.max_speed
+                yield name, "holds {:g} m/s", values, "min_speed", values < self.min_speed
                 rate = np.diff(values, prepend=values[0]) / np.where(step > 0, step, np.inf)
                 rough = np.abs(rate) > self.max_acceleration
                 yield name, "changes by {:g} m/s²", rate, "max_acceleration", rough
             elif name == "gap_m":
                 yield name, "holds {:g} m", values, "max_gap", values > self.max_gap
+                yield name, "holds {:g} m", values, "min_gap", values < self.min_gap
             else:
                 short = (values != 0) & (values < self.min_length)
                 yield name, "holds {:g} m", values, "min_length", short
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
+
+
+def usual_step(table: pd.DataFrame) -> float:
+    """Return the median time between samples of a record [s]; 0 if none has two."""
+    step = table["time_s"].diff()[table["episode"].diff() == 0].median()
+    return float(step) if step == step else 0.0
+
+
+def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Speeds a little below 0, which are noise, as 0; and a line if there are any."""
+    names = [str(name) for name in table.columns if str(name).endswith("speed_mps")]
+    below = {name: table[name] < 0.0 for name in names}
+    count = sum(int(mask.sum()) for mask in below.values())
+    if not count:
+        return table, []
+    least = min(float(table[name].min()) for name in names)
+    table = table.assign(**{name: table[name].clip(lower=0.0) for name in names})
+    return table, [f"{count:,} speeds below 0, the least {least:.3g} m/s, count as 0"]
 
 
 def pair_place(episodes: pd.DataFrame) -> Callable[[int, str], str]:

@@ -211,7 +211,7 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
 
     Args:
         episodes: the SI table of episodes (see :mod:`lcc_rl.data.episodes`).
-        time_step: step of the scenario [s].
+        time_step: step of the table [s].
 
     Raises:
         DataError: if the table is sampled at another step, or holds no episode.
@@ -222,7 +222,7 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
         if len(time) > 1 and not np.allclose(np.diff(time), time_step, atol=0.1 * time_step):
             raise DataError(
                 f"episode {number}: samples are {np.median(np.diff(time)):g} s apart (or not "
-                f"evenly spaced), the scenario's time_step is {time_step:g} s"
+                f"evenly spaced); expected {time_step:g} s"
             )
         recording, leader = str(episode["recording"].iloc[0]), int(episode["leader_id"].iloc[0])
         records.append(torch.tensor(episode["leader_speed_mps"].to_numpy(np.float32)))

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from glob import glob, has_magic
 from pathlib import Path
 from typing import Literal
 
 import pandas as pd
 
+import lcc_rl.assets
 from lcc_rl.data.car_following import Criteria, extract
-from lcc_rl.data.episodes import DERIVED, derive_positions, load_episodes
+from lcc_rl.data.episodes import DERIVED, FIELDS, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
-from lcc_rl.data.tables import TEXT_TAKES, unpacked_size
+from lcc_rl.data.tables import TEXT_TAKES, check_map, unpacked_size
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import Settings
+
+SHIPPED = Path(lcc_rl.assets.__file__).parent / "recorded"
 
 
 @dataclass(frozen=True)
@@ -66,23 +69,31 @@ class NgsimSource(Settings):
 
 
 class EpisodesSource(Settings):
-    """Episodes from a parquet or CSV file, see :func:`lcc_rl.data.episodes.read_episodes`."""
+    """Episodes from tables of pairs: a row per pair and moment, at any rate and with holes."""
 
-    path: str
+    path: str | Sequence[str]  # a file, several, or a pattern; each is a recording
+    # What the table calls ``episode``, ``recording``, ``follower_id``, ``leader_id``, ``time``,
+    # ``follower_speed``, ``leader_speed``, ``gap`` (bumper to bumper), ``follower_position`` and
+    # ``leader_position`` (front bumpers) and ``leader_length``; others as the package writes them.
+    columns: Mapping[str, str | None] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
     plausible: Plausible | None = None  # None for the defaults
+
+    def settled(self) -> None:
+        check_map(FIELDS, self.columns, self.units, "data")
 
     def load(self) -> LoadedEpisodes:
         """Read and validate.
 
         Raises:
-            DataError: if the file is missing or not a valid episode table, or more episodes are
-                implausible than ``plausible`` allows.
+            DataError: if a file is missing or not a valid table, or more samples are implausible
+                than ``plausible`` allows.
         """
-        path = Path(self.path).expanduser()
-        episodes, notes = load_episodes(path)
-        count = episodes["episode"].nunique()
-        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {path}", *notes]
-        return _plausible(self.plausible, episodes, str(path), lines)
+        files = find_files(self.path)
+        episodes, notes = load_episodes(files, self.columns, self.units)
+        count, source = episodes["episode"].nunique(), ", ".join(files)
+        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
+        return _plausible(self.plausible, episodes, source, lines)
 
 
 def episodes_of(
@@ -127,8 +138,15 @@ def _plausible(
     return LoadedEpisodes(kept, [*lines, *said])
 
 
+def shipped() -> list[str]:
+    """Return the names of the recordings in the package: platoons and drives."""
+    return sorted(path.stem for path in SHIPPED.glob("*.parquet"))
+
+
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
+
+    The name of a shipped recording is that file.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
@@ -136,7 +154,7 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(Path(entry).expanduser())
-        found = [name]
+        found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
         if has_magic(name) and not Path(name).exists():
             found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())
             if not found:

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 import lcc_rl.assets
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import find_files
 from lcc_rl.data.tables import Column, TableFile, stem
+from lcc_rl.data.trajectories import HOLE, divided
 from lcc_rl.errors import DataError
 
 CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
@@ -21,12 +23,11 @@ TIME, SPEED = "time_s", "speed_mps"
 FIELDS = (
     Column("drive", "text", required=False),
     Column("time", "time"),
-    Column("speed", "speed", least=0.0),
+    Column("speed", "speed"),
 )
 # Columns of the first car of a native OpenACC file; blank cells divide a record.
-NATIVE = (Column("time", "time"), Column("speed", "speed", least=0.0, blank=True))
+NATIVE = (Column("time", "time"), Column("speed", "speed", blank=True))
 COLUMNS: dict[str, str | None] = {"drive": "drive", "time": TIME, "speed": SPEED}
-UNEVEN = 0.1  # of the median step, by which a step may differ from it
 
 
 def shipped_cycles() -> list[str]:
@@ -59,7 +60,7 @@ def read_speed_record(
         raise DataError(
             f"{path}: no such file, and no shipped cycle ({', '.join(shipped_cycles())})"
         )
-    samples, _ = _read(TableFile(file), {**COLUMNS, "drive": None}, plausible, {}, even=False)
+    samples, _ = _read(TableFile(file), {**COLUMNS, "drive": None}, plausible, {}, divide=False)
     return samples[TIME].to_numpy(), samples[SPEED].to_numpy()
 
 
@@ -78,12 +79,12 @@ def read_drives(
 
     Returns:
         A profile for each record, in the order of their names, and lines on what was read. Its
-        recording is the drive; a native OpenACC file has several profiles if its first car has
-        blank cells.
+        recording is the drive, which has several profiles where blank cells, holes or implausible
+        samples divide it.
 
     Raises:
-        DataError: naming file, row and column, if a value is missing, no number or negative, a
-            time is there twice, the steps of a record are uneven, or too much is implausible.
+        DataError: naming file, row and column, if a value is missing or no number, a time is
+            there twice, or too much is implausible.
     """
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
@@ -105,7 +106,7 @@ def _read(
     columns: Mapping[str, str | None],
     plausible: Plausible | None,
     units: Mapping[str, str],
-    even: bool = True,
+    divide: bool = True,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Name, drive, time and speed of the plausible samples of one file, and the report."""
     fields: Sequence[Column] = FIELDS
@@ -117,9 +118,6 @@ def _read(
     samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"]})
     samples["drive"] = samples["name"] = read.get("drive", stem(table.path))
     samples["row"] = samples.index
-    said: list[str] = []
-    if samples[SPEED].isna().any():
-        samples, said = _without_blanks(samples, table)
     if samples.empty:
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
     samples = samples.sort_values("name", kind="stable", ignore_index=True)
@@ -129,37 +127,46 @@ def _read(
     for wrong, words in (
         (step <= 0, "does not follow the time before it in its record"),
         (usual.isna(), "is the only sample of its record; expected at least 2"),
-        (even & ((step - usual).abs() > UNEVEN * usual), "is not evenly spaced in its record"),
     ):
         if wrong.any():
             raise table.fault(int(samples["row"][wrong].min()), "time", words)
+    samples, said = _divided(samples, (divide & (step > HOLE * usual)).to_numpy(), table)
 
     def place(number: int, column: str) -> str:
         own = {TIME: table.names["time"], SPEED: table.names["speed"]}[column]
         sample = samples.iloc[number]
-        return f"data row {sample['row'] + 1} ({sample['name']}), column {own!r}"
+        return f"data row {sample['row'] + 1} ({sample['drive']}), column {own!r}"
 
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible"
     )
+    parts = kept.groupby("drive")["episode"].transform("nunique") > 1
+    start = kept.groupby("episode")[TIME].transform("min").map("+{:g}s".format)
+    kept["name"] = kept["drive"].where(~parts, kept["drive"] + start)
     line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
     return kept, [line, *table.notes, *said, *lines]
 
 
-def _without_blanks(samples: pd.DataFrame, table: TableFile) -> tuple[pd.DataFrame, list[str]]:
-    """Leave out blank cells, which divide the record: its parts are named after their start."""
-    part = samples[SPEED].isna().cumsum()
-    rows = samples.dropna(subset=SPEED)
-    rows = rows[part[rows.index].duplicated(keep=False)]
-    speed = table.names["speed"]
-    if rows.empty:
-        raise DataError(f"{table.path}: column {speed!r} has no two samples in a row")
-    starts = rows.groupby(part)[TIME].transform("min").map("+{:g}s".format)
-    kept = rows.assign(name=rows["name"] + starts)
+def _divided(
+    samples: pd.DataFrame, hole: NDArray[np.bool_], table: TableFile
+) -> tuple[pd.DataFrame, list[str]]:
+    """Divide records at holes and at blank cells, which are left out; with a line that says so."""
+    blank = samples[SPEED].isna().to_numpy()
+    begins = np.append(True, (samples["episode"].diff() != 0).to_numpy()[1:]) | hole | blank
+    part = np.cumsum(begins)
+    alone = ~blank & (np.bincount(part, ~blank)[part] < 2)
+    kept, speed = divided(samples, blank | alone, hole, 0.0), table.names["speed"]
+    if kept.empty:
+        raise DataError(
+            f"{table.path}: column {table.names['speed']!r} has no two samples in a row"
+        )
+    if kept is samples:
+        return samples, []
     line = (
-        f"left out {len(samples) - len(kept):,} rows with a blank {speed} or alone between such, "
-        f"which divide the record into {kept['name'].nunique()} parts"
+        f"left out {len(samples) - len(kept):,} rows with a blank {speed} or alone; "
+        f"with {int(hole.sum()):,} holes they divide the {samples['episode'].nunique():,} records "
+        f"into {kept['episode'].nunique():,}"
     )
     return kept, [line]

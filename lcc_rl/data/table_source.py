@@ -12,25 +12,24 @@ from pydantic import Field
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
-from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, check_map, stem
-from lcc_rl.data.trajectories import FRAME, ReadReport, Trajectories, find_leaders, stretches
+from lcc_rl.data.tables import Column, TableFile, check_map, stem, whole_numbers
+from lcc_rl.data.trajectories import FRAME, HOLE, ReadReport, Trajectories, find_leaders, stretches
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive, Settings
 
 FIELDS = (
     Column("vehicle", "text"),
     Column("time", "time"),
-    Column("speed", "speed", least=0.0),
+    Column("speed", "speed"),
     Column("position", "length", required=False),
     Column("lane", "text", required=False),
     Column("leader", "text", blank=True, required=False),
-    Column("gap", "length", least=0.0, blank=True, required=False),
+    Column("gap", "length", blank=True, required=False),
     Column("length", "length", least=0.0, blank=True, required=False),
     Column("recording", "text", required=False),
 )
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
 UNEVEN = 0.1  # of a step, by which a time may be off the common grid
-HOLE = 1.5  # of the usual step; a longer one is a missing sample
 LONGEST = 10.0  # s; samples farther apart tell of no following
 LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
@@ -124,7 +123,7 @@ def _vehicles(
 ) -> dict[str, NDArray[np.int64]]:
     """Vehicles and leaders as positive whole numbers; 0 for no leader."""
     ahead = np.full(len(vehicle), "") if leader is None else leader
-    numbers, leaders = _whole(vehicle), _whole(np.where(ahead == "", "0", ahead))
+    numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
     if numbers is None or numbers.min() <= 0 or leaders is None:
         names, codes = np.unique(vehicle, return_inverse=True)
         report.notes.append(f"vehicles are numbered from 1 in the order of {len(names):,} names")
@@ -136,17 +135,6 @@ def _vehicles(
         return {"vehicle": numbers}
     leaders = np.where((leaders < 0) | (leaders == numbers), 0, leaders).astype(np.int64)
     return {"vehicle": numbers, "leader": leaders}
-
-
-def _whole(texts: NDArray) -> NDArray[np.int64] | None:
-    """The numbers that texts are, if all are whole numbers."""
-    try:
-        values = texts.astype(np.float64)
-    except ValueError:
-        return None
-    if not (np.abs(values) < LARGEST_ID).all() or (values != np.rint(values)).any():
-        return None
-    return values.astype(np.int64)
 
 
 def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) -> Trajectories:
@@ -273,7 +261,6 @@ def _interpolated(
     weight[weight < 1e-5] = 0.0
     found, following = (rows.iloc[index].reset_index(drop=True) for index in (first, after))
     found[smooth] = np.concatenate(values)
-    found["speed"] = found["speed"].clip(lower=0.0)
     if "leader" in rows:
         found["leader"] = found.leader.where((weight == 0) | (following.leader == found.leader), 0)
     if "gap" in rows:

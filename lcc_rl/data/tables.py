@@ -298,6 +298,17 @@ def numbers_of(cells: Cells, fault: Fault) -> NDArray[np.float64]:
     return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)
 
 
+def whole_numbers(texts: NDArray) -> NDArray[np.int64] | None:
+    """Return the numbers that texts are, if all are whole numbers."""
+    try:
+        values = texts.astype(np.float64)
+    except ValueError:
+        return None
+    if not (np.abs(values) < LARGEST_ID).all() or (values != np.rint(values)).any():
+        return None
+    return values.astype(np.int64)
+
+
 def parse_text(
     rows: bytes, width: int, separator: str, places: Sequence[str], source: str, first: int = 0
 ) -> pa.Table:

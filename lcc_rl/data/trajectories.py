@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
+HOLE = 1.5  # of the usual step; a longer one is a missing sample
 
 
 @dataclass
@@ -137,6 +138,41 @@ def find_leaders(
 def starts_of(values: NDArray) -> NDArray[np.intp]:
     """First row of each stretch of equal values."""
     return np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
+
+
+def divided(
+    table: pd.DataFrame, wrong: NDArray[np.bool_], begins: NDArray[np.bool_], shortest: float
+) -> pd.DataFrame:
+    """Leave rows out of records, which are divided there.
+
+    Args:
+        table: rows of a record (whole numbers in the column ``episode``) lie together, in order of
+            ``time_s``.
+        wrong: the rows to leave out.
+        begins: rows before which a record is divided, too.
+        shortest: parts of a divided record that are shorter than this go as well [s].
+
+    Returns:
+        The other rows. The first part of a record keeps its number.
+    """
+    episode, time = table["episode"].to_numpy(), table["time_s"].to_numpy(np.float64)
+    first = np.zeros(len(table), dtype=bool)
+    first[starts_of(episode)] = True
+    touched = np.isin(episode, episode[wrong | (begins & ~first)])
+    if not touched.any():
+        return table
+    rows = np.flatnonzero(~wrong)
+    if not len(rows):
+        return table.iloc[:0]
+    starts, lengths = stretches(np.cumsum(first | begins | wrong)[rows])
+    duration = time[rows[starts + lengths - 1]] - time[rows[starts]]
+    keep = ~touched[rows[starts]] | (duration > shortest - 1e-6)
+    numbers = episode[rows[starts]][keep].astype(np.int64)
+    more = pd.Series(numbers).duplicated().to_numpy()
+    numbers[more] = episode.max() + 1 + np.arange(more.sum())
+    kept = table.iloc[rows[np.repeat(keep, lengths)]].reset_index(drop=True)
+    kept["episode"] = np.repeat(numbers, lengths[keep]).astype(episode.dtype)
+    return kept
 
 
 def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

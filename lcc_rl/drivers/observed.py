@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -21,8 +22,9 @@ NUMERIC = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
 class Selection(Settings):
     """Criteria of the episodes used for calibration."""
 
-    # Episodes whose gap ever falls below this are dropped, also beyond the part used [m].
-    min_gap_m: NonNegative = 1.0
+    min_gap_m: NonNegative = 1.0  # smallest plausible gap [m]
+    # Where a gap is smaller: cut there and use the longest part, or drop the whole episode.
+    low_gaps: Literal["cut", "drop"] = "cut"
     max_duration_s: NonNegative | None = 60.0  # the first part of each is used; None: all [s]
     min_duration_s: NonNegative = 10.0  # shorter episodes are dropped [s]
     # Slower episodes are dropped: the relative error divides by speed [m/s].
@@ -144,10 +146,11 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
     selection = selection or Selection()
     frame = _canonical(episodes)
     step = _time_step(frame)
+    frame, report = _above(frame, selection)
     frame["least_gap"] = frame.groupby("episode", sort=False)["gap_m"].transform("min")
     frame = _truncate(frame, selection.max_duration_s)
     table = _summary(frame, step)
-    table, report = _select(table, selection)
+    table, lines = _select(table, selection)
     table = table.sort_values("samples", ascending=False, kind="stable")
     length, count = int(table["samples"].iloc[0]), len(table)
     padded = np.zeros((3, length, count))
@@ -162,7 +165,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
         samples=table["samples"].to_numpy(np.int64),
         identity=table[["episode", *IDENTITY]].reset_index(drop=True),
         time_step=step,
-        report=report,
+        report=[*report, *lines],
     )
 
 
@@ -192,6 +195,24 @@ def _time_step(frame: pd.DataFrame) -> float:
         raise DataError(f"episode table: time_s does not advance (median step {step} s)")
     # Time stamps carry rounding noise that must not enter the simulation.
     return round(step, 6)
+
+
+def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, list[str]]:
+    """The longest part of each episode without a gap that is too small, and a line on them."""
+    low = frame["gap_m"].to_numpy() < selection.min_gap_m
+    if selection.low_gaps == "drop" or not low.any() or low.all():
+        return frame, []
+    episode, time = frame["episode"], frame["time_s"]
+    part = (low | (episode != episode.shift())).cumsum()[~low]
+    length = time.groupby(part).transform("max") - time.groupby(part).transform("min")
+    best = length.groupby(episode).transform("max")
+    chosen = part.where(length == best).groupby(episode).transform("min")
+    kept = frame[(part == chosen).reindex(frame.index, fill_value=False)]
+    count = episode[low].nunique()
+    line = f"{count} of {episode.nunique()} episodes cut where the gap is below "
+    return kept.reset_index(drop=True), [
+        f"{line}{selection.min_gap_m:g} m; their longest part is used"
+    ]
 
 
 def _truncate(frame: pd.DataFrame, duration: float | None) -> pd.DataFrame:

@@ -137,9 +137,7 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
     loaded = _load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
     split = build(cfg.split, "split", CALLED)
     # Every window is kept: the low-variation filter is for platoons, whose errors are relative.
-    return TrajectoryLeaders(
-        source=loaded, split=split, source_step=cfg.scenario.time_step, least_variation=0.0
-    )
+    return TrajectoryLeaders(source=loaded, split=split, least_variation=0.0)
 
 
 def described(population: Population) -> str:

@@ -114,7 +114,6 @@ def population() -> list[list[str]]:
         {"frames": 9},
         {"frames": 60},
         {"v_Class": 3},
-        {"v_Vel": -0.5},
         {"Space_Headway": 16},
         {"Space_Headway": 400},
     ]
@@ -131,17 +130,25 @@ def population() -> list[list[str]]:
 def test_each_criterion_removes_its_candidates_in_order(tmp_path: Path) -> None:
     criteria = Criteria(min_duration_s=1.0, max_duration_s=5.0, min_gap_m=1.0, max_gap_m=100.0)
     episodes, report = extracted(tmp_path, population(), criteria)
-    assert report.candidates == 7
+    assert report.candidates == 4
     assert report.removed == {
         "min_duration_s: 1": 1,
         "max_duration_s: 5": 1,
         "passenger_cars_only": 1,
-        "speeds of at least 0": 1,
-        "min_gap_m: 1": 1,
-        "max_gap_m: 100": 1,
     }
+    assert report.left_out["have a gap beyond min_gap_m=1"] == 30
+    assert report.left_out["have a gap beyond max_gap_m=100"] == 30
     assert episodes["follower_id"].unique().tolist() == [11]
-    assert "removed 1: speeds of at least 0" in str(report)
+    assert "left out 30 samples that have a gap beyond min_gap_m=1" in str(report)
+
+
+def test_a_gap_beyond_the_limits_cuts(tmp_path: Path) -> None:
+    rows = pair(range(60))
+    for row in rows[20:23]:
+        row[16] = "1000"
+    episodes, report = extracted(tmp_path, rows, Criteria(min_duration_s=1.0))
+    assert episodes.groupby("episode").size().tolist() == [20, 37]
+    assert report.left_out["have a gap beyond max_gap_m=120"] == 3
 
 
 @pytest.mark.parametrize(

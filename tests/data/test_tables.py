@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ import pandas as pd
 import pytest
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed
 
+from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.episodes import SCHEMA, read_episodes, validate_episodes, write_episodes
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
 from lcc_rl.data.table_source import TableSource
+from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
@@ -173,6 +176,46 @@ def test_a_written_table_reads_back_whatever_its_order_and_names(tmp_path) -> No
     assert not (tmp_path / "new.parquet").exists()
 
 
+def test_pairs_of_any_columns_units_and_rate_with_holes(tmp_path) -> None:
+    whole = TableSource(path=written(tmp_path, long_table(rows=800)), columns=BY_GAP).load()
+    found = whole.episodes
+    mine = pd.DataFrame(
+        {
+            "run": [f"run {name}" for name in found["episode"]],
+            "clock": 1000.0 * found["time_s"],
+            "lead": 3.6 * found["leader_speed_mps"],
+            "own": 3.6 * found["follower_speed_mps"],
+            "space": found["gap_m"] / FOOT,
+        }
+    )
+    mine = mine.drop(index=[300, 301, 302]).iloc[::2]  # 5 Hz, with a hole in the first run
+    path = written(tmp_path, mine.sort_values("clock", kind="stable"), "mine.csv")
+    columns = {"episode": "run", "time": "clock", "leader_speed": "lead", "gap": "space"}
+    units = {"time": "ms", "leader_speed": "km/h", "follower_speed": "km/h", "gap": "ft"}
+    source = EpisodesSource(path=path, columns={**columns, "follower_speed": "own"}, units=units)
+    loaded = source.load()
+    validate_episodes(loaded.episodes, "pairs")
+    assert loaded.episodes.groupby("episode").size().tolist() == [299, 799, 497]
+    pair = loaded.episodes.groupby("episode")[["follower_id", "leader_id"]].first()
+    assert pair["leader_id"].tolist() == (pair["follower_id"] - 1).tolist()
+    for number, follower in ((0, 2), (1, 3), (2, 2)):
+        part = loaded.episodes[loaded.episodes["episode"] == number]
+        own, ahead = (speed(part["time_s"].to_numpy(), car) for car in (follower, follower - 1))
+        np.testing.assert_allclose(part["follower_speed_mps"], own, atol=0.01)
+        np.testing.assert_allclose(part["leader_speed_mps"], ahead, atol=0.01)
+    report = "\n".join(loaded.report)
+    assert "1 holes divide its 2 episodes into 3" in report
+    assert "samples 0.2 s apart were interpolated to 0.1 s" in report
+
+
+def test_files_of_pairs_are_recordings_of_their_own(tmp_path) -> None:
+    for name in ("a", "b"):
+        pairs().drop(columns="recording").to_csv(tmp_path / f"{name}.csv", index=False)
+    loaded = EpisodesSource(path=str(tmp_path / "*.csv")).load().episodes
+    assert loaded.groupby("recording")["episode"].nunique().to_dict() == {"a": 20, "b": 20}
+    assert loaded["episode"].nunique() == 40
+
+
 # -- native OpenACC files --------------------------------------------------------------------------
 
 
@@ -188,6 +231,28 @@ def test_every_car_follows_the_car_before_it(openacc) -> None:
     loaded.episodes["time_s"] -= 430
     truth(loaded)
     assert f"{openacc}: 3 cars: SMART, MAZDA, TESLA" in loaded.report
+
+
+def test_columns_of_missing_cars_are_absent_and_followers_are_chosen(tmp_path) -> None:
+    text = openacc_text(cars=5)
+    head, table = text.split("Distance_setting,S\n")
+    frame = pd.read_csv(StringIO(table)).drop(columns=["Speed3", "IVS2", "IVS3"])
+    frame["Driver2"], frame["Driver5"] = "ACC", ["Human"] * 300 + ["ACC"] * 100
+    path = tmp_path / "platoon.csv"
+    path.write_text(f"{head}Distance_setting,S\n{frame.to_csv(index=False)}")
+    assert OpenAccSource(path=str(path)).load().episodes["follower_id"].unique().tolist() == [2, 5]
+    found = OpenAccSource(path=str(path), driver="human").load()
+    assert found.episodes["follower_id"].tolist() == [5] * 300
+    assert f"{path}: 300 samples of followers driven by human, 500 of others" in found.report
+
+
+@pytest.mark.parametrize("name", ["casale", "zalazone_dynamic_part26"])
+def test_native_files_of_other_campaigns(shared_data, name: str) -> None:
+    path = shared_data / f"new_openacc_native_{name}.csv.gz"
+    criteria = Criteria(max_gap_m=200.0, passenger_cars_only=False)
+    loaded = OpenAccSource(path=str(path), criteria=criteria).load()
+    validate_episodes(loaded.episodes, name)
+    assert len(loaded.episodes) > 1900
 
 
 def test_a_real_openacc_file(shared_data) -> None:

@@ -204,11 +204,15 @@ def test_unfit_episodes_are_dropped_and_counted(make_episodes):
     episodes.loc[at[2][50], "follower_speed_mps"] = np.nan
     episodes.loc[at[3], ["follower_speed_mps", "leader_speed_mps"]] = 0.0
     episodes = episodes.drop(at[4][50:60])
-    result = quick(episodes, selection=Selection(max_duration_s=15.0))
+    result = quick(episodes, selection=Selection(max_duration_s=15.0, low_gaps="drop"))
     assert result.drivers["episode"].tolist() == [0]
     assert result.drivers["samples"].tolist() == [151]
     counted = [line for line in result.report if line.startswith("1 of 6 episodes dropped: ")]
     assert len(counted) == 5
+    cut = observe(episodes, Selection(max_duration_s=15.0))
+    assert dict(zip(cut.identity["episode"], cut.samples, strict=True)) == {0: 151, 1: 150}
+    assert cut.gap[1] == episodes["gap_m"][at[1][51]]
+    assert "1 of 6 episodes cut where the gap is below 1 m" in cut.report[0]
 
 
 def test_episodes_are_cut_where_the_holdout_begins(uneven_lengths):
@@ -275,7 +279,8 @@ def test_bad_settings_are_named(settings, key):
 
 
 def test_real_drivers_reach_the_reference_errors(shared_data):
-    observed = observe(pd.read_parquet(shared_data / "i80_pairs.parquet"))
+    pairs = pd.read_parquet(shared_data / "i80_pairs.parquet")
+    observed = observe(pairs, Selection(low_gaps="drop"))
     assert observed.count == 249
     start = time.process_time()
     local = fit(observed).drivers
@@ -287,7 +292,8 @@ def test_real_drivers_reach_the_reference_errors(shared_data):
 
 @pytest.mark.slow
 def test_real_drivers_by_every_model(shared_data):
-    observed = observe(pd.read_parquet(shared_data / "i80_pairs.parquet"))
+    pairs = pd.read_parquet(shared_data / "i80_pairs.parquet")
+    observed = observe(pairs, Selection(low_gaps="drop"))
     means = {}
     for model in LAWS:
         drivers = fit(observed, "global", model=model, objective="gap_rmse", holdout=0.3).drivers
