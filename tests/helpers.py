@@ -57,12 +57,16 @@ def wavy_profiles(count: int = 4, samples: int = 400) -> Profiles:
 
 
 def followed_profiles() -> Profiles:
-    """The same leaders with recorded followers, who drive a second behind, 10 to 20 m away."""
+    """The same leaders with recorded followers, who drive a second behind, some 20 m away."""
     leaders = wavy_profiles()
     each = [leaders.record(number) for number in range(len(leaders))]
-    behind = [
-        torch.stack([torch.cat([x[:1].expand(10), x[:-10]]), 15.0 + 0.4 * x], -1) for x in each
-    ]
+    behind = []
+    for speed in each:
+        own = torch.cat([speed[:1].expand(10), speed[:-10]])
+        relative = (speed - own).double()
+        way = torch.cumsum(0.05 * (relative[1:] + relative[:-1]), 0)
+        gap = 20.0 + torch.cat([way.new_zeros(1), way])
+        behind.append(torch.stack([own, gap.float()], -1))
     return from_records(each, leaders.names, leaders.recordings, 0.1, behind)
 
 

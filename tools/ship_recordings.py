@@ -35,10 +35,12 @@ def platoons(table: pd.DataFrame) -> pd.DataFrame:
     Returns:
         A table of pairs; a recording is two minutes of a file.
     """
-    parts = []
+    parts: list[pd.DataFrame] = []
     for (campaign, file), one in table.groupby(["campaign", "file"], observed=True):
         origin = one["time_s"].min()
-        cars = {int(car): own.set_index(_frame(own, origin)) for car, own in one.groupby("car")}
+        numbers = one["car"].unique().tolist()
+        cars = {car: one[one["car"] == car] for car in numbers}
+        cars = {car: own.set_index(_frame(own, origin)) for car, own in cars.items()}
         for car in cars.keys() & {number + 1 for number in cars}:
             own = cars[car].assign(leader=cars[car - 1]["speed_mps"])
             human = own["driver"].eq("Human") & own["gap_m"].between(*GAPS)
@@ -72,7 +74,8 @@ def drives(table: pd.DataFrame) -> pd.DataFrame:
         table: drive (driver_part), time_s and speed_mps, at 10 Hz.
 
     Returns:
-        The middle of each driver's longest trip, of those in which the car neither stands nor cruises there.
+        The middle of each driver's longest trip, of those in which the car neither stands nor
+        cruises there.
     """
     parts = []
     drivers = table["drive"].astype(str).str.extract(r"D(\d+)_")[0].astype(int)
@@ -96,7 +99,7 @@ def _frame(table: pd.DataFrame, origin: float) -> pd.Index:
 def _rounded(table: pd.DataFrame) -> pd.DataFrame:
     """Speeds and gaps to a centimetre, which the instruments do not resolve."""
     names = [name for name in table if str(name).endswith(("_mps", "_m"))]
-    return table.assign(**{name: table[name].astype(float).round(2) for name in names})
+    return table.assign(**{str(x): table[x].astype(float).round(2) for x in names})
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import torch
 from pydantic import Field
 
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Settings, values
@@ -61,6 +62,9 @@ class Agent(Settings, ABC):
     @abstractmethod
     def setup(self, scene: Scene) -> None:
         """Make ``policy`` and what else a training needs."""
+
+    def take(self, profiles: Profiles) -> None:
+        """Take what depends on the records to learn behind: nothing, unless overridden."""
 
     @abstractmethod
     def anneal(self, share: float) -> float:

@@ -9,14 +9,19 @@ falls towards zero.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
 
+log = logging.getLogger("lcc_rl")
+RECORDED = "recorded"
 LEAST = 1e-3  # a limit of zero is approached as if it were this share
 
 
@@ -24,7 +29,8 @@ class Limits:
     """The multipliers of all limits, such as those of the ALCC paper's problem (A5).
 
     Args:
-        largest: largest share of the time of each limit, by name.
+        largest: largest share of the time of each limit, by name; ``recorded`` for the share of
+            the drivers recorded behind the leaders, see :meth:`take`.
         rate: how much the logarithm of a multiplier changes at most per update.
         known: the names that there are.
 
@@ -33,22 +39,46 @@ class Limits:
     """
 
     def __init__(
-        self, largest: Mapping[str, float | None], rate: float, known: Mapping[str, object]
+        self, largest: Mapping[str, float | str | None], rate: float, known: Mapping[str, Any]
     ) -> None:
-        self.largest = {name: share for name, share in largest.items() if share is not None}
-        for name in self.largest:
+        given = {name: share for name, share in largest.items() if share is not None}
+        for name in given:
             if name not in known:
                 raise ConfigError(f"agent.limits.{name}: there is no agent.surrogates.{name}")
             if not hasattr(known[name], "missed"):
                 kind = type(known[name]).__name__
                 raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")
-            if not known[name].weight:  # type: ignore[attr-defined]
+            if not known[name].weight:
                 raise ConfigError(
                     f"agent.limits.{name}: agent.surrogates.{name}.weight is 0, which no price "
                     f"can change; raise it, or use agent.limits.{name}=null"
                 )
+        self.recorded = {name: known[name] for name, share in given.items() if share == RECORDED}
+        self.largest = {name: 0.0 if x == RECORDED else float(x) for name, x in given.items()}
         self.rate = rate
         self.logarithms = dict.fromkeys(self.largest, 0.0)
+
+    def take(self, profiles: Profiles) -> None:
+        """Set the limits that are ``recorded`` to the share that recorded drivers miss.
+
+        Args:
+            profiles: speeds of the leaders to learn behind, and of who was recorded there.
+
+        Raises:
+            ConfigError: if nobody was.
+        """
+        for name, term in self.recorded.items():
+            if profiles.followers is None:
+                raise ConfigError(
+                    f"agent.limits.{name}={RECORDED}: nobody was recorded behind these leaders; "
+                    f"give the share of the time as a number, such as agent.limits.{name}=0.01"
+                )
+            speed, gap = profiles.followers.split(1, -1)
+            relative = profiles.speeds.unsqueeze(-1) - speed
+            seen = {"self.speed": speed, "self.gap": gap, "self.relative_speed": relative}
+            share = float(term.missed(*(seen[key] for key in term.reads)).double().mean())
+            self.largest[name] = share
+            log.info("agent.limits.%s: %.4f of the time, as the recorded drivers", name, share)
 
     def price(self, name: str) -> float:
         """Return the multiplier of a limit; 1 for what is none."""

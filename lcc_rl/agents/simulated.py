@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.objective import Objective
 from lcc_rl.agents.rules import make_policy
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.pieces.base import as_key
@@ -28,9 +29,9 @@ class SimulatedAgent(Agent):
     # Nodes of reward terms that take the place of those of the same name in the objective; their
     # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
     surrogates: dict[str, Any] = field(default_factory=dict)
-    # Largest share of the time in which a surrogate's limit may be missed, by its name; its weight
-    # is then the price at the start, see lcc_rl.agents.limits.
-    limits: dict[str, Share | None] = field(default_factory=dict)
+    # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
+    # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
+    limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
     limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
     regularizers: dict[str, Any] = field(default_factory=dict)  # terms of the objective only
 
@@ -46,6 +47,10 @@ class SimulatedAgent(Agent):
             scene.max_acceleration,
         )
         self.policy = module.to(scene.device)
+
+    def take(self, profiles: Profiles) -> None:
+        """Take the limits that recorded drivers set."""
+        self.objective.limits.take(profiles)
 
 
 SimulatedT = TypeVar("SimulatedT", bound=Any)
@@ -71,8 +76,9 @@ class SimulatedLoop(TrainingLoop[SimulatedT]):
 
     def _limits_row(self, shares: Mapping[str, float]) -> dict[str, float]:
         """Return the columns of the limits: how often each was missed, and at which price."""
-        price = self.objective.limits.price
+        price, largest = self.objective.limits.price, self.objective.limits.largest
         return {
+            **{f"limit_{name}": largest[name] for name in shares},
             **{f"share_{name}": share for name, share in shares.items()},
             **{f"price_{name}": price(name) for name in shares},
         }

@@ -128,7 +128,9 @@ def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
 
 def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
     """Train an agent to the end, write its policy and leave the agent with it."""
-    trainer = make_trainer(cfg, agent, inputs.to_learn_from(), inputs.population, folder)
+    profiles = inputs.to_learn_from()
+    agent.take(profiles)
+    trainer = make_trainer(cfg, agent, profiles, inputs.population, folder)
     if resume:
         trainer.load()
     save_config(cfg, folder)

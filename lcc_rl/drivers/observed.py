@@ -203,16 +203,16 @@ def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, lis
     if selection.low_gaps == "drop" or not low.any() or low.all():
         return frame, []
     episode, time = frame["episode"], frame["time_s"]
-    part = (low | (episode != episode.shift())).cumsum()[~low]
+    begins = low | (episode != episode.shift()).to_numpy()
+    part = pd.Series(np.cumsum(begins), index=frame.index).mask(low)
     length = time.groupby(part).transform("max") - time.groupby(part).transform("min")
-    best = length.groupby(episode).transform("max")
-    chosen = part.where(length == best).groupby(episode).transform("min")
-    kept = frame[(part == chosen).reindex(frame.index, fill_value=False)]
-    count = episode[low].nunique()
-    line = f"{count} of {episode.nunique()} episodes cut where the gap is below "
-    return kept.reset_index(drop=True), [
-        f"{line}{selection.min_gap_m:g} m; their longest part is used"
-    ]
+    longest = part[length == length.groupby(episode).transform("max")].groupby(episode).min()
+    kept = frame[part == episode.map(longest)]
+    line = (
+        f"{episode[low].nunique()} of {episode.nunique()} episodes cut where the gap is below "
+        f"{selection.min_gap_m:g} m; their longest part is used"
+    )
+    return kept.reset_index(drop=True), [line]
 
 
 def _truncate(frame: pd.DataFrame, duration: float | None) -> pd.DataFrame:

@@ -9,6 +9,7 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
+from lcc_rl.agents.limits import RECORDED
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
@@ -55,6 +56,10 @@ HELD_TO = (
     f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
     "time; rows with more save by falling back."
 )
+AS_RECORDED = (
+    "The networks and the IDM tuned on these data may have long time gaps as often as the recorded "
+    "drivers of the training recordings; rows with more save by falling back."
+)
 # Files of figures, in the job's folder and without their ending, and their captions.
 RESULTS = {
     "evaluation/figures/overview": "A held-out episode, and the path energy of both cars",
@@ -73,9 +78,12 @@ def caption_of(trainings: Iterable[StudyConfig]) -> str:
         trainings: configuration of each.
     """
     found = [((cfg.agent or {}).get("limits") or {}).get(LIMIT) for cfg in trainings]
-    limits = {limit for limit in found if limit is not None}
-    held = ", ".join(f"{limit:.2g}" for limit in sorted(limits))
-    return CAPTION if not limits else f"{CAPTION} {HELD_TO.format(limit=held)}"
+    limits = sorted({f"{limit:.2g}" if limit != RECORDED else limit for limit in found if limit})
+    if not limits:
+        return CAPTION
+    if limits == [RECORDED]:
+        return f"{CAPTION} {AS_RECORDED}"
+    return f"{CAPTION} {HELD_TO.format(limit=', '.join(limits))}"
 
 
 def headline(found: pd.DataFrame) -> pd.DataFrame:

@@ -41,10 +41,10 @@ def training_figure(training: pd.DataFrame) -> Figure:
         for line in axis.lines:
             line.set_label("")
         what = name.removeprefix(SHARE)
-        bound = training.get(f"agent.limits.{what}")
+        bound = training.get(f"limit_{what}")
         if bound is not None and bound.nunique() == 1:  # all runs have the same limit
             percent = 100.0 * float(bound.iloc[0])
-            axis.axhline(percent, color=INK, lw=0.8, ls="--", label=f"limit {percent:g} %")
+            axis.axhline(percent, color=INK, lw=0.8, ls="--", label=f"limit {percent:.3g} %")
             axis.set_ylim(0.0, max(4.0 * percent, 1e-3))  # the first batches would set the scale
             legend_above(axis)
         style(axis, "training episodes", f"{LIMITS.get(what, what)} [% of the time]")

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import followed_profiles, wavy_profiles
 from test_analytic import make
 
 from lcc_rl.agents.limits import Limits
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
 
@@ -25,6 +27,21 @@ def test_a_price_rises_until_its_limit_is_kept() -> None:
     # Kept by something else: its price falls.
     assert limits.price("safety") == pytest.approx(2.718281828**-0.4)
     assert limits.price("cav_energy") == 1.0
+
+
+def test_a_limit_is_that_of_the_recorded_drivers() -> None:
+    known = {"safety": SmoothSafety(), "efficiency": SmoothEfficiency(limit=2.0)}
+    limits = Limits({"efficiency": "recorded", "safety": "recorded"}, 0.1, known)
+    profiles = followed_profiles()
+    limits.take(profiles)
+    speed, gap = profiles.followers.T
+    far = (gap > 2.0 * speed) & (speed > 1.0)
+    assert limits.largest["efficiency"] == pytest.approx(float(far.double().mean()))
+    assert 0.0 < limits.largest["efficiency"] < 1.0
+    near = gap < 4.0 * (speed - profiles.speeds)
+    assert limits.largest["safety"] == pytest.approx(float(near.double().mean()))
+    with pytest.raises(ConfigError, match=r"agent\.limits\.efficiency=recorded: nobody was rec"):
+        limits.take(wavy_profiles())
 
 
 def test_a_price_is_resumed() -> None:

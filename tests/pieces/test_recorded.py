@@ -11,7 +11,7 @@ from helpers import POPULATION, compose, composed, followed_profiles, wavy_profi
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.config import load
 from lcc_rl.data.episodes import validate_episodes
-from lcc_rl.data.profiles import at_step, join, leader_profiles
+from lcc_rl.data.profiles import at_step, from_records, join, leader_profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError
@@ -29,12 +29,31 @@ def drive(*overrides: str):
 
 
 def test_every_recorded_speed_is_reached() -> None:
-    data, profiles = drive()
+    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}")
     for episode in range(4):
         own = profiles.follower(int(data["leader", "profile"][episode, 0]))
         torch.testing.assert_close(
             data["next", "vehicles", "speed"][episode, 1:, 0, 0], own[2:21, 0], rtol=0, atol=1e-5
         )
+
+
+def test_a_speedometer_that_errs_leads_nobody_away() -> None:
+    profiles = followed_profiles()
+    fast = [profiles.follower(number) + torch.tensor([0.2, 0.0]) for number in range(len(profiles))]
+    each = [profiles.record(number) for number in range(len(profiles))]
+    biased = from_records(each, profiles.names, profiles.recordings, 0.1, fast)
+    cfg = compose(
+        "idm",
+        "controller@scenario.controllers.automated=recorded",
+        "scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}",
+    )
+    cfg.scenario.pieces["leader"]["start"] = "first"
+    cfg.scenario.horizon = 250
+    data = build_env(cfg, biased, POPULATION, 4, 0, nominal=True).rollout(250)
+    for episode in range(4):
+        recorded = biased.follower(int(data["leader", "profile"][episode, 0]))[:250, 1]
+        off = data["vehicles", "gap"][episode, :, 0, 0] - recorded
+        assert -2.0 < off.min() < -1.5  # 0.2 m/s times 10 s, instead of 5 m
 
 
 def test_vehicles_start_as_recorded() -> None:
