@@ -28,7 +28,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
             their settings (:func:`lcc_rl.results.load`).
     """
     limits = [name for name in map(str, training) if name.startswith(SHARE)]
-    limits = [name for name in limits if training[name].notna().any()]
+    limits = [name for name in limits if training[name].fillna(0.0).any()]
     if not limits:
         return learning_curve(training)
     figure = new_figure(9.0, 3.8)
