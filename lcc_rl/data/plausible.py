@@ -17,6 +17,7 @@ from lcc_rl.settings import NonNegative, Number, Positive, Settings
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
 SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
+HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
 LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
@@ -44,6 +45,9 @@ class Plausible(Settings):
     max_step: Positive = 10.0  # time between consecutive samples [s]
     max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1  # of the samples
     max_mismatch: Annotated[float, Field(ge=1.0, le=LARGEST)] = 1.5
+    # Share of the time with a change of speed above 4 m/s in a second; of recorded traffic it is
+    # 0.0001 or less, of the same speeds in km/h about 0.06.
+    max_hard: Annotated[float, Field(ge=0.0, le=1.0)] = 0.005
 
     def select(
         self,
@@ -105,10 +109,17 @@ class Plausible(Settings):
                 f"{SHORTEST:g} s"
             )
         kept, more_lines = _not_negative(kept)
-        self._check_rate(kept, source, setting)
+        self._check_units(kept, source, setting)
         return kept, [*lines, *more_lines]
 
-    def _check_rate(self, kept: pd.DataFrame, source: str, setting: str) -> None:
+    def _check_units(self, kept: pd.DataFrame, source: str, setting: str) -> None:
+        hard = hard_share(kept)
+        if hard > self.max_hard:
+            raise DataError(
+                f"{source}: speeds change by more than {HARD:g} m/s within a second for "
+                f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; are they "
+                "in km/h, mph or ft/s, or do they need smoothing?"
+            )
         rate = gap_rate(kept)
         if rate is not None and not 1 / self.max_mismatch <= rate <= self.max_mismatch:
             raise DataError(
@@ -142,6 +153,27 @@ class Plausible(Settings):
                 short = (values != 0) & (values < self.min_length)
                 yield name, "holds {:g} m", values, "min_length", short
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
+
+
+def hard_share(table: pd.DataFrame) -> float:
+    """Return the largest share of samples whose speed changes by more than 4 m/s in a second.
+
+    Args:
+        table: see :meth:`Plausible.select`; of the columns that end in ``speed_mps`` the worst
+            counts.
+
+    Returns:
+        The share; 0 where there are too few samples to tell.
+    """
+    step = usual_step(table)
+    reach = max(1, round(1 / step)) if step > 0 else 1
+    same = table["episode"].diff(reach) == 0
+    if same.sum() < LEAST_SAMPLES:
+        return 0.0
+    names = [str(name) for name in table.columns if str(name).endswith("speed_mps")]
+    time = table["time_s"].diff(reach)[same]
+    shares = [(table[x].diff(reach)[same].abs() > HARD * time).mean() for x in names]
+    return float(max(shares, default=0.0))
 
 
 def usual_step(table: pd.DataFrame) -> float:

@@ -12,7 +12,7 @@ from table_text import pairs
 
 from lcc_rl.data.episodes import validate_episodes, write_episodes
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import Plausible, gap_rate
+from lcc_rl.data.plausible import Plausible, gap_rate, hard_share
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import DataError
@@ -84,6 +84,16 @@ def test_gaps_in_other_units_than_the_speeds_are_refused(columns, factor, said) 
         Plausible(max_speed=100.0, min_gap=-1e3).select(
             table, "f.csv", lambda row, column: f"row {row}"
         )
+
+
+def test_speeds_and_gaps_in_other_units_that_agree_are_refused(shared_data: Path) -> None:
+    table = EpisodesSource(path=str(shared_data / "i80_pairs.parquet")).load().episodes
+    assert hard_share(table) < 0.0005
+    table[SPEEDS] *= 3.6
+    table["gap_m"] /= 0.3048
+    with pytest.raises(DataError, match=r"more than 4 m/s within a second for 5.* in km/h, mph"):
+        Plausible().select(table, "f.csv", lambda row, column: f"row {row}")
+    Plausible(max_hard=0.1).select(table, "f.csv", lambda row, column: f"row {row}")
 
 
 @pytest.mark.parametrize("spell", [csv_text, native_text])
