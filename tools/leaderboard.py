@@ -91,7 +91,7 @@ def drawn(task: Task, table: pd.DataFrame) -> str:
     """Return the Markdown table of a task."""
     bounds = (bounded(column, bound) for column, bound in task.limits.items())
     head = ["strategy", task.label, f"saved against {task.against}", "distance lost", *bounds]
-    head += ["spread at the end", "per decision"]
+    head += ["flow", "spread at the end", "per decision"]
     lines = [head]
     for row in table.to_dict("records"):
         name, decision = str(row["strategy"]), row["decision_ms"]
@@ -102,6 +102,7 @@ def drawn(task: Task, table: pd.DataFrame) -> str:
             interval if np.isfinite(row["saving"]) else "",
             f"{row['distance_lost']:+.1%}",
             *(measured(column, row[column]) for column in task.limits),
+            f"{row['flow_vph']:,.0f}/h",
             f"{row['final_speed_spread_mps']:.2f} m/s",
             f"{decision:.2f} ms" if np.isfinite(decision) else "",
         ]
@@ -151,11 +152,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path, help="folders of evaluations with task=…")
     parser.add_argument("--reference", type=Path, default=REFERENCE, help="where scores are kept")
+    parser.add_argument("--name", help="of the scores of a single run, if not the task's")
     parser.add_argument("--page", type=Path, default=PAGE, help="the page to write into")
     options = parser.parse_args(arguments)
+    require(options.name is None or len(options.runs) == 1, "--name is of a single run")
     for folder in options.runs:
         name, table = scored(folder)
-        write_parquet(table, options.reference / f"{name}.parquet")
+        write_parquet(table, options.reference / f"{options.name or name}.parquet")
     write_tables(options.reference, options.page)
     return 0
 

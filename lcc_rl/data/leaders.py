@@ -282,6 +282,8 @@ class DriveLeaders(Settings):
                 training, held_out = divide(training, again=True)
             training = training.at_least(horizon)
         windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
+        if not single:  # what is on one side together is one drive in intervals, too
+            windows = replace(windows, recordings=tuple(map(self._family, windows.recordings)))
         by = "at the end" if single else "by name"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"

@@ -28,7 +28,7 @@ from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.results.savings import LEADER, REPEAT, SOURCE
+from lcc_rl.results.savings import DRIVE, LEADER, REPEAT, SOURCE
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 SUMMED = (
@@ -164,6 +164,7 @@ def describe(
         "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
         "profile": [profiles.names[i] for i in profile.tolist()],
         "profile_id": profile.numpy(),
+        DRIVE: [profiles.recordings[i] for i in profile.tolist()],
         "driver_id": driver.numpy(),
         **({} if repeat is None else {REPEAT: repeat.numpy()}),
         "desired_speed_mps": population.desired_speed[driver].numpy(),

@@ -1,7 +1,8 @@
-"""Bootstrap confidence intervals over held-out windows and training seeds."""
+"""Bootstrap confidence intervals over held-out windows or drives, and training seeds."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
+LEAST_DRIVES = 5  # fewer tell too little of how drives differ
 SEED = 0  # of the resampling: the same rows give the same interval
 
 
@@ -50,7 +52,12 @@ def share_saved(value: Any, baseline: Any) -> Any:
     return (baseline - value) / abs(baseline)
 
 
-def saving(values: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Estimate:
+def saving(
+    values: ArrayLike,
+    baseline: ArrayLike,
+    paired: bool = False,
+    drives: Sequence[object] | None = None,
+) -> Estimate:
     """Return the share saved by the mean against that of a baseline, see :func:`share_saved`.
 
     The interval is that of a clustered bootstrap: held-out windows and training seeds are
@@ -65,6 +72,8 @@ def saving(values: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Esti
         baseline: that of the baseline in the same windows, ``[windows, its seeds]``; a single
             column if it was not trained (a human driver).
         paired: column by column, both sides come from the same training.
+        drives: what each window is cut from; whole drives are resampled if there are at least
+            five, because windows of one drive are alike.
 
     Returns:
         The share with its interval; without one if there is one window and one seed of each. If a
@@ -74,13 +83,21 @@ def saving(values: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Esti
     value = share_saved(_mean(own), _mean(other))
     if max(*own.shape, *other.shape) < 2:
         return Estimate(value)
-    means = _means(own, 1), _means(other, 1 if paired else 2)
+    known = drives if drives is not None and len(set(drives)) >= LEAST_DRIVES else None
+    means = _means(own, 1, known), _means(other, 1 if paired else 2, known)
     return Estimate(value, *bounds(share_saved(*means)))
 
 
-def _means(table: NDArray[np.float64], stream: int) -> NDArray[np.float64]:
+def _means(
+    table: NDArray[np.float64], stream: int, drives: Sequence[object] | None = None
+) -> NDArray[np.float64]:
     """Return the resampled means of ``[windows, seeds]``; a stream draws its own seeds."""
-    return ((weights(len(table), 0) @ table) * weights(table.shape[1], stream)).sum(1)
+    drawn = weights(len(table), 0)
+    if drives is not None:
+        names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
+        drawn = weights(len(names), 0)[:, [names[name] for name in drives]]
+        drawn = drawn / drawn.sum(1, keepdims=True)
+    return ((drawn @ table) * weights(table.shape[1], stream)).sum(1)
 
 
 def bounds(resampled: NDArray[np.float64]) -> tuple[float, float]:

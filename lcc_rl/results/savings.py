@@ -22,6 +22,7 @@ NOTHING = Estimate(np.nan)
 # and with it what ending slower saves; and as drawn (A2).
 KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
 LEADER = ("leader_path_energy_kj", "leader_speed_mps")
+DRIVE = "drive"  # what a row's window is cut from: a drive or a recording
 SOURCE = "source"  # of a row's leader, if a mixture has several
 TERCILES = ("lower", "middle", "upper")
 
@@ -62,7 +63,7 @@ def per_window(episodes: pd.DataFrame, columns: str | Sequence[str]) -> pd.DataF
 
     If every window has the same drivers, these rows give the same :func:`savings`, faster.
     """
-    keys = ["strategy", "training_seed", "profile_id"]
+    keys = ["strategy", "training_seed", "profile_id", *([DRIVE] if DRIVE in episodes else [])]
     names = [columns] if isinstance(columns, str) else list(columns)
     if "training_seed" not in episodes:
         episodes = episodes.assign(training_seed=np.nan)
@@ -79,16 +80,20 @@ def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -
         baseline: the strategy that it is compared with.
 
     Returns:
-        The share with its interval over windows and seeds (:func:`intervals.saving`), on the
-        windows that both were evaluated on; NaN if one of them is missing.
+        The share with its interval over windows or drives, and seeds
+        (:func:`lcc_rl.results.intervals.saving`), on the windows that both were evaluated on; NaN
+        if one of them is missing.
     """
     energy = per_window(episodes[episodes["strategy"].isin([strategy, baseline])], column)
     energy["training_seed"] = energy["training_seed"].astype(object).fillna(-1)
     table = energy.pivot(index="profile_id", columns=["strategy", "training_seed"], values=column)
     table = table.dropna(axis=1, how="all").dropna()
+    drives = None
+    if DRIVE in energy:
+        drives = energy.groupby("profile_id")[DRIVE].first().reindex(table.index).tolist()
     if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
         return NOTHING
-    return saving(table[strategy].to_numpy(), table[baseline].to_numpy())
+    return saving(table[strategy].to_numpy(), table[baseline].to_numpy(), drives=drives)
 
 
 def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, float]:

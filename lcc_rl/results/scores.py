@@ -168,5 +168,5 @@ def as_rich(table: pd.DataFrame, task: Task, title: str) -> Table:
         ("training seeds", "seeds", "{:d}"),
     )
     known = [row for row in rows if row[1] in table]
-    caption = "intervals: over held-out windows and training seeds"
+    caption = "intervals: over held-out windows (drives, if five or more) and training seeds"
     return strategies_side_by_side(table, known, title, caption)

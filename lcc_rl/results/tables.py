@@ -158,8 +158,8 @@ def as_rich(table: pd.DataFrame, title: str) -> Table:
     """Return a summary as a table for the terminal, a column per strategy."""
     caption = (
         "energies: mean per episode; direct: no controlled car; path energy: without what the "
-        "motion stores; intervals: over held-out windows and training seeds; pairs: of a window "
-        "and a driver"
+        "motion stores; intervals: over held-out windows (drives, if five or more) and training "
+        "seeds; pairs: of a window and a driver"
     )
     return strategies_side_by_side(table, ROWS, title, caption)
 

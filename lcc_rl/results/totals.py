@@ -9,7 +9,7 @@ import pandas as pd
 import pyarrow as pa
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.savings import KEYS, REPEAT, SOURCE, paired
+from lcc_rl.results.savings import DRIVE, KEYS, REPEAT, SOURCE, paired
 
 WINDOW = ["strategy", "training_seed", "profile_id"]
 FOLDED = 100_000  # rows of partial sums that are kept before they are added up
@@ -68,7 +68,8 @@ class Totals:
         self.pairs: dict[tuple[str, str], tuple[int, int]] = {}
         self.drivers: dict[tuple[str, str], pd.DataFrame] = {}
         parts: list[pd.DataFrame] = []
-        columns = [*WINDOW, *KEYS, REPEAT, *self.means, *self.lows, paired_by]
+        self.drives: dict[int, str] = {}  # by window
+        columns = [*WINDOW, *KEYS, DRIVE, REPEAT, *self.means, *self.lows, paired_by]
         for frame in frames(rows, list(dict.fromkeys(columns)), source):
             parts.append(self._window_sums(frame))
             if sum(map(len, parts)) > FOLDED + 2 * len(parts[0]):
@@ -77,6 +78,9 @@ class Totals:
             lows_here = frame.groupby("strategy", sort=False)[known].min()
             self.minima = pd.concat([self.minima, lows_here]).groupby(level=0, sort=False).min()
             self._compare(frame)
+            if DRIVE in frame:
+                known_here = frame.drop_duplicates("profile_id")
+                self.drives |= dict(zip(known_here["profile_id"], known_here[DRIVE], strict=True))
         self.windows = _folded(parts)
         self.strategies = [str(name) for name in self.windows.index.unique(0)]
 
@@ -118,9 +122,10 @@ class Totals:
         return float(self.minima[column][strategy]) if column in self.minima else np.nan
 
     def per_window(self) -> pd.DataFrame:
-        """Return the means by strategy, training seed and window, as rows."""
+        """Return the means by strategy, training seed and window, as rows, with their drives."""
         means = self.windows["sum"] / self.windows["count"].replace(0, np.nan)
-        return means.reset_index()
+        rows = means.reset_index()
+        return rows.assign(**{DRIVE: rows["profile_id"].map(self.drives)}) if self.drives else rows
 
     def worse_off(self, strategy: str, baseline: str) -> dict[str, float]:
         """Return :func:`lcc_rl.results.savings.worse_off`; NaN if a strategy is missing."""

@@ -111,3 +111,18 @@ def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     assert table.loc[("idm", 0.02), SHARE] == pytest.approx(0.01)
     nothing = saving_at(fronts(0.0, 2.0), NETWORK, RULE, 0.012)
     assert -0.03 < nothing.low < 0.0 < nothing.high < 0.03
+
+
+def test_windows_of_one_drive_are_resampled_together() -> None:
+    generator = np.random.default_rng(0)
+    of_drive = np.repeat(generator.normal(0.0, 0.05, 8), 10)
+    traffic = 100.0 + generator.normal(0.0, 1.0, 80)
+    own = (traffic * (0.95 + of_drive + generator.normal(0.0, 0.01, 80)))[:, None]
+    drives = np.repeat([f"drive {number}" for number in range(8)], 10).tolist()
+    alone, whole = saving(own, traffic[:, None]), saving(own, traffic[:, None], drives=drives)
+    assert whole.value == alone.value
+    assert whole.high - whole.low > 2.0 * (alone.high - alone.low)
+    assert saving(own, traffic[:, None], drives=["a"] * 40 + ["b"] * 40) == alone  # too few to tell
+    shuffled = generator.permutation(80)
+    again = saving(own[shuffled], traffic[shuffled][:, None], drives=[drives[i] for i in shuffled])
+    assert again.high - again.low == pytest.approx(whole.high - whole.low, rel=0.1)
