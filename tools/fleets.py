@@ -28,13 +28,12 @@ NAMES = {"i24-mixed": "fleets", "ring-22": "fleets_ring"}
 PERCENT = ("saving", "distance_lost")
 SHOWN = {
     "i24-mixed": {"saving": "fuel saved per km [%]", "distance_lost": "distance lost [%]"},
-    # In figures: where all are automated nobody disturbs the ring, and the baseline has no wave.
     "ring-22": {"score": "fuel of all [g/km]", "mean_speed_mps": "mean speed [m/s]"},
 }
 SHOWN_AS = {
     LEARNED: (LEARNED, "#0072b2"),
     "idm_acc": ("IDM as cruise control, tuned", "#009e73"),
-    "idm_acc_filtered": ("IDM as cruise control, tuned, filtered", "#009e73"),
+    "idm_acc_filtered": ("IDM as cruise control, tuned, filtered", "#56b4e9"),
     "acc": ("linear ACC, tuned", "#e69f00"),
     "follower_stopper": ("FollowerStopper", "#cc79a7"),
     "pi_saturation": ("PI with saturation", "#d55e00"),
