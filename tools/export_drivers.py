@@ -18,7 +18,7 @@ from lcc_rl.cli.entry import main_guard
 from lcc_rl.drivers.parameters import COLUMNS, IDM
 from lcc_rl.drivers.tables import load_drivers, models_of
 from lcc_rl.errors import DataError
-from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.atomic import atomic_path, new_file
 
 # Attribute of a vType by parameter of the IDM; both are in m, s and m/s.
 ATTRIBUTES = {
@@ -64,7 +64,7 @@ def main(words: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     root = vehicle_types(load_drivers(options.drivers, options.mode), options.drivers)
     ElementTree.indent(root)
-    with atomic_path(options.target) as temporary:
+    with atomic_path(new_file(options.target, "target")) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
     print(f"{len(root)} vehicle types in {options.target}")
     return 0

@@ -35,6 +35,7 @@ from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, trained
 from lcc_rl.functional.pattern import HUMAN
+from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.savings import savings
@@ -54,6 +55,7 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
     own = ["variant=alcc", f"evaluation.drivers={DRIVERS}"]
     cfg = load("evaluate", [*own, *overrides])
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
+    place = new_file(options.out / "episodes.parquet", "--out")
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     learned = [start(cfg, path, inputs) for path in options.policy or ["pretrained"]]
@@ -68,7 +70,7 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
             rows["profile_id"] += first
             made.append(rows)
     episodes = pd.concat(made, ignore_index=True)
-    write_parquet(episodes, options.out / "episodes.parquet")
+    write_parquet(episodes, place)
     return episodes
 
 

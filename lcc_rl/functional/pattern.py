@@ -82,7 +82,8 @@ def parse_string(pattern: Any, road: str = OPEN) -> VehicleString:
 def _mixture(size: Any, penetration: Any, ring: bool) -> VehicleString:
     if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= LARGEST:
         raise ConfigError(f"scenario.string.size must be a whole number in 1…{LARGEST}, got {size}")
-    if not isinstance(penetration, (int, float)) or not 0.0 <= penetration <= 1.0:
+    number = isinstance(penetration, (int, float)) and not isinstance(penetration, bool)
+    if not number or not 0.0 <= penetration <= 1.0:
         raise ConfigError(f"scenario.string.penetration must lie in [0, 1], got {penetration!r}")
     count = max(round(size * penetration), 1) if penetration > 0 else 0
     roles = (AUTOMATED,) * count + (HUMAN,) * (size - count)
@@ -128,7 +129,7 @@ class _Parser:
         times = self._peek()
         if times is None or not times.startswith("*"):
             return roles
-        count = int(times[1:][:6])
+        count = int(times[1:].lstrip("0")[:6] or 0)
         if not 1 <= count * len(roles) <= LARGEST:
             raise self._error(f"expected a number that makes 1…{LARGEST} vehicles", self.place)
         self._advance()

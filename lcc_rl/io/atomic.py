@@ -13,6 +13,18 @@ from lcc_rl.errors import ResultsError
 SUBFOLDERS = ("figures", "policies", "blocks")
 
 
+def new_file(path: str | Path, option: str) -> Path:
+    """Return the path of a file to write that must not be there yet.
+
+    Raises:
+        ResultsError: if it is.
+    """
+    path = Path(path)
+    if path.exists() or path.is_symlink():
+        raise ResultsError(f"{path} is already there; choose another {option}, or remove it")
+    return path
+
+
 @contextmanager
 def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that replaces it only when the block succeeds.
@@ -22,10 +34,13 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
         durable: flush to disk, so that the file survives a power cut.
 
     Raises:
-        ResultsError: if the file cannot be written (disk full, folder read-only …); a former
+        ResultsError: if ``path`` is there and no regular file, such as a folder or a device.
+        ResultsError: if it cannot be written (disk full, folder read-only …); a former
             file at ``path`` is kept and the temporary one removed.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ResultsError(f"{path}: is no regular file; choose another place to write")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import resource
 import subprocess
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
+from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.runs import save_config
@@ -94,6 +96,19 @@ def test_a_writer_on_a_full_disk_names_the_file_and_keeps_the_former_one(tmp_pat
     assert list(tmp_path.iterdir()) == [path]
     WRITERS[name](path)
     assert path.stat().st_size > 9_000
+
+
+def test_only_regular_files_are_replaced(tmp_path) -> None:
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("folder", "pipe"):
+        with (
+            pytest.raises(ResultsError, match=f"{name}: is no regular file"),
+            atomic_path(tmp_path / name),
+        ):
+            pass
+    with pytest.raises(ResultsError, match="pipe is already there; choose another --out"):
+        new_file(tmp_path / "pipe", "--out")
 
 
 class Mishap:

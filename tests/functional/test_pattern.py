@@ -24,6 +24,8 @@ A, H = "automated", "human"
         ("((automated human)*2 cacc)*2", [A, H, A, H, "cacc"] * 2),
         ("human (my_car2)*1", [H, "my_car2"]),
         ("automated*10000", [A] * 10_000),
+        ("automated*0000025", [A] * 25),
+        ("automated*00000100", [A] * 100),
     ],
 )
 def test_what_a_pattern_means(pattern, roles) -> None:
@@ -59,6 +61,11 @@ def test_an_error_points_at_the_place(pattern, words, place) -> None:
     assert f"{words} at character {place}: " in text
     # The pattern itself, marked where it goes wrong.
     assert text.endswith(f"{pattern[: place - 1]}»{pattern[place - 1 :]}")
+
+
+def test_a_share_is_a_number() -> None:
+    with pytest.raises(ConfigError, match=r"penetration must lie in \[0, 1\], got True"):
+        parse_string({"size": 10, "penetration": True})
 
 
 @pytest.mark.parametrize(

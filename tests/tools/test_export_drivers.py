@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from xml.etree import ElementTree
 
 import export_drivers
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from lcc_rl.drivers.tables import load_drivers
-from lcc_rl.errors import DataError
+from lcc_rl.errors import DataError, ResultsError
 
 
 @pytest.fixture
@@ -41,12 +42,16 @@ def test_the_file_holds_what_the_table_holds(drivers, tmp_path) -> None:
         (lambda t: t.assign(time_gap_s=-1.0), "row 0, column 'time_gap_s'"),
     ],
 )
-def test_bad_drivers_end_in_one_line_and_leave_the_old_file(
-    drivers, tmp_path, change, words
-) -> None:
+def test_bad_drivers_end_in_one_line(drivers, tmp_path, change, words) -> None:
     target = tmp_path / "vtypes.xml"
-    target.write_text("before")
     change(pd.read_parquet(drivers)).to_parquet(drivers)
     with pytest.raises(DataError, match=words):
         export_drivers.main([drivers, str(target)])
-    assert target.read_text() == "before"
+    assert not target.exists()
+
+
+def test_nothing_that_is_there_is_overwritten(drivers, tmp_path) -> None:
+    before = Path(drivers).read_bytes()
+    with pytest.raises(ResultsError, match="is already there; choose another target"):
+        export_drivers.main([drivers, drivers])
+    assert Path(drivers).read_bytes() == before

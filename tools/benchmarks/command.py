@@ -12,6 +12,7 @@ import logging
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from shutil import which
 
 import pandas as pd
@@ -27,7 +28,8 @@ from benchmarks.harness import EXTRA, Row, drawn, installed
 from benchmarks.read import read
 from benchmarks.train import train
 from benchmarks.update import update
-from lcc_rl.errors import LccError, how_to_install, unknown_name
+from lcc_rl.data.tables import TableFile
+from lcc_rl.errors import LccError, ResultsError, how_to_install, unknown_name
 from lcc_rl.io.files import processor, write_parquet
 
 LISTED = (read, env, collect, update, train, calibrate, evaluate)
@@ -74,6 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     here = {"threads": options.threads, "machine": processor(), "torch": torch.__version__}
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     try:
+        if Path(options.out).exists() and "benchmark" not in TableFile(options.out).header:
+            raise ResultsError(f"{options.out} is no table of benchmarks; choose another --out")
         for name in options.names:
             if name not in BENCHMARKS:
                 raise unknown_name("benchmark", name, BENCHMARKS)
