@@ -65,6 +65,7 @@ class ScenarioConfig(Settings):
     controllers: Nodes
     start: Nodes
     filters: Nodes
+    actuators: Nodes = Field(default_factory=dict)
     pieces: Nodes
 
     @property

@@ -172,9 +172,9 @@ def _leader(scenario: Any, node: Any, world: World) -> list[Piece]:
 
 
 def _drivers(scenario: Any, world: World) -> list[Any]:
-    """Build the controllers of the roles that occur, and their safety filters."""
+    """Build the controllers of the roles that occur, their safety filters and actuators."""
     pieces, roles = [], world.string.names
-    for group, needed in (("controllers", True), ("filters", False)):
+    for group, needed in (("controllers", True), ("filters", False), ("actuators", False)):
         nodes = getattr(scenario, group)
         for role in roles:
             if nodes.get(role) is not None:
@@ -187,7 +187,7 @@ def _drivers(scenario: Any, world: World) -> list[Any]:
                 )
         strange = [role for role in nodes if not needed and role not in roles]
         if strange:
-            raise ConfigError(f"scenario.filters.{strange[0]}: no vehicle has that role")
+            raise ConfigError(f"scenario.{group}.{strange[0]}: no vehicle has that role")
     return pieces
 
 
@@ -202,7 +202,8 @@ def _motion(scenario: Any, world: World) -> StringMotion:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
     names = ("circumference", "vehicle_length", "initial_speed")
     of_ring = {name: getattr(scenario, name) for name in names} if string.ring else {}
-    return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
+    late = [role for role in string.names if scenario.actuators.get(role) is not None]
+    return parse(StringMotion, {"start": start, "late": late, **of_ring}, "scenario").bind(world)
 
 
 def make_env(

@@ -117,9 +117,9 @@ def baseline(cfg: StudyConfig, name: str) -> Strategy:
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
     if name == PEOPLE:
-        return Strategy(name, without_filter(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
+        return Strategy(name, by_people(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
     if name == RECORDED:
-        cfg = without_filter(driven_by(cfg, baseline_controller(name)))
+        cfg = by_people(driven_by(cfg, baseline_controller(name)))
         cfg.scenario.start[AUTOMATED] = {TARGET: RECORDED_START}
         return Strategy(name, cfg)
     behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
@@ -164,10 +164,17 @@ def without_filter(cfg: StudyConfig) -> StudyConfig:
     return cfg
 
 
+def by_people(cfg: StudyConfig) -> StudyConfig:
+    """Return a configuration without filter and actuators: a person's motion has them in it."""
+    cfg = without_filter(cfg)
+    cfg.scenario.actuators.pop(AUTOMATED, None)
+    return cfg
+
+
 def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose string lacks the automated vehicles."""
     roles = [role for role in cfg.scenario.vehicles.roles if role != AUTOMATED]
-    cfg = without_filter(cfg)
+    cfg = by_people(cfg)
     cfg.scenario.string = " ".join(roles)
     return cfg
 

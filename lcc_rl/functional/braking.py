@@ -12,10 +12,14 @@ instead of contact).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from lcc_rl.functional.actuation import Motion, Response
+
+HALVINGS, NEARBY = 16, 1e-2  # of the range of accelerations; step of a slope [m/s²]
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,96 @@ def _room_at(
     gap = gap + 0.5 * speed_ahead * time - 0.5 * (speed + reached) * moving
     over = (reached - tau * own).clamp(min=0.0)
     return gap - tau * reached - 0.5 * over**2 / own
+
+
+def least_room_held(motion: Motion, acceleration: Tensor, time: float, braking: Braking) -> Tensor:
+    """Return the least room to come if a vehicle brakes fully after it held an acceleration.
+
+    The vehicle ahead brakes fully from now on.
+
+    Args:
+        motion: the state, its gap less what counts as contact; its acceleration is not used.
+        acceleration: held [m/s²].
+        time: for which it is held [s].
+        braking: how hard both brake, and τ.
+    """
+    speed, ahead, tau = motion.speed, motion.ahead, braking.time_to_collision
+    hard = torch.full_like(ahead, -braking.ahead)
+
+    def at(moment: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        gap = motion.gap + _way(ahead, hard, moment) - _way(speed, acceleration, moment)
+        reached = (speed + acceleration * moment).clamp(min=0.0)
+        return reached, gap, (ahead + hard * moment).clamp(min=0.0)
+
+    end = torch.full_like(speed, time)
+    # Where room may be least before: closing ends to grow, the vehicle ahead stands, and then.
+    slower, slows = (-(acceleration + braking.ahead), -acceleration)
+    inner = (
+        (speed - ahead) / slower.clamp(min=1e-6) - tau,
+        ahead / braking.ahead,
+        speed / slows.clamp(min=1e-6) - tau,
+    )
+    least = least_room(*at(end), braking)
+    for moment in (torch.zeros_like(end), *(torch.minimum(x.clamp(min=0.0), end) for x in inner)):
+        reached, gap, ahead_reached = at(moment)
+        least = torch.minimum(least, gap - tau * (reached - ahead_reached))
+    return least
+
+
+def least_room_late(motion: Motion, response: Response, braking: Braking) -> Tensor:
+    """Return the least room to come while a vehicle brakes fully that obeys with a lag.
+
+    At most that: see :attr:`lcc_rl.functional.actuation.Response.hold`.
+
+    Args:
+        motion: the state, its gap less what counts as contact.
+        response: how the vehicle obeys.
+        braking: how hard both brake, and τ.
+    """
+    return least_room_held(motion, motion.acceleration, response.hold, braking)
+
+
+def safe_command(motion: Motion, response: Response, braking: Braking) -> Tensor:
+    """Return the largest command after which a vehicle that obeys with a lag is still safe.
+
+    Held for a step and for what the lag costs, the acceleration that it leads to must leave room;
+    full braking does in every safe state. The largest such acceleration is found by bisection,
+    and has the gradient of the implicit function.
+
+    Args:
+        motion: the state when the command begins to act, its gap less what counts as contact.
+        response: how the vehicle obeys.
+        braking: how hard both brake, and τ.
+
+    Returns:
+        The command, at most that which leads to full acceleration as hard as braking [m/s²].
+    """
+    time = response.time_step + response.hold
+    # In samples, a vehicle that stops within a step comes a little nearer than its trapezoid.
+    now = replace(motion, gap=motion.gap - 0.125 * braking.own * response.time_step**2)
+    with torch.no_grad():
+        low = torch.full_like(now.speed, -braking.own)
+        high = -low
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            safe = least_room_held(now, middle, time, braking) >= 0.0
+            low, high = torch.where(safe, middle, low), torch.where(safe, high, middle)
+        slope = least_room_held(now, low - NEARBY, time, braking)
+        slope = (slope - least_room_held(now, low, time, braking)) / NEARBY
+        inner = (low > -braking.own) & (low < braking.own - NEARBY)  # elsewhere it is clamped
+    largest = low
+    if any(x.requires_grad for x in (now.speed, now.gap, now.ahead)):
+        room = least_room_held(now, low, time, braking)
+        change = (room - room.detach()) / slope.clamp(min=time * time)
+        largest = low + torch.where(inner, change, 0.0)
+    return motion.acceleration + (largest - motion.acceleration) / response.share
+
+
+def _way(speed: Tensor, acceleration: Tensor, time: Tensor) -> Tensor:
+    """Return what a vehicle drives in a time; once it stands, it stays."""
+    reached = speed + acceleration * time
+    stopped = 0.5 * speed**2 / (-acceleration).clamp(min=1e-6)
+    return torch.where(reached < 0.0, stopped, 0.5 * (speed + reached) * time)
 
 
 def safe_acceleration(

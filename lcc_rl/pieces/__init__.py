@@ -1,6 +1,7 @@
 """Pieces: everything that an environment is made of, one TensorDict transform each."""
 
 from lcc_rl.functional.pattern import VehicleString, parse_string
+from lcc_rl.pieces.actuation import Actuation
 from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
 from lcc_rl.pieces.calibrated import CalibratedDrivers
 from lcc_rl.pieces.cbf import CBFFilter, Corrected
@@ -49,6 +50,7 @@ __all__ = [
     "MPC",
     "OVM",
     "Action",
+    "Actuation",
     "CBFFilter",
     "CalibratedDrivers",
     "Collision",

@@ -6,8 +6,16 @@ import torch
 from pydantic import InstanceOf
 from torch import Tensor
 
-from lcc_rl.functional.braking import Braking, least_room, safe_acceleration
+from lcc_rl.functional.actuation import Motion, Response, predicted
+from lcc_rl.functional.braking import (
+    Braking,
+    least_room,
+    least_room_late,
+    safe_acceleration,
+    safe_command,
+)
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.actuation import ACTUATION, response_of
 from lcc_rl.pieces.base import StepTransform
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
@@ -43,10 +51,18 @@ class CBFFilter(StepTransform):
     and falls with the square of the speed below: the vehicle is near before its leader stands, and
     pays for it with energy.
 
+    With a ``delay``, a ``lag`` and a ``braking`` of the vehicle (:class:`Actuation`) the bounds are
+    those of the state in which the command begins to act: commands given before it act until then,
+    while the vehicle ahead brakes as hard as is reckoned with; and full braking is reached with the
+    lag (:func:`lcc_rl.functional.braking.safe_command`).
+
     Reads and replaces ``("command", role)``, ``[*batch, n, 1]`` [m/s²]. Differentiable.
     """
 
     max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    delay: NonNegative = 0.0  # of the commands' effect, a number of steps [s]
+    lag: NonNegative = 0.0  # of the acceleration behind the command [s]
+    braking: Positive | None = None  # hardest braking that there is; None: max_acceleration [m/s²]
     time_to_collision: Positive = 4.0  # shortest allowed [s]
     rate: Positive = 3.0  # how fast that limit may be approached [1/s]
     margin: Positive = 0.2  # gap that counts as contact [m]
@@ -67,15 +83,23 @@ class CBFFilter(StepTransform):
 
     def setup(self, world: World) -> None:
         """Read the commands of the role and what bounds them."""
-        seen = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
         self.role, self.string, self.time_step = self.name, world.string, world.time_step
-        wanted = f"next.command.{self.role}"
-        self.see(world, [wanted, *seen], [("command", self.role)], self.role)
-        self.braking = Braking(self.max_acceleration, self.braking_ahead, self.time_to_collision)
+        own = min(self.braking or self.max_acceleration, self.max_acceleration)
+        self.response = response_of(self.delay, self.lag, own, world, self.role)
+        seen = ["self.speed", "self.gap", "ahead.speed", "ahead.acceleration"]
+        seen += [f"{self.role}.{ACTUATION}"] * self.late
+        self.see(world, [f"next.command.{self.role}", *seen], [("command", self.role)], self.role)
+        self.limits = Braking(own, self.braking_ahead, self.time_to_collision)
+
+    @property
+    def late(self) -> bool:
+        """Whether the vehicle obeys with a delay or a lag."""
+        return bool(self.delay or self.lag)
 
     def watch(self) -> Promised:
         """Return the piece that records the steps for which the filter promises its limit."""
-        watching = Promised(braking=self.braking, margin=self.margin)
+        late = self.response if self.late else None
+        watching = Promised(braking=self.limits, margin=self.margin, response=late)
         return watching.bind(World(self.string), self.role)
 
     def compute(self, *entries: Tensor) -> Tensor:
@@ -83,20 +107,42 @@ class CBFFilter(StepTransform):
         return self.filtered(*self.views(*entries))
 
     def filtered(
-        self, wanted: Tensor, speed: Tensor, gap: Tensor, ahead: Tensor, ahead_acceleration: Tensor
+        self,
+        wanted: Tensor,
+        speed: Tensor,
+        gap: Tensor,
+        ahead: Tensor,
+        ahead_acceleration: Tensor,
+        kept: Tensor | None = None,
     ) -> Tensor:
-        """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²]."""
-        closing, shortest = speed - ahead, self.braking.time_to_collision
+        """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²].
+
+        Args:
+            wanted: commands [m/s²].
+            speed, gap, ahead, ahead_acceleration: the state [m/s, m, m/s, m/s²].
+            kept: of the actuation, where there is one.
+        """
+        # Any of them that is no number, or infinite, shows in the sum.
+        known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
+        response, free = self.response, gap - self.margin
+        if kept is None:
+            safe = safe_acceleration(speed, free, ahead, self.limits, self.time_step)
+        else:
+            now = Motion(speed, free, ahead, kept[..., :1])
+            worst = predicted(now, kept[..., 1:], -self.braking_ahead, response)[-1]
+            safe = safe_command(worst, response, self.limits)
+            expected = predicted(now, kept[..., 1:], ahead_acceleration, response)[-1]
+            speed, free, ahead = expected.speed, expected.gap, expected.ahead
+            gap = free + self.margin
+        closing, shortest = speed - ahead, self.time_to_collision
         command = wanted
         if self.time_gap is not None:
             allowed, slope = self._longest_gap(speed, self.time_gap)
             least = (-closing - self.time_gap_rate * (allowed - gap)) / slope
             command = torch.maximum(command, least)
-        free = gap - self.margin
         slower = self.rate * (free - shortest * closing) - closing
-        expected = ahead_acceleration + slower / (shortest + 0.5 * self.time_step)
-        safe = safe_acceleration(speed, free, ahead, self.braking, self.time_step)
-        command = torch.minimum(command, torch.minimum(expected, safe))
+        comfort = ahead_acceleration + slower / (shortest + 0.5 * self.time_step)
+        command = torch.minimum(command, torch.minimum(comfort, safe))
         if self.shortest_time_gap is not None:
             room = gap - self.shortest_time_gap * speed
             half = 0.5 * self.time_step
@@ -104,8 +150,6 @@ class CBFFilter(StepTransform):
             held = (self.time_gap_rate * room + opening) / (self.shortest_time_gap + half)
             command = torch.minimum(command, held)
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
-        # Any of them that is no number, or infinite, shows in the sum.
-        known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
         return torch.where(known, command, -self.max_acceleration)
 
     def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
@@ -147,16 +191,26 @@ class Promised(StepTransform):
 
     braking: InstanceOf[Braking]  # what the filter reckons with
     margin: Positive  # gap that counts as contact [m]
+    response: InstanceOf[Response] | None = None  # of a vehicle that obeys late
 
     name = AUTOMATED
 
     def setup(self, world: World) -> None:
         """Read what bounds the commands of the role."""
-        seen = ("self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration")
+        seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
+        seen += [f"{self.name}.{ACTUATION}"] * (self.response is not None)
         self.see(world, seen, [(self.name, "promised")], self.name)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return 1 for the steps that are covered."""
-        speed, gap, ahead, acceleration = self.views(*entries)
-        safe = least_room(speed, gap - self.margin, ahead, self.braking) >= -ROUNDING
-        return (safe & (acceleration >= -self.braking.ahead - ROUNDING)).to(speed.dtype)
+        speed, gap, ahead, acceleration, *kept = self.views(*entries)
+        free = gap - self.margin
+        room = least_room(speed, free, ahead, self.braking)
+        if self.response is not None:
+            now = Motion(speed, free, ahead, kept[0][..., :1])
+            path = predicted(now, kept[0][..., 1:], -self.braking.ahead, self.response)
+            rooms = [x.gap - self.braking.time_to_collision * (x.speed - x.ahead) for x in path]
+            rooms.append(least_room_late(path[-1], self.response, self.braking))
+            room = torch.stack(rooms).amin(0)
+        kept_up = acceleration >= -self.braking.ahead - ROUNDING
+        return ((room >= -ROUNDING) & kept_up).to(speed.dtype)

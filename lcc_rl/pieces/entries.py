@@ -55,6 +55,8 @@ ENTRIES: dict[Key, tuple[str, str]] = {
     (ROLE, "commanded_speed"): ("m/s", "speed that PI with saturation commanded last"),
     (ROLE, "unsolved"): ("–", "1 where the plan of MPC had no solution, and it brakes"),
     ("command", ROLE): ("m/s²", "acceleration that the role's controller commands"),
+    ("obeyed", ROLE): ("m/s²", "acceleration that engine and brakes make of the command"),
+    (ROLE, "actuation"): ("m/s²", "that of the last step, and commands that do not act yet"),
     ("hybrid", "winner"): ("–", "candidate chosen: 0 rule, 1 policy, −1 at reset"),
     ("hybrid", "switches"): ("–", "changes of the winner since the start"),
     ("hybrid", "clamps"): ("–", "steps in which the jerk bound cut a candidate"),

@@ -6,7 +6,10 @@ import pytest
 import torch
 from helpers import ACTION, small_env
 
+from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import play
+from lcc_rl.functional.actuation import Motion, Response
+from lcc_rl.functional.braking import Braking, safe_command
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.rewards import TERMS
 
@@ -39,6 +42,39 @@ def test_no_policy_passes_the_limits(action) -> None:
     assert (held["time_gap"] > 2.5).double().mean() < 0.01
     broken = (free["ttc"] < 4.0) | (free["time_gap"] > 2.5)
     assert broken.double().mean() > 0.1
+
+
+LATE = "scenario.actuators.automated={_target_: lcc_rl.pieces.Actuation, delay: 0.2, lag: 0.3}"
+
+
+@pytest.mark.parametrize("action", [1.0, 0.0, None])
+def test_late_brakes_need_a_filter_that_knows_them(action) -> None:
+    blind = driven(action, "+filter=cbf", LATE)
+    knows = driven(action, "+filter=cbf_actuation")
+    assert blind["ttc"].min() < 4.0
+    promised = knows["promised"] == 1.0
+    assert promised.double().mean() > 0.9
+    assert (knows["ttc"][promised] >= 4.0).all()
+    assert knows["gap"].min() > 0.1
+
+
+def test_a_delay_is_a_number_of_steps() -> None:
+    with pytest.raises(ConfigError, match="delay of automated must be a multiple of the time step"):
+        small_env("alcc", 2, ["+filter=cbf_actuation", "scenario.actuators.automated.delay=0.25"])
+
+
+def test_the_gradient_passes_the_filter_that_knows_late_brakes() -> None:
+    response, limits = Response.of(0.1, 0.3, 3.0, 0.1), Braking(3.0, 2.6, 4.0)
+    gap = torch.tensor([[35.0]], dtype=torch.float64, requires_grad=True)
+
+    def bound(x: torch.Tensor) -> torch.Tensor:
+        one = torch.ones_like(x)
+        return safe_command(Motion(20.0 * one, x, 15.0 * one, 0.3 * one), response, limits)
+
+    (slope,) = torch.autograd.grad(bound(gap).sum(), gap)
+    with torch.no_grad():
+        expected = (bound(gap + 0.5) - bound(gap - 0.5)) / 1.0
+    torch.testing.assert_close(slope, expected, rtol=0.05, atol=1e-3)
 
 
 def test_a_shortest_time_gap_is_kept_where_braking_suffices() -> None:

@@ -43,6 +43,7 @@ from lcc_rl.pieces import (
     MPC,
     OVM,
     Action,
+    Actuation,
     CalibratedDrivers,
     CBFFilter,
     Collision,
@@ -112,6 +113,7 @@ ROLES = (
     "saturating",
     "constant",
     "plain",
+    "slow",
     "following",
     "cruising",
     "planning",
@@ -177,6 +179,8 @@ def controllers() -> dict[str, tuple[str, Piece]]:
         "HCFS": ("hybrid", HCFS(rule=cacc, spacing_weight=0.02, spacing_time=1.0)),
         "CBFFilter": ("automated", CBFFilter()),
         "Corrected": ("automated", Corrected()),
+        "ConstantAcceleration, late": ("slow", ConstantAcceleration(acceleration=0.3)),
+        "Actuation": ("slow", Actuation(delay=0.2, lag=0.3)),
     }
 
 
@@ -186,7 +190,7 @@ def motion(string: VehicleString) -> StringMotion:
     start |= {role: HeadwayStart() for role in CONNECTED}
     start |= {} if string.ring else {"recorded": RecordedStart()}
     length = 30.0 * len(string) if string.ring else None
-    return StringMotion(start=start, circumference=length, initial_speed=8.0)
+    return StringMotion(start=start, circumference=length, initial_speed=8.0, late=["slow"])
 
 
 def rewards() -> dict[str, tuple[str | None, Piece]]:

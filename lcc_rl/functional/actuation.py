@@ -1,0 +1,93 @@
+"""What engine and brakes make of commands: they act late, with a lag, and within their limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lcc_rl.functional.kinematics import advance_gap, advance_speed
+
+
+@dataclass(frozen=True)
+class Response:
+    """How commands become accelerations.
+
+    A command acts after ``late`` steps; from then on the acceleration approaches it by ``share``
+    of what is left in every step (a first-order lag τ, sampled: 1 − e^(−T/τ)).
+
+    Args:
+        late: steps between a command and its first effect.
+        share: in (0, 1]; 1 without lag.
+        braking: hardest braking that there is, positive [m/s²].
+        time_step: T [s].
+    """
+
+    late: int
+    share: float
+    braking: float
+    time_step: float
+
+    @classmethod
+    def of(cls, delay: float, lag: float, braking: float, time_step: float) -> Response:
+        """Return the response to a delay and a lag, both in s; the delay is a number of steps."""
+        share = 1.0 if lag == 0.0 else 1.0 - math.exp(-time_step / lag)
+        return cls(round(delay / time_step), share, braking, time_step)
+
+    @property
+    def hold(self) -> float:
+        """Time for which the last acceleration, held, covers what the lag loses [s].
+
+        Braking fully from acceleration a reaches, step by step, a speed that lies above that of
+        braking at once by T·(a + braking)·(1 − share + (1 − share)² + …). Holding a for this time
+        and braking at once afterwards lies above by as much in the end, and never by less.
+        """
+        return self.time_step * (1.0 - self.share) / self.share
+
+    def next(self, acceleration: Tensor, command: Tensor) -> Tensor:
+        """Return the acceleration of a step from that of the step before [m/s²]."""
+        wanted = command.clamp(min=-self.braking)
+        return acceleration + self.share * (wanted - acceleration)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """State of a vehicle and of the one ahead when the next command begins to act.
+
+    Args:
+        speed, gap, ahead: of the vehicle [m/s], to and of the one ahead [m, m/s].
+        acceleration: of the step before [m/s²].
+    """
+
+    speed: Tensor
+    gap: Tensor
+    ahead: Tensor
+    acceleration: Tensor
+
+
+def predicted(
+    now: Motion, pending: Tensor, ahead_acceleration: Tensor | float, response: Response
+) -> list[Motion]:
+    """Return the motion after every step in which commands already given act.
+
+    Args:
+        now: the motion, entries of any one shape ``[…, 1]``.
+        pending: commands given and not yet begun, the oldest first, ``[…, late]`` [m/s²].
+        ahead_acceleration: of the vehicle ahead throughout, which stops at standstill [m/s²].
+        response: how the vehicle obeys.
+
+    Returns:
+        The present motion, then one per step.
+    """
+    found, step = [now], response.time_step
+    for number in range(pending.shape[-1]):  # split would give an empty one of none
+        command = pending[..., number : number + 1]
+        last = found[-1]
+        own = response.next(last.acceleration, command)
+        speed, _ = advance_speed(last.speed, own, step)
+        ahead, _ = advance_speed(last.ahead, torch.as_tensor(ahead_acceleration), step)
+        gap = advance_gap(last.gap, last.ahead, last.speed, ahead, speed, step)
+        found.append(Motion(speed, gap, ahead, own))
+    return found
