@@ -144,8 +144,8 @@ def load(
             with damaged.noting(path.parent):
                 parts[path] = read_table(path, texts_of(schema))
         runs = {path: runs[path] for path in parts}
-    if not runs:
-        raise _nothing(root, table, damaged)
+        if not runs:
+            raise _nothing(root, table, damaged)
     missing = missing_shards(list(runs.values())) if table == "episodes" else []
     for line in missing:
         if strict:
@@ -185,6 +185,8 @@ def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema
         with damaged.noting(path.parent):
             whole = unified(whole, schemas[path], path)
             kept.append(path)
+    if not kept:
+        raise _nothing(root, table, damaged)
     return {path: runs[path] for path in sorted(kept)}, whole
 
 

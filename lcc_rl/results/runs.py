@@ -78,8 +78,7 @@ def stored_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     content = read_settings(path)
     try:
-        if "scenario" in content:
-            parse(ScenarioConfig, content["scenario"], "scenario")
+        parse(ScenarioConfig, content.get("scenario", {}), "scenario")
     except ConfigError as error:
         raise ResultsError(f"{path}: damaged: {error}") from error
     return content
