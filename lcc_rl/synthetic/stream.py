@@ -76,20 +76,19 @@ class StreamSource(Settings):
         count, longest = self.recordings * self.platoons * self.vehicles, self.duration_s[1]
         size = f"data: recordings × platoons × vehicles = {count}, up to {longest:g} s each,"
         require_memory({size: count * longest / FRAME * SAMPLE})
+        low, high = (round(value / FRAME) for value in self.duration_s)
+        drawn = []
+        for index in range(self.recordings):
+            generator = np.random.default_rng([self.seed, index])
+            drawn.append((generator.integers(low, high + 1, self.platoons), generator))
+        drivers = self.drivers or bootstrap()
+        made = drive_platoons(self.leader, drivers, self.vehicles, self.noise, drawn)
         made = [
-            self.drive(recording_name(index), np.random.default_rng([self.seed, index]))
-            for index in range(self.recordings)
+            Stream(one.samples.assign(recording=name), one.truth.assign(recording=name))
+            for name, one in zip(map(recording_name, range(self.recordings)), made, strict=True)
         ]
         samples = pd.concat([one.samples for one in made], ignore_index=True)
         return Stream(samples, pd.concat([one.truth for one in made], ignore_index=True))
-
-    def drive(self, name: str, generator: np.random.Generator) -> Stream:
-        """Simulate one recording; vehicle ids count from 1, platoon by platoon, front to back."""
-        low, high = (round(value / FRAME) for value in self.duration_s)
-        seen = generator.integers(low, high + 1, self.platoons)
-        drivers = self.drivers or bootstrap()
-        made = drive_platoons(self.leader, drivers, self.vehicles, seen, self.noise, generator)
-        return Stream(made.samples.assign(recording=name), made.truth.assign(recording=name))
 
     def write(self, path: str | Path) -> Stream:
         """Generate the stream and write it in the official NGSIM layout.
