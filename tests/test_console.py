@@ -67,7 +67,7 @@ def test_help_names_the_version_and_every_command(tmp_path) -> None:
     ],
 )
 def test_what_need_not_wait_for_torch_does_not_load_it(tmp_path, words, unused, printed) -> None:
-    write_parquet(pd.DataFrame({"x": [1.0]}), tmp_path / "run" / "episodes.parquet")
+    write_parquet(pd.DataFrame({"strategy": ["idm"]}), tmp_path / "run" / "episodes.parquet")
     (tmp_path / "run" / "config.yaml").write_text("seed: 3\n")
     done = ran(sys.executable, "-c", PROGRAM, *words, cwd=tmp_path)
     assert not unused.intersection(done.stderr.rpartition("loaded:")[2].split())

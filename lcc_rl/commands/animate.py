@@ -16,7 +16,7 @@ from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file, in_words
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
-from lcc_rl.results.runs import CONFIG, STEPS, stored_config
+from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
 
 KEPT = "evaluation.sample_episodes=4"
 
@@ -53,15 +53,17 @@ def run(
     steps = read_parquet(folder / STEPS)
     if steps.empty:
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
-    names = list(dict.fromkeys(map(str, steps["strategy"])))
-    strategy = names[-1] if strategy is None else strategy
-    if strategy not in names:
-        raise unknown_name("strategy", strategy, names)
-    found = sample_episodes(steps, strategy)
-    if not 0 <= episode < len(found):
-        raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
-    label, rows = list(found.items())[episode]
-    motion = _cut(motion_of(rows, stored_config(folder)["scenario"]), start, duration)
+    scenario = stored_config(folder)["scenario"]
+    with reading(folder / STEPS):
+        names = list(dict.fromkeys(map(str, steps["strategy"])))
+        strategy = names[-1] if strategy is None else strategy
+        if strategy not in names:
+            raise unknown_name("strategy", strategy, names)
+        found = sample_episodes(steps, strategy)
+        if not 0 <= episode < len(found):
+            raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
+        label, rows = list(found.items())[episode]
+        motion = _cut(motion_of(rows, scenario), start, duration)
     title = f"{in_words(strategy)}: {label}"
     default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
     return animate(motion, title, out or default)

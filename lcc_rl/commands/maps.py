@@ -25,7 +25,7 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.figures.policy_maps import policy_maps
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
-from lcc_rl.results.runs import STEPS, load_config
+from lcc_rl.results.runs import STEPS, load_config, reading
 from lcc_rl.runs.precision import prepare_torch
 
 log = logging.getLogger("lcc_rl")
@@ -56,7 +56,8 @@ def run(folder: str | Path, trust: Sequence[str] = ()) -> list[Path]:
     own = [s for s in strategies if s.policy is not None and not s.name.endswith("oracle")]
     learned = list({s.name: s for s in reversed(own)}.values())[:MOST]
     steps, scenario = read_parquet(folder / STEPS), vars(cfg.scenario)
-    grid = grid_of(_motions(steps, [strategy.name for strategy in learned], scenario, folder))
+    with reading(folder / STEPS):
+        grid = grid_of(_motions(steps, [strategy.name for strategy in learned], scenario, folder))
     platoon = cfg.scenario.pieces.get("communication") is not None
     tables = []
     for strategy in (*reversed(learned), baseline(cfg, "cacc tuned" if platoon else "idm tuned")):

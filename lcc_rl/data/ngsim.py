@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -142,6 +142,18 @@ def read_ngsim(
     return Trajectories(samples, rows.report)
 
 
+def of_columns(columns: Mapping[str, NDArray], name: str) -> Trajectories:
+    """Return the trajectories of a file in feet that has these columns.
+
+    Args:
+        columns: the official columns, checked.
+        name: what the report calls the file.
+    """
+    rows = _Rows(ReadReport(files=[name]), FOOT)
+    rows.add(_Numbers(name, columns), None)
+    return Trajectories(_sorted(rows), rows.report)
+
+
 # -- blocks of rows --------------------------------------------------------------------------------
 
 
@@ -192,6 +204,22 @@ class _Block:
             return DataError(f"{self.path}: line {line}, column {column.key!r} {words}")
 
         return checked(self.table[column.key], column, fault)
+
+
+class _Numbers(_Block):
+    """Rows that are at hand as numbers."""
+
+    def __init__(self, path: str, columns: Mapping[str, NDArray]) -> None:
+        self.path, self.columns = path, columns
+
+    def __len__(self) -> int:
+        return len(self.columns["Vehicle_ID"])
+
+    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
+        return [""], np.zeros(len(self), dtype=np.int64)
+
+    def values(self, column: Column) -> NDArray[np.float64]:
+        return self.columns[column.key].astype(np.float64)
 
 
 def _blocks(name: str) -> Iterator[_Block]:

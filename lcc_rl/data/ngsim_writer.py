@@ -39,9 +39,7 @@ def write_ngsim(samples: pd.DataFrame, path: str | Path) -> None:
     Raises:
         ResultsError: if the file cannot be written.
     """
-    # Plain text orders recordings the same whatever the categories' own order is.
-    frame = samples.astype({"recording": str}).sort_values(KEY, ignore_index=True)
-    table = pa.table(_columns(frame))
+    table = pa.table(official_columns(samples))
     text = io.BytesIO((",".join(table.column_names) + "\n").encode())
     text.seek(0, io.SEEK_END)
     # Arrow quotes the names of a header it writes itself; the published files do not.
@@ -53,8 +51,10 @@ def write_ngsim(samples: pd.DataFrame, path: str | Path) -> None:
         temporary.write_bytes(content)
 
 
-def _columns(frame: pd.DataFrame) -> dict[str, NDArray]:
-    """The 18 official columns in their order."""
+def official_columns(samples: pd.DataFrame) -> dict[str, NDArray]:
+    """Return the 18 official columns of samples in their order, see :func:`write_ngsim`."""
+    # Plain text orders recordings the same whatever the categories' own order is.
+    frame = samples.astype({"recording": str}).sort_values(KEY, ignore_index=True)
     start = {
         name: round(datetime.fromisoformat(name).timestamp() * 1000)
         for name in frame["recording"].unique()

@@ -154,7 +154,8 @@ def string_measures(
     def deviation(entry: Tensor) -> Tensor:
         return average((entry - average(entry)).square()).sqrt()
 
-    spread = speed.std(-2, correction=0)
+    # Several times as fast as torch's std of a few vehicles.
+    spread = (speed - speed.mean(-2, keepdim=True)).square().mean(-2).sqrt()
     late = torch.arange(len(alive), device=alive.device).view(-1, *[1] * (alive.ndim - 1))
     last = alive & (late >= (0.9 * steps).floor())
     found = {

@@ -21,7 +21,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET, short_name
-from lcc_rl.config.schemas import AUTO, StudyConfig
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
 from lcc_rl.evaluation.rollout import Policy
@@ -32,19 +32,19 @@ log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
-PLACE = f"controller@{AUTO}"
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
 TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
 FILTERED = "_filtered"
-# Settings that make the controller of each baseline.
-BASELINES = {
-    "idm": ("variant=idm",),
-    **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
-    **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
+GAINS = ("path", "paper_like", "tuned")
+# File in conf/controller of each baseline, and the settings that differ from it.
+BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
+    "idm": ("idm", {}),
+    **{name: (file, {}) for name, file in TUNED.items()},
+    **{f"cacc {gains}": ("cacc", {}) for gains in GAINS},
     # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
-    "mpc_far": ("variant=idm", f"{AUTO}.longest_gap=-4.0", f"{PLACE}=mpc"),
-    "deadbeat": ("variant=deadbeat",),
-    "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
+    "mpc_far": ("mpc", {"longest_gap": -4.0}),
+    "deadbeat": ("deadbeat", {}),
+    "deadbeat oracle": ("deadbeat", {"lookahead": "oracle"}),
 }
 DIRECT = "direct"  # a string without automated vehicles
 RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the leader
@@ -135,9 +135,22 @@ def baseline(cfg: StudyConfig, name: str) -> Strategy:
 @cache
 def rules() -> tuple[str, ...]:
     """Return the names of all baselines and of the files of conf/controller."""
-    shipped = Path(str(files("lcc_rl.conf"))) / "controller"
-    found = sorted(path.stem for path in shipped.glob("*.yaml") if path.stem not in NEEDY)
+    found = sorted(_files() - set(NEEDY))
     return tuple(dict.fromkeys([DIRECT, PEOPLE, *BASELINES, *found]))
+
+
+def _files() -> set[str]:
+    shipped = Path(str(files("lcc_rl.conf"))) / "controller"
+    return {path.stem for path in shipped.glob("*.yaml")}
+
+
+@cache
+def _controllers(gains: str) -> dict[str, Any]:
+    """Return the nodes of the files of conf/controller, composed at once."""
+    names = _files() - {"action", "human", "hcfs"}
+    nodes = [f"+controller@scenario.controllers.{name}={name}" for name in sorted(names)]
+    cfg = load("evaluate", ["variant=idm", f"+gains={gains}", *nodes])
+    return dict(cfg.scenario.controllers)
 
 
 @cache
@@ -153,8 +166,9 @@ def baseline_controller(name: str, suffix: str = "") -> Any:
     """
     if name not in rules():
         raise unknown_name("baseline", name, rules())
-    *first, last = BASELINES.get(name, ("variant=idm", f"{PLACE}={name}"))
-    return load("evaluate", [*first, last + suffix]).scenario.controllers[AUTOMATED]
+    file, settings = BASELINES.get(name, (name, {}))
+    gains = name.removeprefix("cacc ") if file == "cacc" else GAINS[-1]
+    return {**_controllers(gains)[file + suffix], **settings}
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:

@@ -73,6 +73,8 @@ def study_figures(
 ) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of all that an evaluation with a row per episode shows.
 
+    Those that networks are compared with have no figures of their own beside a network's.
+
     Args:
         episodes: rows of episodes.parquet.
         steps: rows of steps.parquet; it may have none.
@@ -85,7 +87,7 @@ def study_figures(
         yield "space_time", diagram
     if len(steps) and {"human", "idm"} & set(names) and cars[-1] not in UNTRAINED:
         yield "overview", overview(episodes, steps, cars[-1])
-    for name in cars:
+    for name in [name for name in cars if name not in UNTRAINED] or cars:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:

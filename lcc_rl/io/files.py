@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -96,11 +96,24 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
         ConfigError: if it does not fit into memory.
     """
     # As a table, as a data frame, and once more while it is checked.
-    require_memory({f"reading {path}": 3 * _read(path, _unpacked_size)})
-    _schema(Path(path))
-    table = _read(path, partial(pq.read_table, page_checksum_verification=True))
-    frame: pd.DataFrame = table.to_pandas()
+    require_memory({f"reading {path}": 3 * unpacked_size(path)})
+    schema_of(path)
+    table = read_table(path)
+    try:
+        frame: pd.DataFrame = table.to_pandas()
+    except Exception as error:  # whatever pandas' own entry of the metadata says
+        raise _no_frame(path, error) from error
     return frame
+
+
+def read_table(path: str | Path, encoded: Sequence[str] = ()) -> pa.Table:
+    """Read a table, of which some columns of text are dictionary-encoded.
+
+    Raises:
+        ResultsError: if it is missing or damaged.
+    """
+    how = {"page_checksum_verification": True, "read_dictionary": list(encoded)}
+    return _read(path, lambda place: pq.read_table(place, **how))
 
 
 def as_rows(path: Path) -> Rows:
@@ -110,55 +123,73 @@ def as_rows(path: Path) -> Rows:
         ResultsError: if it is missing, damaged or of a newer schema.
     """
     many = _read(path, pq.read_metadata).num_rows > FEW
-    return as_dataset([path]) if many else read_parquet(path)
+    return as_dataset({path: {}}, schema_of(path)) if many else read_parquet(path)
 
 
-def as_dataset(
-    paths: Sequence[Path], columns: Sequence[Mapping[str, Any]] | None = None
-) -> ds.Dataset:
+def as_dataset(tables: Mapping[Path, Mapping[str, Any]], schema: pa.Schema) -> ds.Dataset:
     """Return tables as one dataset of pyarrow, whose rows are read when asked.
 
-    Text is dictionary-encoded. A column that a table lacks is null there.
-
     Args:
-        paths: the tables.
-        columns: further columns, constant within each table.
-
-    Raises:
-        ResultsError: if a table is missing, damaged, of a newer schema, or has another type of
-            column than the rest.
+        tables: of each file the columns that are constant in it, the same of all files.
+        schema: columns of the files, see :func:`schema_of`; one that a file lacks is null there.
     """
-    schemas = [_schema(path) for path in paths]
-    try:
-        schema = pa.unify_schemas(schemas, promote_options="permissive")
-    except pa.ArrowException as error:
-        raise ResultsError(f"{paths[0].parent}: tables differ: {error}") from error
-    texts = [field.name for field in schema if _is_text(field.type)]
-    for name in texts:
-        schema = schema.set(schema.get_field_index(name), pa.field(name, TEXT))
-    extra = [dict(each) for each in columns or [{}] * len(paths)]
-    own = pa.Table.from_pylist(extra).schema
-    own = pa.schema([(x.name, TEXT if _is_text(x.type) else x.type) for x in own])
-    fields = [*schema, *(field for field in own if field.name not in schema.names)]
+    constant = pa.Table.from_pylist([dict(columns) for columns in tables.values()]).schema
+    for field in _texts_encoded(constant):
+        schema = schema.append(field)
     return ds.FileSystemDataset.from_paths(
-        [str(path) for path in paths],
-        schema=pa.schema(fields),
+        [str(path) for path in tables],
+        schema=schema,
         format=ds.ParquetFileFormat(
-            ds.ParquetReadOptions(dictionary_columns=texts),
+            ds.ParquetReadOptions(dictionary_columns=texts_of(schema)),
             ds.ParquetFragmentScanOptions(page_checksum_verification=True),
         ),
         filesystem=fs.LocalFileSystem(),
-        partitions=[_constants(each) for each in extra],
+        partitions=[_constants(columns) for columns in tables.values()],
     )
 
 
-def _schema(path: Path) -> pa.Schema:
-    """Return the columns of a table of the present schema version, or of other origin."""
+def schema_of(path: str | Path, needed: Iterable[str] = ()) -> pa.Schema:
+    """Return the columns of a table of the present schema version, or of other origin.
+
+    Text is dictionary-encoded.
+
+    Raises:
+        ResultsError: if it is missing, damaged, of another schema version, no data frame, or
+            without a column that is needed.
+    """
     found: pa.Schema = _read(path, pq.read_schema)
-    version = (found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()).decode()
+    version = _decoded((found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()))
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path}: schema version {version[:20]!r}; expected {SCHEMA_VERSION}")
-    return found.remove_metadata()
+    try:
+        _ = found.pandas_metadata
+    except ValueError as error:
+        raise _no_frame(path, error) from error
+    for name in needed:
+        if name not in found.names:
+            raise ResultsError(f"{path}: not what a run writes: it has no column {name}")
+    return _texts_encoded(found.remove_metadata())
+
+
+def unified(schema: pa.Schema, other: pa.Schema, path: Path) -> pa.Schema:
+    """Return the columns of two schemas.
+
+    Raises:
+        ResultsError: if a column has another type in the other one, which is that of ``path``.
+    """
+    try:
+        return pa.unify_schemas([schema, other], promote_options="permissive")
+    except pa.ArrowException as error:
+        raise ResultsError(f"{path}: {_in_one_line(error)}") from error
+
+
+def texts_of(schema: pa.Schema) -> list[str]:
+    """Return the names of the columns of text."""
+    return [field.name for field in schema if field.type == TEXT]
+
+
+def _texts_encoded(schema: pa.Schema) -> pa.Schema:
+    return pa.schema([(x.name, TEXT if _is_text(x.type) else x.type) for x in schema])
 
 
 def _is_text(kind: pa.DataType) -> bool:
@@ -174,20 +205,33 @@ def _constants(columns: Mapping[str, Any]) -> ds.Expression:
     return found
 
 
-def _unpacked_size(path: Path) -> int:
-    found = pq.read_metadata(path)
+def unpacked_size(path: str | Path) -> int:
+    """Return the bytes that a table's columns take in memory, about."""
+    found = _read(path, pq.read_metadata)
     return sum(found.row_group(place).total_byte_size for place in range(found.num_row_groups))
 
 
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
     """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
-    if not path.is_file():
-        raise ResultsError(f"{path}: no such file")
     try:
+        if not path.is_file():  # a pipe would be waited for
+            raise ResultsError(f"{path}: no such file")
         return reader(path)
     except (pa.ArrowException, OSError) as error:
-        raise ResultsError(f"{path}: not a readable parquet file: {error}") from error
+        raise ResultsError(f"{path}: not readable as parquet: {_in_one_line(error)}") from error
+
+
+def _no_frame(path: str | Path, error: Exception) -> ResultsError:
+    return ResultsError(f"{path}: damaged, no data frame: {_in_one_line(error)}")
+
+
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _decoded(text: bytes) -> str:
+    return text.decode(errors="replace")
 
 
 def parquet_metadata(path: str | Path) -> dict[str, str]:
@@ -197,4 +241,4 @@ def parquet_metadata(path: str | Path) -> dict[str, str]:
         ResultsError: if the file is missing or damaged.
     """
     raw = _read(path, pq.read_schema).metadata or {}
-    return {key.decode(): value.decode() for key, value in raw.items() if key != b"pandas"}
+    return {_decoded(key): _decoded(value) for key, value in raw.items() if key != b"pandas"}

@@ -23,9 +23,9 @@ def read_text(path: Path) -> str:
         ResultsError: if it is missing, no regular file (a pipe would be waited for), too large or
             not text.
     """
-    if not path.is_file():
-        raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     try:
+        if not path.is_file():
+            raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
         text = content.decode()

@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-from torchrl.record.loggers import Logger
+from typing import TYPE_CHECKING, Any, Literal
 
 from lcc_rl.errors import ConfigError, how_to_install
 from lcc_rl.settings import Settings
+
+if TYPE_CHECKING:  # loading it looks for the packages of all loggers
+    from torchrl.record.loggers import Logger
 
 Row = Mapping[str, float]
 

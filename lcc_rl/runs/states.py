@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from omegaconf.errors import OmegaConfBaseException
 
 from lcc_rl.errors import Interrupted, LccError, ResultsError
-from lcc_rl.io.atomic import atomic_path, remove_leftovers
+from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 
 LOCK, ERROR, PROGRESS = ".lock", "error.txt", "progress.json"
@@ -157,10 +157,17 @@ def is_finished(folder: Path) -> bool:
 
 
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
-    """Return the state of the run in a folder."""
+    """Return the state of the run in a folder; one that cannot be entered has failed."""
+    name = folder.name if name is None else name
+    try:
+        return _inspected(folder, name)
+    except OSError as error:
+        return RunState(name, "failed", error=f"cannot be read: {error.strerror}")
+
+
+def _inspected(folder: Path, name: str) -> RunState:
     progress = read_progress(folder) or {}
     done, total = int(progress.get("done", 0)), int(progress.get("total", 0))
-    name = folder.name if name is None else name
     if is_claimed(folder):
         return RunState(name, "running", done, total, float(progress.get("eta_s", 0.0)))
     if (folder / ERROR).exists():
@@ -191,9 +198,11 @@ def run_folders(root: Path) -> list[Path]:
     if not root.is_dir():
         raise ResultsError(f"{root}: no such folder")
     found = []
-    for place, folders, files in os.walk(root):
+    # A folder that cannot be listed may be a run, whose state says so.
+    for place, folders, files in os.walk(root, onerror=lambda e: found.append(Path(e.filename))):
         is_run = bool(MARKS.intersection(files)) or ".hydra" in folders
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        own = SUBFOLDERS if is_run else ()
+        folders[:] = sorted(x for x in folders if not x.startswith(".") and x not in own)
         if is_run:
             found.append(Path(place))
     parents = {parent for folder in found for parent in folder.parents}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,19 +48,18 @@ def drive_platoons(
     leader: StopAndGo,
     drivers: DriverPopulation,
     vehicles: int,
-    seen: NDArray[np.int64],
     noise: float,
-    generator: np.random.Generator,
-) -> Stream:
-    """Simulate platoons that drive one after another on one lane.
+    recordings: Sequence[tuple[NDArray[np.int64], np.random.Generator]],
+) -> list[Stream]:
+    """Simulate recordings, in each of which platoons drive one after another on one lane.
 
     Args:
         leader: stochastic leader of every platoon.
         drivers: population from which the followers are drawn.
         vehicles: vehicles per platoon, the leader included.
-        seen: recorded steps of every platoon ``[platoons]``.
         noise: relative noise of the drivers' acceleration (A18).
-        generator: source of all randomness.
+        recordings: of each the recorded steps of every platoon ``[platoons]``, and the source of
+            all its randomness.
 
     Raises:
         ConfigError: if drivers have another model than the IDM.
@@ -67,17 +67,46 @@ def drive_platoons(
     if drivers.models is not None:
         known = ", ".join(sorted(set(drivers.models)))
         raise ConfigError(f"data.drivers: expected IDM drivers for a stream, got those of {known}")
-    warm_up = round(WARM_UP_S / FRAME)
-    steps = warm_up + int(seen.max())
-    ahead, level = leader.drive(len(seen), steps, FRAME, generator)
-    shape = (vehicles - 1, len(seen))
-    ranks = [drivers.select(row) for row in draw_drivers(drivers, level, shape, generator)]
-    xi = torch.from_numpy(generator.uniform(0.0, noise, (steps, *shape)))
-    speed, gap = follow(torch.from_numpy(ahead), ranks, xi)
-    mean, spread, shortest, longest = LENGTHS_M
-    length = generator.normal(mean, spread, (vehicles, len(seen))).clip(shortest, longest)
-    samples = _samples(speed, _positions(speed, gap, length), length, warm_up, seen)
-    return Stream(samples, _truth(ranks))
+    drawn = _drawn(leader, drivers, vehicles, noise, recordings)
+    ahead, chosen, xi, _ = (np.concatenate(parts, -1) for parts in zip(*drawn, strict=True))
+    ranks = [drivers.select(row) for row in torch.from_numpy(chosen)]
+    speed, gap = follow(torch.from_numpy(ahead), ranks, torch.from_numpy(xi))
+    made, first, warm_up = [], 0, round(WARM_UP_S / FRAME)
+    for (seen, _), (_, chosen, _, length) in zip(recordings, drawn, strict=True):
+        own = slice(first, first := first + len(seen))
+        position = _positions(speed[..., own], gap[..., own], length)
+        samples = _samples(speed[..., own], position, length, warm_up, seen)
+        ranks = [drivers.select(row) for row in torch.from_numpy(chosen)]
+        made.append(Stream(samples, _truth(ranks)))
+    return made
+
+
+def _drawn(
+    leader: StopAndGo,
+    drivers: DriverPopulation,
+    vehicles: int,
+    noise: float,
+    recordings: Sequence[tuple[NDArray[np.int64], np.random.Generator]],
+) -> list[tuple[Array, NDArray[np.int64], Array, Array]]:
+    """Draw leaders' speeds, drivers, noise and lengths of each recording, platoons last.
+
+    Series of short recordings go on, so that all have the length of the longest.
+    """
+    warm_up, (mean, spread, shortest, longest) = round(WARM_UP_S / FRAME), LENGTHS_M
+    most, drawn = warm_up + max(int(seen.max()) for seen, _ in recordings), []
+    for seen, generator in recordings:
+        steps, shape = warm_up + int(seen.max()), (vehicles - 1, len(seen))
+        ahead, level = leader.drive(len(seen), steps, FRAME, generator)
+        chosen = draw_drivers(drivers, level, shape, generator).numpy()
+        xi = generator.uniform(0.0, noise, (steps, *shape))
+        length = generator.normal(mean, spread, (vehicles, len(seen))).clip(shortest, longest)
+        drawn.append((_longer(ahead, most + 1), chosen, _longer(xi, most), length))
+    return drawn
+
+
+def _longer(values: Array, steps: int) -> Array:
+    """Return a series with its last values repeated to a number of steps."""
+    return np.concatenate([values, np.repeat(values[-1:], steps - len(values), axis=0)])
 
 
 def draw_drivers(

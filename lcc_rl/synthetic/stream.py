@@ -1,9 +1,10 @@
 """Synthetic congested traffic with known drivers, the default data source.
 
 A lane of IDM drivers drawn from the calibrated I-80 population drives in platoons behind
-stochastic stop-and-go leaders (:class:`lcc_rl.synthetic.stop_and_go.StopAndGo`). The stream is
-written in the official NGSIM layout and read back, so that it passes the same reader, extraction
-and calibration as the real files. Unlike there, the parameters of every driver are known.
+stochastic stop-and-go leaders (:class:`lcc_rl.synthetic.stop_and_go.StopAndGo`). The stream has the
+columns and the rounding of the official NGSIM layout, in which it can be written, and passes the
+same extraction and calibration as the real files. Unlike there, the parameters of every driver are
+known.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ import pandas as pd
 from pydantic import Field, InstanceOf
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.ngsim_writer import write_ngsim
-from lcc_rl.data.sources import LoadedEpisodes, NgsimSource
+from lcc_rl.data.ngsim import of_columns
+from lcc_rl.data.ngsim_writer import official_columns, write_ngsim
+from lcc_rl.data.sources import LoadedEpisodes, episodes_of
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.errors import LARGEST_SIZE, LAST_SEED, ConfigError
@@ -42,7 +44,7 @@ FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 
 
 class StreamSource(Settings):
-    """Source of synthetic car-following episodes, written in the NGSIM layout and read back.
+    """Source of synthetic car-following episodes, in the columns and the rounding of NGSIM.
 
     The default size gives 270 pairs in three recordings; the I-80 data that the leader is fitted
     to hold 264 pairs in three recordings.
@@ -74,20 +76,19 @@ class StreamSource(Settings):
         count, longest = self.recordings * self.platoons * self.vehicles, self.duration_s[1]
         size = f"data: recordings × platoons × vehicles = {count}, up to {longest:g} s each,"
         require_memory({size: count * longest / FRAME * SAMPLE})
+        low, high = (round(value / FRAME) for value in self.duration_s)
+        drawn = []
+        for index in range(self.recordings):
+            generator = np.random.default_rng([self.seed, index])
+            drawn.append((generator.integers(low, high + 1, self.platoons), generator))
+        drivers = self.drivers or bootstrap()
+        made = drive_platoons(self.leader, drivers, self.vehicles, self.noise, drawn)
         made = [
-            self.drive(recording_name(index), np.random.default_rng([self.seed, index]))
-            for index in range(self.recordings)
+            Stream(one.samples.assign(recording=name), one.truth.assign(recording=name))
+            for name, one in zip(map(recording_name, range(self.recordings)), made, strict=True)
         ]
         samples = pd.concat([one.samples for one in made], ignore_index=True)
         return Stream(samples, pd.concat([one.truth for one in made], ignore_index=True))
-
-    def drive(self, name: str, generator: np.random.Generator) -> Stream:
-        """Simulate one recording; vehicle ids count from 1, platoon by platoon, front to back."""
-        low, high = (round(value / FRAME) for value in self.duration_s)
-        seen = generator.integers(low, high + 1, self.platoons)
-        drivers = self.drivers or bootstrap()
-        made = drive_platoons(self.leader, drivers, self.vehicles, seen, self.noise, generator)
-        return Stream(made.samples.assign(recording=name), made.truth.assign(recording=name))
 
     def write(self, path: str | Path) -> Stream:
         """Generate the stream and write it in the official NGSIM layout.
@@ -97,28 +98,35 @@ class StreamSource(Settings):
             ResultsError: if a file cannot be written.
         """
         stream = self.generate()
-        write_ngsim(stream.samples, path)
-        write_parquet(stream.truth, truth_path(path))
+        write_stream(stream, path)
         return stream
 
     def load(self) -> LoadedEpisodes:
-        """Write the stream, read it back and extract its car-following episodes.
+        """Generate the stream and extract the car-following episodes that its file would have.
 
         Raises:
             DataError: if no pair meets the criteria.
             ConfigError: if ``keep`` names a file that holds something else.
             ResultsError: if the file cannot be written.
         """
-        with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
-            kept = Path(self.keep or "stream.csv").expanduser()
-            path = Path(folder) / kept.name
-            self.write(path)
-            loaded = NgsimSource(path=str(path), criteria=self.criteria).load()
-            if self.keep is not None:
+        stream = self.generate()
+        if self.keep is not None:
+            with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
+                kept = Path(self.keep).expanduser()
+                path = Path(folder) / kept.name
+                write_stream(stream, path)
                 keep_files({path: kept, truth_path(path): truth_path(kept)})
+        trajectories = of_columns(official_columns(stream.samples), "the stream")
+        loaded = episodes_of(trajectories, self.criteria, None)
         size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"
         line = f"synthetic stream: {size} vehicles, seed {self.seed}"
         return replace(loaded, report=[line, *loaded.report])
+
+
+def write_stream(stream: Stream, path: str | Path) -> None:
+    """Write a stream, and beside it the parameters of its drivers."""
+    write_ngsim(stream.samples, path)
+    write_parquet(stream.truth, truth_path(path))
 
 
 def keep_files(files: Mapping[Path, Path]) -> None:

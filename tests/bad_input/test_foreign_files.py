@@ -14,7 +14,6 @@ import torch
 import yaml
 from commands import content, run_command, tiny
 
-from lcc_rl import results
 from lcc_rl.commands import evaluation, training
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
@@ -219,19 +218,3 @@ def test_schema_versions_that_there_are_not(tmp_path) -> None:
         with pytest.raises(ResultsError, match=r"a\.parquet: schema version") as caught:
             read_parquet(path)
         assert len(str(caught.value)) < 200
-
-
-def test_damaged_runs_are_left_out_by_name(trained, tmp_path, caplog) -> None:
-    for name in "abc":
-        shutil.copytree(trained, tmp_path / name)
-    (tmp_path / "b" / "episodes.parquet").write_text("x")
-    (tmp_path / "c" / "config.yaml").write_text(": [")
-    rows = results.load(tmp_path)
-    assert set(rows["run"]) == {"a"}
-    assert set(rows.attrs["damaged"]) == {"b", "c"}
-    assert "b/episodes.parquet" in caplog.text
-    with pytest.raises(ResultsError, match=r"b/episodes\.parquet"):
-        results.load(tmp_path, strict=True)
-    shutil.rmtree(tmp_path / "a")
-    with pytest.raises(ResultsError, match=r"none is readable: .*b/episodes\.parquet"):
-        results.load(tmp_path)

@@ -13,6 +13,7 @@ from helpers import slow_but
 from stream_statistics import compare_statistics, leader_statistics
 
 from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.sources import NgsimSource
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError
@@ -82,6 +83,13 @@ def test_calibration_recovers_the_time_gaps(stream: Stream, tmp_path: Path) -> N
     assert error.median() < 0.02
     assert error.max() < 0.3
     assert found["rmspe"].median() < 0.005
+
+
+def test_the_stream_has_the_episodes_of_its_file(tmp_path: Path) -> None:
+    source, path = StreamSource(**SMALL, seed=5), tmp_path / "stream.csv"
+    source.write(path)
+    file = NgsimSource(path=path, criteria=source.criteria).load()
+    pd.testing.assert_frame_equal(source.load().episodes, file.episodes, check_exact=True)
 
 
 def test_nobody_reverses_or_collides() -> None:

@@ -25,6 +25,7 @@ from benchmarks.collect import collect
 from benchmarks.env import env
 from benchmarks.evaluate import evaluate
 from benchmarks.harness import EXTRA, Row, drawn, installed
+from benchmarks.loading import loading, start
 from benchmarks.read import read
 from benchmarks.train import train
 from benchmarks.update import update
@@ -32,7 +33,8 @@ from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import LccError, ResultsError, how_to_install, unknown_name
 from lcc_rl.io.files import processor, write_parquet
 
-LISTED = (read, env, collect, update, train, calibrate, evaluate)
+LISTED = (read, loading, start, env, collect, update, train, calibrate, evaluate)
+NO_DEVICE = ("read", "loading", "start")  # always on the processor
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
 }
@@ -83,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise unknown_name("benchmark", name, BENCHMARKS)
         for name in options.names or BENCHMARKS:
             chosen = [options.device] if options.device else devices
-            for device in ["cpu"] if name == "read" else chosen:
+            for device in ["cpu"] if name in NO_DEVICE else chosen:
                 measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))
                 console.print(drawn(f"{name}, {device}", measured))
                 rows += [{"benchmark": name, **row, "device": device} for row in measured]

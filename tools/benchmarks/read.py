@@ -19,16 +19,20 @@ from lcc_rl.errors import DataError
 
 # The kernel's mark of this very process: ru_maxrss may begin at that of the one that started it.
 PROGRAM = """
-import resource, sys
-from pathlib import Path
-from lcc_rl.data.ngsim import read_ngsim
+import resource
 def peak():
     if not Path("/proc/self/status").exists():
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # bytes where no /proc
     return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 2**10
+from pathlib import Path
 before = peak()
-read_ngsim(sys.argv[1], sys.argv[2] or None)
+read()
 print(peak() - before)
+"""
+READER = """
+import sys
+from lcc_rl.data.ngsim import read_ngsim
+def read(): read_ngsim(sys.argv[1], sys.argv[2] or None)
 """
 PEAK = "peak memory"
 
@@ -50,9 +54,9 @@ def read(options: Namespace) -> list[Row]:
         rows = rates(options, runs, "rows/s", counts, against)
         write_copies(path, fourfold, ("a", "b", "c", "d"))
         memory = {
-            PEAK: peak_memory(path, ""),
-            "… 4 × the rows, ¼ kept": peak_memory(fourfold, "a"),
-            "… 4 × the rows": peak_memory(fourfold, ""),
+            PEAK: peak_memory(READER, str(path), ""),
+            "… 4 × the rows, ¼ kept": peak_memory(READER, str(fourfold), "a"),
+            "… 4 × the rows": peak_memory(READER, str(fourfold), ""),
         }
     return rows + rows_of(memory, "MiB", {name: [PEAK] for name in memory if name != PEAK})
 
@@ -70,8 +74,13 @@ def write_copies(path: Path, target: Path, locations: Sequence[str]) -> None:
             file.writelines(f"{line},{place}\n" for line in lines)
 
 
-def peak_memory(path: Path, location: str) -> np.ndarray:
-    """Return by how much reading raises the peak of a fresh process [MiB]."""
-    command = [sys.executable, "-c", PROGRAM, str(path), location]
+def peak_memory(reader: str, *words: str) -> np.ndarray:
+    """Return by how much reading raises the peak of a fresh process [MiB].
+
+    Args:
+        reader: a program that defines ``read``.
+        words: its arguments.
+    """
+    command = [sys.executable, "-c", reader + PROGRAM, *words]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return np.array([float(done.stdout)])

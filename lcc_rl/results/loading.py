@@ -1,0 +1,266 @@
+"""Tables of many runs as one."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import pandas as pd
+import pyarrow as pa
+from pandas.api.types import is_numeric_dtype
+from pyarrow.dataset import Dataset
+
+from lcc_rl.errors import ResultsError, unknown_name
+from lcc_rl.io.atomic import SUBFOLDERS
+from lcc_rl.io.files import (
+    Rows,
+    as_dataset,
+    read_table,
+    schema_of,
+    texts_of,
+    unified,
+    unpacked_size,
+)
+from lcc_rl.io.memory import require_memory
+from lcc_rl.results.runs import CONFIG, flatten, read_settings
+
+log = logging.getLogger("lcc_rl")
+
+# The tables of a run, and columns without which a file of this name is not one.
+TABLES = {
+    "episodes": ("strategy",),
+    "training": ("iteration",),
+    "timing": ("iteration",),
+    "steps": ("strategy", "time_s"),
+    "drivers": ("desired_speed_mps", "time_gap_s"),
+}
+ALWAYS = ("variant", "seed")  # settings that are columns also where all runs agree
+SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
+# Integers of pandas that may be missing.
+NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.int32(): pd.Int32Dtype()}
+Runs = dict[Path, dict[str, Any]]  # the settings of each run by its table
+
+
+class Damaged(dict[str, str]):
+    """Reasons why runs are left out, by run.
+
+    Args:
+        root: the folder above the runs.
+        strict: raise the first reason instead.
+    """
+
+    def __init__(self, root: Path, strict: bool) -> None:
+        super().__init__()
+        self.root, self.strict = root, strict
+
+    @contextmanager
+    def noting(self, folder: Path) -> Iterator[None]:
+        """Note what is raised while files of a run are read."""
+        try:
+            yield
+        except ResultsError as error:
+            if self.strict:
+                raise
+            log.warning("left out: %s", error)
+            self[str(folder.relative_to(self.root))] = str(error)
+
+    def unlisted(self, error: OSError) -> None:
+        """Note a folder that cannot be listed."""
+        with self.noting(folder := Path(error.filename)):
+            raise ResultsError(f"{folder}: cannot be read: {error.strerror}")
+
+
+@overload
+def load(
+    root: str | Path = ...,
+    table: str = ...,
+    settings: Sequence[str] | None = ...,
+    *,
+    strict: bool = ...,
+    lazy: Literal[False] = ...,
+) -> pd.DataFrame: ...
+
+
+@overload
+def load(
+    root: str | Path = ...,
+    table: str = ...,
+    settings: Sequence[str] | None = ...,
+    *,
+    strict: bool = ...,
+    lazy: Literal[True],
+) -> Dataset: ...
+
+
+def load(
+    root: str | Path = "outputs",
+    table: str = "episodes",
+    settings: Sequence[str] | None = None,
+    *,
+    strict: bool = False,
+    lazy: bool = False,
+) -> Rows:
+    """Read one table of every run below a folder.
+
+    A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
+    and ``frame.attrs["missing"]`` the missing shards of an evaluation.
+
+    Args:
+        root: a run folder, or any folder above runs.
+        table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
+        settings: which settings become columns, by their dotted keys (``"seed"``,
+            ``"agent.gamma"``) or patterns of them (``"reward.*"``, ``"*"``); by default
+            ``"variant"``, ``"seed"`` and those in which the runs differ.
+        strict: raise for a damaged run, or a missing shard, instead.
+        lazy: return a pyarrow dataset, which reads rows when they are needed, for tables that do
+            not fit into memory.
+
+    Returns:
+        The rows of all runs, in the order of their folders, with the column ``run`` and the
+        chosen settings. Text is categorical.
+
+    Raises:
+        ConfigError: if the table, or a setting, is unknown, or the rows do not fit into memory.
+        ResultsError: if no such table below ``root`` can be read.
+    """
+    if table not in TABLES:
+        raise unknown_name("table", table, TABLES)
+    root = Path(root)
+    damaged = Damaged(root, strict)
+    runs, schema = _surveyed(root, table, damaged)
+    constants = _chosen(runs, settings, schema.names)
+    parts = {}
+    if not lazy:
+        require_memory({f"reading {root}": 2 * sum(map(unpacked_size, runs))})
+        for path in runs:
+            with damaged.noting(path.parent):
+                parts[path] = read_table(path, texts_of(schema))
+        runs = {path: runs[path] for path in parts}
+        if not runs:
+            raise _nothing(root, table, damaged)
+    missing = missing_shards(list(runs.values())) if table == "episodes" else []
+    for line in missing:
+        if strict:
+            raise ResultsError(f"{root}: {line}")
+        log.warning("%s: %s", root, line)
+    if lazy:
+        return as_dataset(constants, schema)
+    frame = _frame(parts, constants)
+    frame.attrs |= {"damaged": dict(damaged)} if damaged else {}
+    frame.attrs |= {"missing": missing} if missing else {}
+    return frame
+
+
+def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
+    """Return the files of a name in run folders at or below a folder, sorted."""
+    found = []
+    for place, folders, files in os.walk(root, onerror=damaged.unlisted):
+        own = SUBFOLDERS if CONFIG in files else ()
+        folders[:] = [x for x in folders if not x.startswith(".") and x not in own]
+        if name in files:
+            found.append(Path(place, name))
+    return sorted(found)
+
+
+def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema]:
+    """Return the settings of all runs whose tables can be read as one, and its columns."""
+    runs, schemas = {}, {}
+    for path in _files(root, f"{table}.parquet", damaged):
+        with damaged.noting(path.parent):
+            schema, config = schema_of(path, TABLES[table]), path.parent / CONFIG
+            own = dict(flatten(read_settings(config))) if config.exists() else {}
+            runs[path] = {"run": str(path.parent.relative_to(root)), **own}
+            schemas[path] = schema
+    # Columns are as most tables have them, whichever comes first.
+    common, whole, kept = Counter(map(str, schemas.values())), pa.schema([]), []
+    for path in sorted(runs, key=lambda path: -common[str(schemas[path])]):
+        with damaged.noting(path.parent):
+            whole = unified(whole, schemas[path], path)
+            kept.append(path)
+    if not kept:
+        raise _nothing(root, table, damaged)
+    return {path: runs[path] for path in sorted(kept)}, whole
+
+
+def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:
+    """Return the settings that become columns beside those of the table."""
+    every = dict.fromkeys(key for settings in runs.values() for key in settings)
+    for name in names or ():
+        if not any(fnmatchcase(key, name) for key in every):
+            near = get_close_matches(name, every, cutoff=0.4)  # there are some hundreds
+            raise unknown_name("setting of these runs", name, near)
+    first = next(iter(runs.values()))
+
+    def is_column(key: str) -> bool:
+        if names is not None:
+            return any(fnmatchcase(key, name) for name in names)
+        return key in ALWAYS or any(one.get(key) != first.get(key) for one in runs.values())
+
+    kept = [key for key in every if key == "run" or is_column(key)]
+    of_one_type = {
+        key: _of_one_type([one.get(key) for one in runs.values()])
+        for key in kept
+        if key not in columns
+    }
+    return {
+        path: {key: values[place] for key, values in of_one_type.items()}
+        for place, path in enumerate(runs)
+    }
+
+
+def _of_one_type(values: Sequence[Any]) -> list[Any]:
+    """Return the values of a setting, as text where they are of several types."""
+    kinds = {type(value) for value in values} - {type(None)}
+    if (kinds <= {int, float} and kinds) or len(kinds) == 1:
+        return list(values)
+    return [None if value is None else str(value) for value in values]
+
+
+def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
+    """Return tables, and what is constant in each, as one data frame."""
+    table = pa.concat_tables(parts.values(), promote_options="permissive")
+    counts = [len(part) for part in parts.values()]
+    integers = {
+        name: table[name].to_pandas(types_mapper=NULLABLE.get)
+        for name in table.column_names
+        if pa.types.is_integer(table[name].type) and table[name].null_count
+    }
+    first, columns = next(iter(constants.values())), {}
+    for key in first:
+        values = pd.Series([constants[path][key] for path in parts])
+        values = values if is_numeric_dtype(values) else values.astype("category")
+        columns[key] = values.repeat(counts).array
+    # Without the metadata of pandas, which may differ from table to table.
+    frame = table.to_pandas(split_blocks=True, self_destruct=True, ignore_metadata=True)
+    return pd.concat([frame.assign(**integers), pd.DataFrame(columns, copy=False)], axis=1)
+
+
+def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for every evaluation, among runs' settings, that lacks some of its shards."""
+    parts: dict[str, set[int]] = {}
+    for settings in (x for x in runs if (x.get(SHARDS) or 1) > 1):
+        others = {key: value for key, value in settings.items() if key not in (SHARD, "run")}
+        key = json.dumps(others, sort_keys=True, default=str)
+        parts.setdefault(key, set()).add(settings[SHARD])
+    lines = []
+    for key, present in parts.items():
+        settings = json.loads(key)
+        gaps = sorted(set(range(settings[SHARDS])) - present)
+        if gaps:
+            which = ", ".join(map(str, gaps[:10])) + (", …" if len(gaps) > 10 else "")
+            of = f"{len(gaps)} of {settings[SHARDS]} shards of variant {settings['variant']}"
+            lines.append(f"{of} are missing: {SHARD}={which}")
+    return lines
+
+
+def _nothing(root: Path, table: str, damaged: Damaged) -> ResultsError:
+    why = f"; none is readable: {next(iter(damaged.values()))}" if damaged else ""
+    return ResultsError(f"{root}: no {table}.parquet in it or below it{why}")

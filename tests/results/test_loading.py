@@ -1,0 +1,202 @@
+"""Tables of many runs: settings as columns, and damaged runs beside good ones."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from lcc_rl import results
+from lcc_rl.cli.status import main as status
+from lcc_rl.commands import animate
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.io.files import read_parquet, write_parquet
+
+TABLE = "episodes.parquet"
+
+
+def episodes(seed: int, rows: int = 6) -> pd.DataFrame:
+    energy = np.random.default_rng(seed).random(rows)
+    strategy, count = ["idm", "alcc"] * (rows // 2), pd.array([None, 3] * (rows // 2), "Int64")
+    return pd.DataFrame({"strategy": strategy, "training_seed": count, "energy_kj": energy})
+
+
+def made(folder: Path, seed: int = 0, **settings: object) -> Path:
+    folder.mkdir(parents=True)
+    content = {"seed": seed, "variant": "alcc", "agent": {"gamma": 0.9}, "trust": [], **settings}
+    (folder / "config.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    write_parquet(episodes(seed), folder / TABLE)
+    return folder
+
+
+# -- settings --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("names", "columns"),
+    [
+        (None, ["run", "seed", "variant", "agent.tau"]),
+        ([], ["run"]),
+        (["seed"], ["run", "seed"]),
+        (["agent.*"], ["run", "agent.gamma", "agent.tau"]),
+        (["*"], ["run", "seed", "variant", "agent.gamma", "trust", "agent.tau"]),
+    ],
+)
+def test_rows_are_those_of_the_files_beside_the_settings_that_are_named(
+    tmp_path, names, columns
+) -> None:
+    made(tmp_path / "b" / "2", 5, agent={"gamma": 0.9, "tau": 0.1})
+    made(tmp_path / "b" / "1", 7)
+    frame = results.load(tmp_path, settings=names)
+    assert list(frame.columns[3:]) == columns
+    assert frame["run"].tolist() == ["b/1"] * 6 + ["b/2"] * 6
+    own = pd.concat([episodes(7), episodes(5)], ignore_index=True)
+    assert frame["training_seed"].dtype == own["training_seed"].dtype
+    pd.testing.assert_frame_equal(frame[own.columns].astype({"strategy": str}), own)
+    found = results.load(tmp_path, settings=names, lazy=True).to_table().to_pandas()
+    found = found.astype({"training_seed": "Int64"})
+    pd.testing.assert_frame_equal(found.astype(object), frame.astype(object), check_exact=True)
+    if "agent.tau" in columns:
+        assert frame.groupby("run")["agent.tau"].first().tolist()[1] == 0.1
+
+
+def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:
+    made(tmp_path / "a")
+    with pytest.raises(ConfigError, match=r"'agent.gama'.*Did you mean 'agent.gamma'"):
+        results.load(tmp_path, settings=["seed", "agent.gama"])
+
+
+# -- damaged runs ----------------------------------------------------------------------------------
+
+
+def rewritten(folder: Path, key: bytes, value: bytes) -> None:
+    table = pq.read_table(folder / TABLE)
+    metadata = {**table.schema.metadata, key: value}
+    pq.write_table(table.replace_schema_metadata(metadata), folder / TABLE)
+
+
+def flipped(folder: Path) -> None:
+    """Change a byte of the first page, which its checksum shows."""
+    content = bytearray((folder / TABLE).read_bytes())
+    content[60] ^= 1
+    (folder / TABLE).write_bytes(content)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "text": lambda folder: (folder / TABLE).write_text("x"),
+    "page": flipped,
+    "schema": lambda folder: rewritten(folder, b"lcc_rl.schema", b"\xff"),
+    "pandas": lambda folder: rewritten(folder, b"pandas", b"{broken"),
+    "foreign": lambda folder: pd.DataFrame({"a": [1]}).to_parquet(folder / TABLE),
+    "typed": lambda folder: write_parquet(
+        episodes(0).assign(energy_kj=["much"] * 6), folder / TABLE
+    ),
+    "yaml": lambda folder: (folder / "config.yaml").write_text(": ["),
+    "scenario": lambda folder: (folder / "config.yaml").write_text("scenario: x"),
+}
+
+
+def test_damaged_runs_are_named_in_a_line_each_and_the_rest_is_read(tmp_path, caplog) -> None:
+    for name, damage in DAMAGES.items():
+        damage(made(tmp_path / name))
+    made(tmp_path / "good" / "1", 1)
+    made(tmp_path / "good" / "2", 2)
+    frame = results.load(tmp_path)
+    assert set(frame["run"]) == {"good/1", "good/2"}
+    assert frame.attrs["damaged"].keys() == DAMAGES.keys()
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == len(DAMAGES)
+    assert all("\n" not in line and str(tmp_path) in line for line in lines)
+    assert results.load(tmp_path, lazy=True).schema.names == list(frame.columns)
+    with pytest.raises(ResultsError, match=r"foreign/episodes\.parquet"):
+        results.load(tmp_path, strict=True)
+    for name in DAMAGES.keys() - {"typed"}:  # which is wrong beside others only
+        with pytest.raises(ResultsError, match=f"none is readable: .*{name}"):
+            results.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("broken", [b"{broken", b"[]", json.dumps({"columns": 5}).encode()])
+def test_broken_metadata_of_pandas_is_one_line(tmp_path, broken) -> None:
+    rewritten(made(tmp_path / "a"), b"pandas", broken)
+    with pytest.raises(ResultsError, match=r"a/episodes\.parquet: damaged") as caught:
+        read_parquet(tmp_path / "a" / TABLE)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """Return a folder of a user whom permissions bind, as which the test works."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        with TemporaryDirectory() as folder:
+            yield Path(folder)
+    finally:
+        os.seteuid(user)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o000])
+def test_a_folder_that_cannot_be_entered_is_named(open_folder, capsys, mode) -> None:
+    made(open_folder / "good")
+    closed = made(open_folder / "closed")
+    closed.chmod(mode)
+    try:
+        frame = results.load(open_folder)
+        assert set(frame["run"]) == {"good"}
+        assert frame.attrs["damaged"].keys() == {"closed"}
+        status([str(open_folder)])
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == 3
+        assert "closed  cannot be read: Permission denied" in lines[0]
+        with pytest.raises(OSError, match="closed"):  # which commands show in a line
+            animate.run(closed)
+    finally:
+        closed.chmod(0o700)
+
+
+SCENARIO = {
+    "name": "a",
+    "horizon": 9,
+    "time_step": 0.1,
+    "string": "automated human",
+    "road": "open",
+    "vehicle_length": 5.0,
+    "initial_speed": 0.0,
+    "controllers": {},
+    "start": {},
+    "filters": {},
+    "pieces": {},
+}
+GOOD = {"scenario": SCENARIO}
+
+
+@pytest.mark.parametrize(
+    ("steps", "settings", "message"),
+    [
+        (
+            {"strategy": ["idm"] * 2},
+            GOOD,
+            r"steps\.parquet: not what a run writes: .*training_seed",
+        ),
+        ({"a": [1]}, GOOD, r"steps\.parquet: not what a run writes"),
+        ({"strategy": ["idm"]}, {"scenario": "x"}, r"config\.yaml: damaged: scenario is 'x'"),
+        ({"strategy": ["idm"]}, {"scenario": {"road": 3}}, r"config\.yaml: damaged: scenario"),
+    ],
+)
+def test_an_animation_of_foreign_files_is_refused_in_a_line(
+    tmp_path, steps, settings, message
+) -> None:
+    folder = made(tmp_path / "a", **settings)
+    write_parquet(pd.DataFrame(steps), folder / "steps.parquet")
+    with pytest.raises(ResultsError, match=message) as caught:
+        animate.run(folder)
+    assert "\n" not in str(caught.value)
