@@ -37,15 +37,18 @@ def update(options: Namespace) -> list[Row]:
     rows: list[Row] = []
     for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
         agent = kind(batch_size=batch).start(Scene(7, device=options.device))
-        own, plain, other = (f"{kind.__name__}.update", f"plain {kind.__name__}", OTHER)
+        name = kind.__name__
+        own, plain, loss, other = f"{name}.update", f"plain {name}", f"TorchRL's {name}Loss", OTHER
+        slow = kind(batch_size=batch, fused=False).start(Scene(7, device=options.device))
         runs: dict[str, Run] = {
             own: times(count, own_update(agent, played)),
             plain: times(count, plain_update(agent, played)),
+            loss: times(count, own_update(slow, played)),
         }
         if installed():
             model = their_update(options, agent, played)
             runs[other] = partial(model.train, count, batch)
-        against = {own: [plain, other], other: [plain]}
+        against = {own: [plain, loss, other], other: [plain]}
         counts = dict.fromkeys(runs, count)
         rows += rates(options, runs, "updates/s", counts, against, batch, grad=True)
     return rows
