@@ -19,6 +19,7 @@ from torchrl.objectives.common import LossModule
 
 from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
 from lcc_rl.agents.agent import Agent, Fraction, Scene, Whole, anneal, derived_seed
+from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.vectors import join, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, given_as
@@ -70,8 +71,12 @@ class OffPolicy(Agent):
     # Episodes whose mean reward rates the policy; the best one becomes the run's. None: the last.
     best_window: Count | None = None
     exploration: given_as(Exploration) = field(default_factory=Exploration)  # type: ignore[valid-type]
+    # Compute the gradient as written out, which gives the numbers of TorchRL's loss up to rounding
+    # in less time; False differentiates the loss itself.
+    fused: bool = True
 
     critics: ClassVar[int] = 1
+    joint: ClassVar[bool] = True  # whether one optimizer steps all that is learned at once
 
     def settled(self) -> None:
         for name in ("batch_size", "learning_starts"):
@@ -83,7 +88,7 @@ class OffPolicy(Agent):
 
     def setup(self, scene: Scene) -> None:
         size, seed, hidden = scene.observation_size, scene.seed, self.hidden
-        self.count = 0
+        self.count, self.generator = 0, torch.Generator(scene.device)
         self.policy = make_actor(size, 1, hidden, seed).to(scene.device)
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)
         keys = ["observation", "action"]
@@ -93,8 +98,6 @@ class OffPolicy(Agent):
             )
             for number in range(self.critics)
         ]
-        self.optimizers: dict[str, torch.optim.Adam] = {}
-        self.targets: dict[str, tuple[Tensor, Tensor]] = {}  # of each: its vector and the online
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's."""
@@ -112,28 +115,53 @@ class OffPolicy(Agent):
             ``loss_actor`` and ``loss_value``, detached.
         """
 
-    def _complete(self, loss: LossModule, critic: str, delayed: Sequence[str]) -> None:
+    def _complete(
+        self, loss: LossModule, delayed: Sequence[str], alpha: tuple[Tensor, float] | None = None
+    ) -> None:
         """Set discount, optimizers and targets of a loss with an actor and Q networks.
 
         Args:
             loss: TorchRL's.
-            critic: its name for the Q networks' parameters.
             delayed: which of ``"actor"`` and ``"value"`` have a target network.
+            alpha: a temperature that is learned, and its learning rate.
         """
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.gamma)
         # TorchRL asks for an updater of the targets; _follow does its work.
         HardUpdate(loss)
+        keys = {"actor": "actor_network_params"}
+        keys["value"] = "value_network_params" if self.critics == 1 else "qvalue_network_params"
+        networks = {name: leaves(getattr(loss, key)) for name, key in keys.items()}
         rates = {"actor": self.actor_lr, "value": self.critic_lr}
-        for name, key in (("actor", "actor_network_params"), ("value", critic)):
-            network = leaves(getattr(loss, key))
-            vector = join(network)
-            slopes = torch.zeros_like(vector)
-            for parameter, slope in zip(network, views(slopes, network), strict=True):
-                parameter.grad = slope
-            self.optimizers[name] = vector_adam(vector, slopes, [len(vector)], [rates[name]])
-            if name in delayed:
-                self.targets[name] = join(leaves(getattr(loss, f"target_{key}"))), vector
+        if alpha is not None:
+            networks["alpha"], rates["alpha"] = [alpha[0]], alpha[1]
+        targets = {name: leaves(getattr(loss, f"target_{keys[name]}")) for name in delayed}
+        self._join(networks, rates, targets)
+        self.written = ActorCritic(networks, targets, self) if self.fused else None
+
+    def _join(
+        self,
+        networks: dict[str, list[Tensor]],
+        rates: dict[str, float],
+        targets: dict[str, list[Tensor]],
+    ) -> None:
+        """Let all that is learned live in one vector, as do its gradients and the targets."""
+        everything = [tensor for network in networks.values() for tensor in network]
+        vector = join(everything)
+        self.slopes = torch.zeros_like(vector)
+        for parameter, slope in zip(everything, views(self.slopes, everything), strict=True):
+            parameter.grad = slope
+        sizes = {name: sum(map(Tensor.numel, network)) for name, network in networks.items()}
+        parts = [each.split(list(sizes.values())) for each in (vector, self.slopes)]
+        groups = {"all": (vector, self.slopes, [*sizes.values()], [*rates.values()])}
+        if not self.joint:
+            alone = zip(sizes, *parts, strict=True)
+            groups = {n: (own, slope, [len(own)], [rates[n]]) for n, own, slope in alone}
+        self.optimizers = {name: vector_adam(*group) for name, group in groups.items()}
+        target = join([tensor for network in targets.values() for tensor in network])
+        behind = target.split([sizes[name] for name in targets])
+        ahead = dict(zip(sizes, parts[0], strict=True))
+        self.targets = {n: (own, ahead[n]) for n, own in zip(targets, behind, strict=True)}
 
     @contextmanager
     def _own_randomness(self) -> Iterator[None]:
@@ -142,17 +170,26 @@ class OffPolicy(Agent):
             torch.manual_seed(derived_seed(self.seed, self.count, "update"))
             yield
 
+    def _noise(self, like: Tensor, count: int) -> list[Tensor]:
+        """Draw what TorchRL's loss draws in this update: N(0, 1), so many times."""
+        generator = self.generator.manual_seed(derived_seed(self.seed, self.count, "update"))
+        return [
+            torch.randn(like.shape, generator=generator, device=like.device) for _ in range(count)
+        ]
+
     def _penalty(self, batch: TensorDictBase) -> Tensor:
         """Return the penalty on the actor's output before its tanh."""
         raw = self.policy.module[0](batch["observation"])
         return self.saturation * raw.square().mean()
 
-    def _step(self, *names: str) -> None:
-        """Take a step of the named optimizers along the gradients at hand; clear all gradients."""
-        for name in names:
-            take_step(self.optimizers[name])
-        for optimizer in self.optimizers.values():
-            optimizer.zero_grad(set_to_none=False)
+    def _differentiate(self, loss: Tensor) -> None:
+        """Write the gradient of a loss by automatic differentiation."""
+        self.slopes.zero_()
+        loss.backward()
+
+    def _step(self, name: str) -> None:
+        """Take a step of the named optimizer along the gradients at hand."""
+        take_step(self.optimizers[name])
 
     @torch.no_grad()
     def _follow(self, *names: str) -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import field
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
 from lcc_rl.agents.actor import ACTION, OBSERVATION, action_noise, seeded_mlp
 from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.fused import ActorCritic, Network
 from lcc_rl.agents.off_policy import Exploration, OffPolicy
 from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import SEED, STEP
@@ -64,6 +68,16 @@ class SampledAction(TensorDictModuleBase):
         return tensordict.set(ACTION, (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE))
 
 
+class Sample(NamedTuple):
+    """Actions drawn by :meth:`SAC._sample`; every entry ``[batch, 1]``."""
+
+    mean: Tensor  # of the action before the tanh
+    bend: Tensor  # tanh of the network of the standard deviation
+    push: Tensor  # the noise times the standard deviation
+    action: Tensor
+    log_prob: Tensor
+
+
 class SAC(OffPolicy):
     """Learns a distribution of actions and its temperature; its mean is the policy that is kept.
 
@@ -99,18 +113,73 @@ class SAC(OffPolicy):
             loss_function="l2",
             delay_qvalue=True,
         ).to(device)
-        self._complete(loss, "qvalue_network_params", ("value",))
-        self.loss.log_alpha.grad = torch.zeros_like(self.loss.log_alpha)
-        alpha = [self.loss.log_alpha]
-        self.optimizers["alpha"] = torch.optim.Adam(alpha, lr=self.alpha_lr, fused=True)
+        self._complete(loss, ("value",), (loss.log_alpha, self.alpha_lr))
+        self.log_alpha = loss.log_alpha
+        self.spread = Network([*spread.parameters()])
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        with self._own_randomness():
-            losses = self.loss(batch)
-        total = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
-        (total + self._penalty(batch)).backward()
-        self._step(*self.optimizers)
+        losses = (
+            self._by_loss(batch) if self.written is None else self._by_hand(batch, self.written)
+        )
+        self._step("all")
         self._follow("value")
         self.count += 1
-        named = {"loss_actor": "loss_actor", "loss_value": "loss_qvalue"}
-        return {name: losses[key].detach() for name, key in named.items()}
+        return dict(zip(("loss_actor", "loss_value"), losses, strict=True))
+
+    def _by_loss(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Write the gradient by TorchRL's loss; return the losses."""
+        with self._own_randomness():
+            losses = self.loss(batch)
+        actor, value = losses["loss_actor"], losses["loss_qvalue"]
+        self._differentiate(actor + value + losses["loss_alpha"] + self._penalty(batch))
+        return actor.detach(), value.detach()
+
+    @torch.no_grad()
+    def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
+        """Write the gradient out; policy and temperature follow the Q networks before the step."""
+        rows = len(batch)
+        space, seen, after = networks.space(rows), batch.get("observation"), batch.get("next")
+        reached, alpha = after.get("observation"), self.log_alpha.exp()
+        noise = self._noise(space.slope, 2)
+        then = self._sample(reached, noise[0], networks)
+        future = networks.future(reached, then.action, space.data)
+        wanted = networks.wanted(after, future.sub_(then.log_prob.mul_(alpha)))
+        now = self._sample(seen, noise[1], networks)
+        space.data.place(seen, batch.get("action"))
+        space.own.place(seen, now.action)
+        networks.judge(space.both)
+        first, second = space.own.values
+        loss_actor = (now.log_prob * alpha).sub_(torch.minimum(first, second)).mean()
+        loss_value = networks.critic_step(space.data, wanted)
+        # Each action's value is that of the critic that gives less.
+        chosen = space.slope * (first <= second)
+        slope = networks.through_critics(space.own, [chosen, space.slope - chosen], 1)
+        self._learn_policy(seen, now, slope, alpha, networks)
+        entropy = now.log_prob.mean().add_(self.loss.target_entropy)
+        self.log_alpha.grad.copy_(entropy.neg_())
+        return loss_actor, loss_value
+
+    def _sample(self, seen: Tensor, noise: Tensor, networks: ActorCritic) -> Sample:
+        """Draw actions as ``TanhNormal`` does."""
+        mean, bend = networks.actor.forward(seen), self.spread.forward(seen).tanh_()
+        logarithm = bend.mul(3.0).sub_(2.0)
+        push = logarithm.exp().mul_(noise)
+        before = mean + push
+        # log N(noise; 0, 1) − log of the standard deviation − log of the derivative of the tanh
+        log_prob = noise.square().mul_(-0.5).sub_(logarithm).sub_(0.5 * math.log(2.0 * math.pi))
+        log_slope = softplus(before.mul(-2.0)).add_(before).sub_(math.log(2.0)).mul_(-2.0)
+        action = before.tanh_().clamp_(-ONE, ONE)
+        return Sample(mean, bend, push, action, log_prob.sub_(log_slope))
+
+    def _learn_policy(
+        self, seen: Tensor, now: Sample, slope: Tensor, alpha: Tensor, networks: ActorCritic
+    ) -> None:
+        """Write the gradient of the policy, from the derivative by its actions."""
+        rows = len(seen)
+        slope.mul_(now.action.square().neg_().add_(1.0))
+        slope.addcmul_(now.action, alpha, value=2.0 / rows)
+        spread = (slope * now.push).sub_(alpha, alpha=1.0 / rows)
+        spread.mul_(now.bend.square().neg_().add_(1.0).mul_(3.0))
+        self.spread.backward(seen, spread)
+        slope.add_(now.mean, alpha=2.0 * self.saturation / rows)
+        networks.actor.backward(seen, slope)

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.objectives import TD3Loss
 
 from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.settings import Count, NonNegative
 
@@ -20,6 +21,7 @@ class TD3(OffPolicy):
     policy_delay: Count = 2  # updates of the Q networks for each of policy and targets
 
     critics = 2
+    joint = False
 
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
@@ -33,22 +35,55 @@ class TD3(OffPolicy):
             delay_actor=True,
             delay_qvalue=True,
         )
-        self._complete(loss, "qvalue_network_params", ("actor", "value"))
+        self._complete(loss, ("actor", "value"))
         self.last_actor = torch.zeros(())
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        with self._own_randomness():
-            value, _ = self.loss.value_loss(batch)
-        value.backward()
+        networks = self.written
+        value = self._value_by_loss(batch) if networks is None else self._value(batch, networks)
         self._step("value")
         self.count += 1
         if self.count % self.policy_delay == 0:
-            actor, _ = self.loss.actor_loss(batch)
-            (actor + self._penalty(batch)).backward()
+            self.last_actor = (
+                self._actor_by_loss(batch) if networks is None else self._actor(batch, networks)
+            )
             self._step("actor")
             self._follow("actor", "value")
-            self.last_actor = actor.detach()
-        return {"loss_actor": self.last_actor, "loss_value": value.detach()}
+        return {"loss_actor": self.last_actor, "loss_value": value}
+
+    def _value_by_loss(self, batch: TensorDictBase) -> Tensor:
+        with self._own_randomness():
+            value, _ = self.loss.value_loss(batch)
+        self._differentiate(value)
+        return value.detach()
+
+    def _actor_by_loss(self, batch: TensorDictBase) -> Tensor:
+        actor, _ = self.loss.actor_loss(batch)
+        self._differentiate(actor + self._penalty(batch))
+        return actor.detach()
+
+    @torch.no_grad()
+    def _value(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:
+        """Write the gradient of the Q networks' loss; return the loss."""
+        data, after = networks.space(len(batch)).data, batch.get("next")
+        reached = after.get("observation")
+        action = networks.target_actor.forward(reached).tanh_()
+        (noise,) = self._noise(action, 1)
+        noise.mul_(self.policy_noise).clamp_(-self.noise_clip, self.noise_clip)
+        action.add_(noise).clamp_(-1.0, 1.0)
+        wanted = networks.wanted(after, networks.future(reached, action, data))
+        networks.judge(data.place(batch.get("observation"), batch.get("action")))
+        return networks.critic_step(data, wanted)
+
+    @torch.no_grad()
+    def _actor(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:
+        """Write the gradient of the policy's loss, by the first Q network; return the loss."""
+        space, seen = networks.space(len(batch)), batch.get("observation")
+        raw = networks.actor.forward(seen)
+        action = raw.tanh()
+        (value,) = networks.judge(space.own.place(seen, action), 1)
+        networks.actor_step(seen, space, raw, action)
+        return -value.mean()
 
     def state_dict(self) -> dict[str, object]:
         return {**super().state_dict(), "last_actor": self.last_actor}

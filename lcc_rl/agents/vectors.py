@@ -7,7 +7,6 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam
 
 
 def views(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
@@ -45,6 +44,7 @@ def vector_adam(
     return torch.optim.Adam(groups, fused=True)
 
 
+@torch.no_grad()
 def take_step(optimizer: torch.optim.Adam) -> None:
     """Take the step of ``optimizer.step()`` without what torch does around each call."""
     if not optimizer.state:  # made by the first step
@@ -54,20 +54,23 @@ def take_step(optimizer: torch.optim.Adam) -> None:
         first, second = group["betas"]
         parameters = group["params"]
         states = [optimizer.state[parameter] for parameter in parameters]
-        adam(
+        averages, squares, steps = (
+            [state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step")
+        )
+        torch._foreach_add_(steps, 1)
+        torch._fused_adam_(
             parameters,
             [parameter.grad for parameter in parameters],
-            [state["exp_avg"] for state in states],
-            [state["exp_avg_sq"] for state in states],
+            averages,
+            squares,
             [],
-            [state["step"] for state in states],
-            fused=True,
-            amsgrad=False,
+            steps,
+            lr=group["lr"],
             beta1=first,
             beta2=second,
-            lr=group["lr"],
             weight_decay=0.0,
             eps=group["eps"],
+            amsgrad=False,
             maximize=False,
         )
 

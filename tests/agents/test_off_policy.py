@@ -71,7 +71,7 @@ def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
 
 def batch(size: int = 64, seed: int = 0) -> TensorDict:
     draw = torch.Generator().manual_seed(seed)
-    flag = torch.zeros(size, 1, dtype=torch.bool)
+    flag = torch.rand(size, 1, generator=draw) < 0.3
     return TensorDict(
         {
             "observation": torch.randn(size, 7, generator=draw),
@@ -87,33 +87,36 @@ def batch(size: int = 64, seed: int = 0) -> TensorDict:
     )
 
 
-@EACH
-def test_vectors_learn_as_torchs_adam_and_torchrls_soft_update_do(agent) -> None:
-    settings = ("agent.tau=0.05", "agent.critic_lr=0.002")
-    joined, plain = (make_agent(compose("alcc", f"agent={agent}", *SMALL, *settings)) for _ in "ab")
+@pytest.mark.parametrize("hidden", [[200, 100, 50], [16]])
+@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
+def test_updates_equal_torchrls_loss_torchs_adam_and_torchrls_soft_update(agent, hidden) -> None:
+    settings = (*SMALL, "agent.tau=0.05", "agent.critic_lr=0.002", f"agent.hidden={hidden}")
+    made, plain = (
+        make_agent(compose("alcc", f"agent={agent}", *settings, f"agent.fused={fused}"))
+        for fused in ("true", "false")
+    )
     loss = plain.loss
-    critic = loss.qvalue_network_params
+    values = getattr(loss, f"{'value' if agent == 'ddpg' else 'qvalue'}_network_params")
     own = {
         "actor": torch.optim.Adam(leaves(loss.actor_network_params), lr=1e-3),
-        "value": torch.optim.Adam(leaves(critic), lr=2e-3),
+        "value": torch.optim.Adam(leaves(values), lr=2e-3),
         "alpha": torch.optim.Adam([getattr(loss, "log_alpha", torch.nn.Parameter())], lr=1e-3),
     }
     updater = SoftUpdate(loss, tau=0.05)
 
-    def step(*names: str) -> None:
-        for name in names:
-            own[name].step()
-        loss.zero_grad(set_to_none=True)
+    def step(name: str) -> None:
+        for each in own if name == "all" else [name]:
+            own[each].step()
 
     plain._step, plain._follow = step, lambda *_: updater.step()
-    for number in range(6):
+    for number in range(12):
         data = batch(seed=number)
-        found, expected = joined.update(data.clone()), plain.update(data.clone())
+        found, expected = made.update(data.clone()), plain.update(data.clone())
         for name in expected:
-            torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(found[name], expected[name], rtol=1e-5, atol=1e-5)
     state = plain.loss.state_dict()
-    for name, value in joined.loss.state_dict().items():
-        torch.testing.assert_close(value, state[name], rtol=1e-3, atol=2e-5)
+    for name, value in made.loss.state_dict().items():
+        torch.testing.assert_close(value, state[name], rtol=0.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("filled", [40, 100, 130])

@@ -20,6 +20,7 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 
+from benchmarks import harness
 from benchmarks.calibrate import calibrate
 from benchmarks.collect import collect
 from benchmarks.env import env
@@ -52,6 +53,9 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
     )
     parser.add_argument("--device", help="cpu or cuda (default: cpu, and cuda where there is one)")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
+    parser.add_argument(
+        "--clock", choices=[*harness.TIMERS], default="wall", help="processor: for a loaded machine"
+    )
     parser.add_argument("--repeats", type=int, default=5, help="repeats of every case")
     parser.add_argument(
         "--quick", action="store_true", help="two repeats of tiny sizes, not compiled, as a trial"
@@ -70,12 +74,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print and write; return 1 if the input is at fault."""
     options = parse(arguments)
     torch.set_num_threads(options.threads)
+    harness.timer = options.clock
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     console, rows = Console(), []
     console.width = max(console.width, 110)
     if not installed():
         console.print(escape(f"left out: {', '.join(EXTRA)} ({how_to_install('bench')})"))
-    here = {"threads": options.threads, "machine": processor(), "torch": torch.__version__}
+    here = {
+        "threads": options.threads,
+        "clock": options.clock,
+        "machine": processor(),
+        "torch": torch.__version__,
+    }
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     try:
         if Path(options.out).exists() and "benchmark" not in TableFile(options.out).header:

@@ -7,8 +7,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import stable_baselines3
 import torch
-from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -74,16 +74,16 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
         return [False] * self.num_envs
 
 
-def their_agent(options: Namespace, vector: VecEnv, **how: Any) -> DDPG:
-    """Return stable-baselines3's DDPG with the paper's layers."""
+def their_agent(options: Namespace, vector: VecEnv, kind: str, **how: Any) -> Any:
+    """Return stable-baselines3's agent of that name with the paper's layers."""
     layers = {"net_arch": [200, 100, 50]}
     settings = {"policy_kwargs": layers, "gamma": 0.9, "device": options.device, **how}
-    return DDPG("MlpPolicy", vector, **settings)
+    return getattr(stable_baselines3, kind)("MlpPolicy", vector, **settings)
 
 
 def predicting(options: Namespace, vector: VecEnv, steps: int) -> Run:
     """Return so many steps of ``predict`` and the environment; nothing is kept."""
-    model, state = their_agent(options, vector), {"seen": vector.reset()}
+    model, state = their_agent(options, vector, "DDPG"), {"seen": vector.reset()}
 
     def run() -> None:
         for _ in range(steps):

@@ -73,6 +73,6 @@ def their_training(options: Namespace, batch: int, steps: int) -> Run:
 
     how = {"train_freq": 1, "gradient_steps": 1, "batch_size": batch, "buffer_size": 20000}
     vector = PlainVector(training(options, 1), options.compile)
-    model = their_agent(options, vector, learning_starts=batch, verbose=0, **how)
+    model = their_agent(options, vector, "DDPG", learning_starts=batch, verbose=0, **how)
     model.learn(batch + 1)
     return lambda: model.learn(steps, reset_num_timesteps=False)

@@ -1,9 +1,10 @@
-"""Benchmark of DDPG's update."""
+"""Benchmark of the updates of DDPG, TD3 and SAC."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import torch
@@ -13,33 +14,41 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from benchmarks.collect import OTHER
 from benchmarks.harness import Row, Run, installed, rates
 from benchmarks.plain import alcc, training
-from benchmarks.plain_update import PlainUpdate, check
-from lcc_rl.agents import DDPG
+from benchmarks.plain_update import PlainDDPG, PlainSAC, PlainTD3, PlainUpdate, check
+from lcc_rl.agents import DDPG, SAC, TD3
 from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.agents.replay import LEARNED_FROM, draws, transitions
 
-OWN, PLAIN = "DDPG.update", "plain update"
+# Of every agent: the update by hand.
+AGENTS: dict[type[OffPolicy], type[PlainUpdate]] = {DDPG: PlainDDPG, TD3: PlainTD3, SAC: PlainSAC}
+SIZES = ((64, 60), (256, 40), (1024, 20))  # batch, updates of a repeat
+QUICK = ((16, 2), (32, 2))
 
 
 def update(options: Namespace) -> list[Row]:
-    """Return DDPG updates per second, beside one written by hand and stable-baselines3's.
+    """Return updates per second, beside those written by hand and stable-baselines3's.
 
-    All updates include drawing the batch from the buffer, both losses and backward passes, Adam
+    All updates include drawing the batch from the buffer, all losses and backward passes, Adam
     and the soft target updates, all in single precision. stable-baselines3's is its ``train()``,
-    which also writes its two losses to its logger, once per call of many updates.
+    which also writes its losses to its logger, once per call of many updates.
     """
     played = transitions(alcc(options, 1000).rollout(20, break_when_any_done=False))
     rows: list[Row] = []
-    for batch, count in ((16, 2), (32, 2)) if options.quick else ((64, 60), (256, 40), (1024, 20)):
-        agent = DDPG(batch_size=batch).start(Scene(7, device=options.device))
+    for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
+        agent = kind(batch_size=batch).start(Scene(7, device=options.device))
+        name = kind.__name__
+        own, plain, loss, other = f"{name}.update", f"plain {name}", f"TorchRL's {name}Loss", OTHER
+        slow = kind(batch_size=batch, fused=False).start(Scene(7, device=options.device))
         runs: dict[str, Run] = {
-            OWN: times(count, own_update(agent, played)),
-            PLAIN: times(count, plain_update(agent, played)),
+            own: times(count, own_update(agent, played)),
+            plain: times(count, plain_update(agent, played)),
+            loss: times(count, own_update(slow, played)),
         }
         if installed():
-            model = their_update(options, batch, played)
-            runs[OTHER] = partial(model.train, count, batch)
-        against = {OWN: [PLAIN, OTHER], OTHER: [PLAIN]}
+            model = their_update(options, agent, played)
+            runs[other] = partial(model.train, count, batch)
+        against = {own: [plain, loss, other], other: [plain]}
         counts = dict.fromkeys(runs, count)
         rows += rates(options, runs, "updates/s", counts, against, batch, grad=True)
     return rows
@@ -55,7 +64,7 @@ def times(count: int, function: Run) -> Run:
     return run
 
 
-def own_update(agent: DDPG, played: TensorDictBase) -> Run:
+def own_update(agent: OffPolicy, played: TensorDictBase) -> Run:
     """Return the agent's update with batches from a buffer of its size."""
     storage = LazyTensorStorage(agent.buffer_size, device=agent.device)
     buffer = ReplayBuffer(storage=storage, batch_size=agent.batch_size)
@@ -64,25 +73,27 @@ def own_update(agent: DDPG, played: TensorDictBase) -> Run:
     return lambda: agent.update(next(draw))
 
 
-def plain_update(agent: DDPG, played: TensorDictBase) -> PlainUpdate:
+def plain_update(agent: OffPolicy, played: TensorDictBase) -> PlainUpdate:
     """Return the update by hand, checked, with the transitions of the agent's buffer."""
     reached = {"reached": "observation", "reward": "reward", "terminated": "terminated"}
     columns = {name: played["next", key] for name, key in reached.items()}
     columns |= {name: played[name] for name in ("observation", "action")}
-    plain = DDPG(batch_size=agent.batch_size, fused=False)
-    loss = plain.start(Scene(7, seed=1, device=agent.device))
-    check(loss, PlainUpdate(loss, columns))
-    return PlainUpdate(agent, columns)
+    kind, plain = type(agent), AGENTS[type(agent)]
+    loss = kind(batch_size=agent.batch_size, fused=False)
+    loss = loss.start(Scene(7, seed=1, device=agent.device))
+    check(loss, plain(loss, columns))
+    return plain(agent, columns)
 
 
-def their_update(options: Namespace, batch: int, played: TensorDictBase) -> Any:
-    """Return SB3's DDPG with the same transitions in a buffer of the same size."""
+def their_update(options: Namespace, agent: OffPolicy, played: TensorDictBase) -> Any:
+    """Return SB3's agent of that name with the same transitions in a buffer of the same size."""
     from stable_baselines3.common.logger import configure
 
     from benchmarks.theirs import PlainVector, their_agent
 
     vector = PlainVector(training(options, 1), compiled=False)
-    model = their_agent(options, vector, batch_size=batch, buffer_size=20000)
+    how = {"batch_size": agent.batch_size, "buffer_size": agent.buffer_size}
+    model = their_agent(options, vector, type(agent).__name__, **how)
     model.set_logger(configure(None, []))
     columns = [played[key].cpu().numpy() for key in list(LEARNED_FROM.values())[:5]]
     for seen, action, after, reward, done in zip(*columns, strict=True):
