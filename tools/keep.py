@@ -1,6 +1,7 @@
 """Keep the small tables behind a page: python tools/keep.py <what> <folder>… --out <path>
 
 lengths: the held-out windows of HCFS studies whose trainings differ in length, one file.
+sources: runs of platoons behind several sources of leaders, a folder each, named after it.
 means: the means of one evaluation per window and per driver, two files in a folder.
 alcc: those of an ALCC study's main part, its learning curves, an episode and its drivers.
 """
@@ -24,7 +25,7 @@ from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.studies.alcc.report import CURVES, MAIN
 from lcc_rl.studies.alcc.study import DRIVERS
 from lcc_rl.studies.hcfs.study import TRAINING
-from lcc_rl.studies.hcfs.tables import LEARNED
+from lcc_rl.studies.hcfs.tables import LEARNED, MEASURES, RUN, STABLE, per_run, rounded
 
 # Columns of the learning curves that are kept, besides the terms of the reward.
 CURVE = ("variant", "seed", "iteration", "episodes", "updates", "episode_reward", "collisions")
@@ -43,6 +44,20 @@ def lengths(studies: Sequence[Path], path: Path) -> None:
                 reward=kept["reward"].astype("float32").round(4), training_episodes=episodes
             )
         )
+    write_parquet(pd.concat(parts, ignore_index=True), path)
+
+
+def sources(evaluations: Sequence[Path], path: Path) -> None:
+    """Keep what CACC, DDPG and the hybrid, by its choices, did in the windows of every source."""
+    parts = []
+    for folder in evaluations:
+        rows = results.load(folder)
+        hybrid = (rows["strategy"] == "hcfs") & (rows["deployed.choice"] != "better")
+        names = rows["strategy"].mask(hybrid, "hcfs " + rows["deployed.choice"])
+        rows = rows.assign(strategy=names)[(rows["case"] == WINDOWS) & names.isin(STABLE)]
+        # CACC and DDPG drove beside every choice.
+        kept = per_run(rows.drop_duplicates([*RUN, "follower"]))
+        parts.append(rounded(kept[[*RUN, *MEASURES]]).assign(source=folder.name))
     write_parquet(pd.concat(parts, ignore_index=True), path)
 
 
@@ -73,7 +88,7 @@ def _only(folders: Sequence[Path]) -> Path:
     return folders[0]
 
 
-KINDS = {"lengths": lengths, "means": means, "alcc": alcc}
+KINDS = {"lengths": lengths, "sources": sources, "means": means, "alcc": alcc}
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -6,12 +6,16 @@ Tensors of vehicles are ``[*batch, N, 1]``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
+
+# What the hybrid strategy drives by: the better of its candidates (the paper), the best point
+# between them, or the rule and what the first vehicle's best point adds to its own rule.
+Choice = Literal["better", "between", "first"]
 
 
 class Place(NamedTuple):
@@ -159,6 +163,7 @@ def hybrid_decision(
     time_step: float,
     max_acceleration: float,
     place: Place | None = None,
+    choice: Choice = "better",
 ) -> Decision:
     """Decide between two candidate accelerations, per follower (H12–H14).
 
@@ -168,6 +173,12 @@ def hybrid_decision(
 
     The theorem H15–H21 assumes that each candidate keeps the jerk bound relative to the
     acceleration executed last; without step 1 that is not so.
+
+    With ``choice="between"`` the point between the candidates that earns most takes the place of
+    steps 2 and 3: there is no jump, and no step is expected to earn less than either candidate,
+    as the blend of step 3 is. With ``"first"`` the first vehicle decides so; the others add its
+    correction, what it adds to its rule, to their own. In the errors between neighbours the
+    correction cancels: they obey the rule's law, whatever the policy does.
 
     Args:
         rule, learned: the candidates [m/s²].
@@ -182,20 +193,44 @@ def hybrid_decision(
         time_step: T [s].
         max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
         place: where the vehicle is, which a reward with a spacing weight needs.
+        choice: see above. The winner between the candidates is the nearer one.
     """
-    candidates, clamped, capped = _bounded(
+    (one, two), clamped, capped = _bounded(
         torch.stack([rule, learned]), interval, cap, max_acceleration
     )
-    rule, learned = candidates.unbind(0)
-    earned = reward.one_step(speed, last_acceleration, candidates, leader_next, time_step, place)
-    winner = (earned[1] > earned[0]).to(torch.int64)
+    # Between the candidates the reward bends where the speed error or the jerk vanishes.
+    bends = () if choice == "better" else ((leader_next - speed) / time_step, last_acceleration)
+    shares = _shares(one, two, *bends)
+    options = torch.lerp(one, two, shares)
+    earned = reward.one_step(speed, last_acceleration, options, leader_next, time_step, place)
+    share = shares.gather(-1, earned.argmax(-1, keepdim=True))
+    if choice == "first":
+        share = share[..., :1, :].expand_as(rule)
+    winner = (share > 0.5).to(torch.int64)
     if last_winner is None:
         switched = torch.zeros_like(clamped)
     else:
         switched = (last_winner >= 0) & (winner != last_winner)
-    chosen = torch.where(winner.bool(), learned, rule)
-    chosen = torch.where(switched, 0.5 * (rule + learned), chosen)
+    if choice == "better":
+        share = torch.where(switched, 0.5, share)
+    chosen = torch.lerp(one, two, share)
+    if choice == "first":
+        same = rule + (chosen - rule)[..., :1, :]
+        (chosen,), clamped, capped = _bounded(same[None], interval, cap, max_acceleration)
     return Decision(chosen, winner, switched, clamped, capped)
+
+
+def _shares(rule: Tensor, learned: Tensor, *bends: Tensor) -> Tensor:
+    """Return shares of the learned candidate, ``[*batch, N, n]``: 0, 1, then those of the bends.
+
+    Args:
+        rule, learned: the candidates, ``[*batch, N, 1]`` [m/s²].
+        bends: accelerations of that shape [m/s²]; those beyond a candidate count as it.
+    """
+    span = learned - rule
+    span = torch.where(span == 0.0, 1.0, span)
+    between = [((bend - rule) / span).clamp(0.0, 1.0) for bend in bends]
+    return torch.cat([torch.zeros_like(rule), torch.ones_like(rule), *between], -1)
 
 
 def _bounded(

@@ -160,15 +160,28 @@ def leader_names(lookahead: str) -> list[str]:
 
 
 def check_leader(lookahead: str, controller: Controller) -> None:
-    """Check that a controller can have a look-ahead.
+    """Check that an oracle's leader is the recorded one, of which alone it knows the future."""
+    if lookahead == "oracle":
+        check_platoon(
+            controller, "lookahead=oracle", "knows the recorded leader only", "causal or hold"
+        )
+
+
+def check_platoon(controller: Controller, option: str, fact: str, remedy: str) -> None:
+    """Check that a controller drives all vehicles of its string.
+
+    Args:
+        controller: the controller.
+        option: its option that needs this, and the value.
+        fact: what the option does or needs.
+        remedy: values that can be used instead.
 
     Raises:
-        ConfigError: if the leader of some of its vehicles is another than the recorded one, of
-            which alone an oracle knows the future.
+        ConfigError: if the string has other vehicles, too.
     """
-    where = f"scenario.controllers.{controller.role}"
-    if lookahead == "oracle" and controller.string.names != (controller.role,):
+    names = controller.string.names
+    if names != (controller.role,):
         raise ConfigError(
-            f"{where}.lookahead=oracle knows the recorded leader only, but the string has "
-            f"{', '.join(controller.string.names)}; use causal or hold"
+            f"scenario.controllers.{controller.role}.{option} {fact}, but the string has "
+            f"{', '.join(names)}; use {remedy}"
         )

@@ -17,6 +17,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
+    Choice,
     Decision,
     Place,
     PlatoonReward,
@@ -25,7 +26,13 @@ from lcc_rl.functional.hcfs import (
     safe_acceleration,
 )
 from lcc_rl.pieces.base import Key, Piece
-from lcc_rl.pieces.connected import Communication, Lookahead, check_leader, leader_names
+from lcc_rl.pieces.connected import (
+    Communication,
+    Lookahead,
+    check_leader,
+    check_platoon,
+    leader_names,
+)
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
@@ -54,6 +61,9 @@ class HCFS(Controller):
     # drives through the vehicle ahead: the paper's reward has no spacing term. It brakes fully
     # where a measurement, the action or the rule's command is no finite number.
     safe_cap: bool = True
+    # The better candidate (the paper), the best point between both, or, for a string that is one
+    # platoon, what that of the first vehicle adds to its rule, added to every vehicle's rule.
+    choice: Choice = "better"
     braking: Positive = 3.0  # b of the safe cap [m/s²]
     margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
     # Settings of the compared lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
@@ -81,6 +91,8 @@ class HCFS(Controller):
         reads += [*leader_names(self.lookahead), *(".".join(key) for key in state), *rule.names]
         self.drive(world, reads, state)
         check_leader(self.lookahead, self)
+        if self.choice == "first":
+            check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
         own = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
         self.reward = PlatoonReward(**own)
 
@@ -124,6 +136,7 @@ class HCFS(Controller):
             self.time_step,
             self.max_acceleration,
             Place(leader_gap, leader[0]),
+            self.choice,
         )
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:

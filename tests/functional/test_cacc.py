@@ -334,3 +334,39 @@ def test_theorem_holds_with_clamping_for_every_bound() -> None:
                 assert violated > 0.05  # the literal rule does fail
             else:
                 assert violated == 0.0  # vacuous: 2 a_max/T
+
+
+@pytest.mark.parametrize("choice", ["better", "between", "first"])
+@pytest.mark.parametrize("bound", [10.0, 30.0])
+def test_no_step_earns_less_than_a_parent_would(choice, bound) -> None:
+    generator = torch.Generator().manual_seed(2)
+    shape = (3000, 4, 1)
+
+    def draw(scale: float) -> torch.Tensor:
+        return scale * (2.0 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1.0)
+
+    last, speed, rule, learned = draw(A_MAX), 10.0 + draw(0.5), draw(2.0), draw(2.0)
+    before = torch.randint(-1, 2, shape, generator=generator)
+    leader, interval = torch.full((3000, 1, 1), 10.0).double(), jerk_interval(last, bound, T, A_MAX)
+    got = hybrid_decision(
+        *(rule, learned, speed, last, before, leader, interval, None, PlatoonReward(), T, A_MAX),
+        choice=choice,
+    )
+
+    def earned(acceleration: torch.Tensor) -> torch.Tensor:
+        return PlatoonReward().one_step(speed, last, acceleration, leader, T)
+
+    one, two = (parent.clamp(*interval) for parent in (rule, learned))
+    short = torch.maximum(earned(one), earned(two)) - earned(got.acceleration)
+    if choice == "better":  # the printed blend falls short, and nothing else does
+        assert short[got.switched].max() > 0.01
+        assert short[~got.switched].max() < 1e-12
+        return
+    deciding = slice(None) if choice == "between" else slice(1)
+    assert short[:, deciding].max() < 1e-12
+    every = torch.lerp(one, two, torch.linspace(0.0, 1.0, 201, dtype=torch.float64))
+    assert (earned(every) - earned(got.acceleration))[:, deciding].max() < 1e-12
+    if choice == "first" and bound == 30.0:  # where nothing is cut, all add the same to their rule
+        added = got.acceleration - rule
+        free = (rule + (learned - rule)[:, :1]).abs().amax((1, 2)) < A_MAX
+        torch.testing.assert_close(added[free], added[free][:, :1].expand(-1, 4, 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from helpers import POPULATION, composed, network, string, wavy_profiles
@@ -235,6 +237,28 @@ def test_switching_state_is_carried_by_the_tensordict() -> None:
     assert torch.equal(begun["hybrid", "switches"][1], data["next", "hybrid", "switches"][1, -1])
 
 
+def amplification(series) -> torch.Tensor:
+    """Σ e_v(i,i−1)² over that of the vehicle ahead, where that one moves."""
+    energy = series["speed_error"].square().sum(0)
+    return (energy[:, 1:] / energy[:, :-1])[energy[:, :-1] > 1e-2]
+
+
+@pytest.mark.parametrize("actor", [*ACTORS, "hasty"])
+def test_what_the_first_decides_is_not_amplified_whoever_is_the_parent(actor) -> None:
+    # Errors between neighbours obey the rule alone: at every frequency z the error behind is
+    # (k1 X + k2 − k1 delay) / (z − 1 + kx X + kv) times the one ahead, X = T/2 (z + 1)/(z − 1).
+    k1, k2, k3, k4 = 0.04, 0.12, 1.4, 1.3
+    z = torch.exp(1j * torch.logspace(-4, math.log10(math.pi), 2000, dtype=torch.float64))
+    place = T / 2 * (z + 1) / (z - 1)
+    behind = (k1 * (place - 0.005) + k2) / (z - 1 + (k1 + k3) * place + k2 + k4)
+    bound = behind.abs().max().square()
+    assert bound < 0.05
+    found = amplification(play(windows(), hcfs(actor, choice="first")))
+    assert found.max() < bound
+    if actor == "random":
+        assert amplification(play(windows(), hcfs(actor))).max() > 1.0
+
+
 def test_the_hybrid_of_good_parents_is_about_as_good_as_the_better() -> None:
     profiles = windows()
     hybrid = play(profiles, hcfs("good"))["reward"].sum()
@@ -243,8 +267,10 @@ def test_the_hybrid_of_good_parents_is_about_as_good_as_the_better() -> None:
     assert hybrid >= 1.1 * max(parents)  # rewards are negative: 10 %
 
 
-def test_the_hybrid_brakes_where_what_it_measures_is_no_number() -> None:
-    hybrid = HCFS(rule=CACC()).bind(World(parse_string("automated*2"), T))
+@pytest.mark.parametrize("choice", ["better", "between", "first"])
+def test_the_hybrid_brakes_where_what_it_measures_is_no_number(choice) -> None:
+    hybrid = HCFS(rule=CACC(), choice=choice).bind(World(parse_string("automated*2"), T))
+    unused = {"first": "action"}  # that of the second vehicle
     measured = (
         "action",
         "speed",
@@ -261,7 +287,7 @@ def test_the_hybrid_brakes_where_what_it_measures_is_no_number() -> None:
                 value[0, 1] = torch.nan
             entries.append(value)
         command, *_ = hybrid.command(*entries)
-        assert command[0, 1] == -A_MAX, name
+        assert (command[0, 1] == -A_MAX) == (name != unused.get(choice)), name
         assert command[0, 0] > -A_MAX
 
 
@@ -330,6 +356,12 @@ def test_cacc_in_a_mixed_string_obeys_the_law_by_hand() -> None:
     wanted = (change / T).clamp(-3.0, 3.0)
     found = data["next", "vehicles", "command"][..., 4, 0]
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_the_first_decides_for_one_platoon_only() -> None:
+    words = "choice=first needs a string that is one platoon, but the string has automated, human"
+    with pytest.raises(ConfigError, match=words):
+        HCFS(rule=CACC(), choice="first").bind(World(MIXED, T))
 
 
 # -- the headway and the safe cap ------------------------------------------------------------------

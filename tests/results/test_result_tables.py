@@ -78,12 +78,15 @@ def series() -> dict[str, torch.Tensor]:
         "jerk": [[4.0, 0.0], [-6.0, 1.0], [0.0, 0.0]],
         "reward": (-torch.tensor(error).abs()).tolist(),
         "gap": [[5.0, 4.0], [3.0, 4.0], [4.0, -0.1]],
+        "power": [[100.0, 0.0], [200.0, -20.0], [300.0, 50.0]],
         "winner": [[0, 1], [1, 1], [1, 1]],
         "switches": [[0, 0], [1, 0], [1, 0]],
         "clamps": [[0, 0]] * 3,
         "cap_interventions": [[0, 0]] * 3,
     }
-    return {name: torch.tensor(values).view(3, 1, 2) for name, values in found.items()}
+    speed = torch.tensor([[10.0, 8.0], [12.0, 8.0], [10.0, 7.0], [10.0, 7.0]]).view(4, 1, 2)
+    rows = {name: torch.tensor(values).view(3, 1, 2) for name, values in found.items()}
+    return {**rows, "speed": speed}
 
 
 def test_measures_of_a_platoon_by_hand() -> None:
@@ -94,6 +97,9 @@ def test_measures_of_a_platoon_by_hand() -> None:
     assert (first["max_gap_error_m"], second["max_gap_error_m"]) == (2.0, pytest.approx(5.1))
     assert pd.isna(first["energy_ratio"])
     assert second["energy_ratio"] == pytest.approx(4.0 / 2.0)
+    # J and m of a step's length: 600 / (11 + 11 + 10), 30 / (8 + 7.5 + 7).
+    assert first["energy_kj_per_km"] == pytest.approx(600 / 32)
+    assert second["energy_kj_per_km"] == pytest.approx(30 / 22.5)
     assert first["learned_share"] == pytest.approx(2 / 3)
     assert (first["switches"], second["switches"], first["frames"]) == (1, 0, 3)
 

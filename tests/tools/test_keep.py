@@ -9,6 +9,7 @@ from study_frames import episodes
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
+from lcc_rl.studies.hcfs.tables import LARGEST, SUMS, sources
 
 
 def test_the_length_of_the_training_stands_beside_the_windows(tmp_path) -> None:
@@ -35,6 +36,32 @@ def test_the_length_of_the_training_stands_beside_the_windows(tmp_path) -> None:
         (800, "ddpg"): -3.0,
         (800, "hcfs"): -1.0,
     }
+
+
+def test_runs_behind_other_leaders_are_named_by_the_choice(tmp_path) -> None:
+    strategies = ["cacc tuned", "ddpg", "hcfs", "hcfs oracle"]
+    for choice, reward in (("better", -4.0), ("first", -2.0)):
+        rows = pd.DataFrame({"strategy": strategies, "reward": [-8.0, -6.0, reward, -1.0]})
+        rows["training_seed"] = pd.Series([None, 0, 0, 0], dtype="Int64")
+        rows = rows.assign(**dict.fromkeys([*SUMS[:4], *SUMS[5:], *LARGEST], 0.5), case="windows")
+        rows = rows.assign(profile="a", run_id=0, min_gap_m=4.0, learned_share=0.0)
+        rows = rows.assign(energy_kj_per_km=600.0 + rows["reward"])
+        both = pd.concat([rows.assign(follower=1), rows.assign(follower=2, min_gap_m=3.0)])
+        write_parquet(both, tmp_path / "cycles" / choice / "episodes.parquet")
+        settings = f"deployed: {{choice: {choice}}}"
+        (tmp_path / "cycles" / choice / "config.yaml").write_text(settings)
+    path = tmp_path / "sources.parquet"
+    assert keep.main(["sources", str(tmp_path / "cycles"), "--out", str(path)]) == 0
+    kept = pd.read_parquet(path).set_index("strategy")
+    sums = {"cacc tuned": -16.0, "ddpg": -12.0, "hcfs": -8.0, "hcfs first": -4.0}
+    assert kept["reward"].to_dict() == sums
+    assert set(kept["source"]) == {"cycles"}
+    assert set(kept["min_gap_m"]) == {3.0}
+    table = sources(kept.reset_index()).set_index("strategy")
+    first = table.loc["HCFS, the first decides"]
+    assert first["string ratio, above 1"] == "0.50, 0 of 1"
+    # 598 against CACC's 592 kJ/km.
+    assert first["energy saved_pct"] == pytest.approx(100 * (1 - 598 / 592))
 
 
 def test_means_per_window_and_per_driver(tmp_path) -> None:

@@ -20,6 +20,7 @@ from lcc_rl.studies.hcfs.tables import LEARNED
 from lcc_rl.studies.runner import read_notes
 
 LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
+SOURCES = "sources.parquet"  # rows of the windows of other sources of leaders
 TITLE = "Hybrid Car-Following Strategy: the study"
 # The paper's table and figures of each case: speeds, jerk, and who drives.
 CASES = {
@@ -59,6 +60,7 @@ def write_results(
     for case in CASES:
         _case(made, episodes, steps, case)
     _whole(made, episodes)
+    _sources(made)
     _training(made)
     text = """The weights of the reward are not printed. Table IV determines them: the sums of
         errors and jerks printed there give its sums of reward within 0.1."""
@@ -126,6 +128,15 @@ def _whole(made: Page, episodes: pd.DataFrame) -> None:
         ("whole_gains", "HCFS against its parents", tables.whole_gains(episodes, PARENTS)),
     ]
     made.add("Whole records", text, listed)
+
+
+def _sources(made: Page) -> None:
+    if not (made.folder / SOURCES).exists():  # only where platoons drove behind other leaders, too
+        return
+    text = """HCFS as printed, and as it takes the best point between its parents, decided by the
+        first vehicle, which broadcasts what it adds to CACC."""
+    table = tables.sources(read_parquet(made.folder / SOURCES))
+    made.add("Other leaders", text, [("sources", "Windows of other sources of leaders", table)])
 
 
 def _training(made: Page) -> None:

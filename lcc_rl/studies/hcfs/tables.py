@@ -28,6 +28,8 @@ NAMES = {  # of strategies, for readers
     "cacc tuned": "CACC, tuned",
     "ddpg": "DDPG",
     "hcfs": "HCFS",
+    "hcfs between": "HCFS, best point between",
+    "hcfs first": "HCFS, the first decides",
     "hcfs literal": "HCFS, literal",
     "hcfs oracle": "HCFS, oracle",
     "hcfs untuned": "HCFS of the fitted CACC",
@@ -43,12 +45,16 @@ RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
 SUMS += ["collided", *COUNTS]
 LARGEST = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
+# What is kept of runs behind other sources of leaders, and of which strategies.
+MEASURES = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
+MEASURES += ["energy_kj_per_km"]
+STABLE = ("cacc tuned", LEARNED, "hcfs", "hcfs between", "hcfs first")
 
 
 def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum the rows of the vehicles of each run; :func:`case_table` reads the result alike."""
     how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST, "max")}
-    how |= {"min_gap_m": "min", "learned_share": "mean"}
+    how |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
     return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(how)
 
 
@@ -75,11 +81,11 @@ def weights() -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def rewards(episodes: pd.DataFrame, strategy: str, case: str) -> pd.DataFrame:
-    """Return Σ reward of every run, ``[runs × seeds]``; one column where nothing was learned."""
+def per_seed(episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward") -> pd.DataFrame:
+    """Return a sum of every run, ``[runs × seeds]``; one column where nothing was learned."""
     rows = episodes[(episodes["strategy"] == strategy) & (episodes["case"] == case)]
     return rows.assign(training_seed=rows["training_seed"].fillna(-1)).pivot_table(
-        index="profile", columns="training_seed", values="reward", aggfunc="sum"
+        index="profile", columns="training_seed", values=of, aggfunc="sum"
     )
 
 
@@ -97,11 +103,11 @@ def win_rates(
         with 95 % intervals over windows and seeds. Trained strategies are compared seed by seed;
         ``seeds_ahead`` counts the seeds with a positive difference.
     """
-    own = rewards(episodes, of, case)
+    own = per_seed(episodes, of, case)
     names = [n for n in dict.fromkeys(episodes["strategy"]) if n != of]
     rows = []
     for name in names if against is None else against:
-        other = rewards(episodes, name, case)
+        other = per_seed(episodes, name, case)
         if len(other.columns) == 1:
             other = pd.concat([other.iloc[:, 0]] * len(own.columns), axis=1, keys=own.columns)
         shared = own.columns.intersection(other.columns)
@@ -130,7 +136,7 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
             "strategy": NAMES[name],
             "Σ abs e_v_mps": table.at[name, "speed_error_sum_mps"],
             "Σ abs jerk_mps3": table.at[name, "jerk_sum_mps3"],
-            **intervals.crossed(rewards(episodes, name, WINDOWS)).columns("Σ reward"),
+            **intervals.crossed(per_seed(episodes, name, WINDOWS)).columns("Σ reward"),
         }
         for name in strategies
     ]
@@ -184,11 +190,41 @@ def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
             {
                 "episodes of training": episodes,
                 "trainings": parent["trainings"],
-                **intervals.crossed(rewards(group, LEARNED, WINDOWS)).columns("DDPG"),
-                **intervals.crossed(rewards(group, "hcfs", WINDOWS)).columns("HCFS"),
+                **intervals.crossed(per_seed(group, LEARNED, WINDOWS)).columns("DDPG"),
+                **intervals.crossed(per_seed(group, "hcfs", WINDOWS)).columns("HCFS"),
                 **{new: parent[old] for old, new in GAINED.items() if old.startswith("gain")},
             }
         )
+    return pd.DataFrame(rows)
+
+
+def sources(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return reward, stability and energy behind several sources of leaders.
+
+    Args:
+        runs: rows of strategies, seeds and windows, with the ``source`` of the leaders.
+
+    Returns:
+        A row per source and strategy: Σ reward and the energy saved against CACC, with intervals
+        over windows and seeds; the largest gap error, the worst string ratio and how many runs
+        have one above 1, of all runs.
+    """
+    rows = []
+    for source, group in runs.groupby("source", sort=False):
+        spent = {
+            name: per_seed(group, name, WINDOWS, "energy_kj_per_km")
+            for name in STABLE
+            if name in set(group["strategy"])
+        }
+        for name, energy in spent.items():
+            own = group[group["strategy"] == name]
+            saved = intervals.saving(energy, spent[STABLE[0]])
+            above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
+            row = {"leaders": source, "strategy": NAMES[name]}
+            row |= intervals.crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
+            row |= {"gap error_m": own["max_gap_error_m"].max()}
+            row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
+            rows.append(row | saved.columns("energy saved_pct", 100.0))
     return pd.DataFrame(rows)
 
 
