@@ -34,6 +34,7 @@ from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
 from lcc_rl.pieces.surrogates import (
     Correction,
+    ExcessSpacing,
     PathEnergy,
     SmoothEfficiency,
     Smoothness,
@@ -67,6 +68,7 @@ __all__ = [
     "EnergyClasses",
     "EnergyReward",
     "EquilibriumStart",
+    "ExcessSpacing",
     "Feature",
     "FollowerStopper",
     "Gipps",

@@ -115,6 +115,30 @@ class Correction(RewardTerm):
         return -correction.square()
 
 
+class ExcessSpacing(RewardTerm):
+    """Minus the share by which a vehicle takes more of the lane than a human driver at its speed.
+
+    The flow of a lane is speed over mean spacing, so a lane with a share p of such vehicles loses
+    about p times this share. Its limit holds on average: what is taken in a wave may be given
+    back after it.
+    """
+
+    standstill_gap: Positive = 2.0  # of the human driver [m]
+    time_gap: Positive = 1.05  # of the human driver, that of a stationary gap [s]
+    vehicle_length: Positive = 5.0  # [m]
+
+    reads = ("self.gap", "self.speed")
+
+    def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        return -self.missed(gap, speed)
+
+    def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
+        """Return that share, negative for a vehicle closer than a human, ``[*batch, A, 1]``."""
+        own = self.standstill_gap + self.time_gap * speed
+        return (gap - own) / (own + self.vehicle_length)
+
+
 class PathEnergy(RewardTerm):
     """−P/scale · T of the energy that a path takes: without what the motion stores.
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from lcc_rl.pieces import SafetyReward, SmoothEfficiency, Smoothness, SmoothSafety
+from lcc_rl.pieces import ExcessSpacing, SafetyReward, SmoothEfficiency, Smoothness, SmoothSafety
 
 
 def column(*values: float) -> torch.Tensor:
@@ -40,3 +40,10 @@ def test_efficiency_begins_at_its_threshold_and_leads_back() -> None:
 
 def test_smoothness_is_the_square_of_the_jerk() -> None:
     assert Smoothness(weight=0.5).bind().compute(torch.tensor([[2.0]])).item() == -2.0
+
+
+def test_excess_spacing_is_the_share_of_the_lane_that_a_human_would_not_take() -> None:
+    term = ExcessSpacing(standstill_gap=2.0, time_gap=1.0, vehicle_length=5.0)
+    gap, speed = column(22.0, 49.0, 8.5), column(20.0, 20.0, 20.0)  # a human keeps 22 m, takes 27 m
+    assert term.missed(gap, speed).squeeze(-1).tolist() == pytest.approx([0.0, 1.0, -0.5])
+    assert torch.equal(term.reward(gap, speed), -term.missed(gap, speed))
