@@ -9,10 +9,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
-from lcc_rl.runs.interrupts import interruptible
-from lcc_rl.runs.output import unbroken_output
 from lcc_rl.runs.overview import counts, draw, headline, live, note, progress
 from lcc_rl.runs.states import survey
 from lcc_rl.runs.sweeps import read_plan
@@ -61,9 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
     options = parser.parse_args(arguments)
-    with interruptible(), unbroken_output():
-        main_guard(look)(options.folder, Console(highlight=False), options.watch)
+    look(options.folder, Console(highlight=False), options.watch)
 
 
 if __name__ == "__main__":
-    main()
+    main_guard(main)()

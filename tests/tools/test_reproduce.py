@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.studies import reproduce as tool
 
 
