@@ -134,11 +134,6 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
     def explained_function(*arguments: Any) -> Any:
         try:
             return function(*arguments)
-        except OSError as error:
-            if error.filename is not None or SweepCallback.target is None:
-                raise
-            # Of a file that Hydra writes itself.
-            raise ResultsError(f"{SweepCallback.target}: {error}") from error
         except (*HYDRA_ERRORS, ValueError, TypeError) as error:
             *_, last = traceback.walk_tb(error.__traceback__)
             module = str(last[0].f_globals["__name__"])
@@ -146,6 +141,11 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
                 raise
             typed = [word for word in sys.argv[1:] if "=" in word]
             raise input_error(error) or explained(error, typed) from error
+        except OSError as error:
+            if error.filename is not None or SweepCallback.target is None:
+                raise
+            # Of a file that Hydra writes itself.
+            raise ResultsError(f"{SweepCallback.target}: {error}") from error
 
     return explained_function
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from rich.console import Console
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
+from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.overview import counts, draw, headline, live, note, progress
 from lcc_rl.runs.states import survey
 from lcc_rl.runs.sweeps import read_plan
@@ -55,7 +55,7 @@ def look(folder: str, console: Console, watching: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Show the folder given on the command line."""
-    parser = argparse.ArgumentParser("lcc-rl status", description=__doc__)
+    parser = Arguments(prog="lcc-rl status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
     options = parser.parse_args(arguments)

@@ -15,7 +15,7 @@ from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
-from lcc_rl.data.tables import TEXT_TAKES, check_map, unpacked_size
+from lcc_rl.data.tables import TEXT_TAKES, check_map, file_size
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
@@ -60,7 +60,7 @@ class NgsimSource(Settings):
         """
         files = find_files(self.path)
         if self.location is None:  # of one location of several, nobody knows how much there is
-            require_memory({f"reading {name}": TEXT_TAKES * unpacked_size(name) for name in files})
+            require_memory({f"reading {name}": TEXT_TAKES * file_size(name) for name in files})
         trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)

@@ -71,7 +71,7 @@ def claim(folder: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         raise busy(folder) from None
-    except (OSError, NotImplementedError) as error:
+    except (OSError, NotImplementedError, ValueError) as error:  # the last one: of such a name
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
     try:
         remove_leftovers(folder)
