@@ -32,7 +32,7 @@ def check_used(content: Mapping[str, Any], overrides: Sequence[str], sweep: bool
     for item, key in typed.items():
         for unused, reason in reasons.items():
             if (key == unused or key.startswith(f"{unused}.")) and item not in NO_AGENT:
-                raise ConfigError(f"{item} has no effect: {reason}")
+                raise ConfigError(f"{item.removeprefix('++')} has no effect: {reason}")
 
 
 def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

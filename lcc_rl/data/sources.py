@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import glob, has_magic
+from os.path import expanduser
 from pathlib import Path
 from typing import Literal
 
@@ -153,7 +154,7 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
-        name = str(Path(entry).expanduser())
+        name = str(expanduser(entry))
         found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
         if has_magic(name) and not Path(name).exists():
             found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from io import BufferedReader, RawIOBase
+from os.path import expanduser  # that of pathlib raises for an unknown user
 from pathlib import Path
 from typing import IO, Any
 
@@ -126,7 +127,7 @@ class TableFile:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path).expanduser()
+        self.path = Path(expanduser(path))
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
         if not self.path.is_file():

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import field, replace
 from datetime import UTC, datetime, timedelta
 from filecmp import cmp
+from os.path import expanduser
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
@@ -110,7 +111,7 @@ class StreamSource(Settings):
             ResultsError: if the file cannot be written.
         """
         with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
-            kept = Path(self.keep or "stream.csv").expanduser()
+            kept = Path(expanduser(self.keep or "stream.csv"))
             path = Path(folder) / kept.name
             self.write(path)
             loaded = NgsimSource(path=str(path), criteria=self.criteria).load()
