@@ -66,12 +66,13 @@ def claim(folder: Path) -> Iterator[None]:
     """
     made, lock = False, FileLock(folder / LOCK)
     try:
+        str(folder.resolve()).encode()  # pyarrow knows names in UTF-8 only
         made = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout:
         raise busy(folder) from None
-    except (OSError, NotImplementedError, ValueError) as error:  # the last one: of such a name
+    except (OSError, NotImplementedError, ValueError) as error:  # the last one: of a name
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
     try:
         remove_leftovers(folder)
