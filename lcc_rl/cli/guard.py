@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from typing import Any, NoReturn
 
@@ -40,6 +41,6 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def stop(text: str, code: int) -> NoReturn:
     """Print a line on stderr and exit."""
-    with unbroken_output():
+    with suppress(OSError), unbroken_output():
         print(f"lcc_rl: {one_line(text)}", file=sys.stderr)
     sys.exit(code)

@@ -113,7 +113,7 @@ class SweepCallback(Callback):
         """Exit with one line before Hydra writes into the folder of another process's run."""
         try:
             type(self).target = folder = Path(config.hydra.run.dir)
-            type(self).made = [x for x in (folder, *folder.parents) if not x.exists()]
+            type(self).made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]
         except OmegaConfBaseException:  # resume=nowhere: Hydra says so itself when it gets there
             return
         if is_claimed(folder):
