@@ -71,3 +71,23 @@ def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     near = get_close_matches(name, options, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options) or 'none'}.{hint}")
+
+
+def of_hydra(error: BaseException) -> bool:
+    """Whether an error is one of Hydra's or OmegaConf's; neither need be loaded."""
+    kinds = type(error).__mro__
+    return any(kind.__module__.startswith(("hydra.", "omegaconf.")) for kind in kinds)
+
+
+def input_error(error: BaseException) -> LccError | None:
+    """Return the error of this package that another one wraps."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, LccError):
+        # OmegaConf sets its resolvers' errors as context, not as cause.
+        cause = cause.__cause__ or (cause.__context__ if of_hydra(cause) else None)
+    return cause
+
+
+def one_line(text: str) -> str:
+    """Return a text in one line without control characters, which a terminal would obey."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

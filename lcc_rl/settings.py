@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 import re
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -31,6 +32,9 @@ Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
+Million = Annotated[int, Field(ge=1, le=1_000_000)]
+MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
+Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -96,7 +100,7 @@ def refused(error: ValidationError, kind: Any, where: str) -> ConfigError:
     if first["type"] == "value_error":
         return ConfigError(f"{key}: {first['ctx']['error']}")
     wanted = re.sub(r"^\w+ should", "must", first["msg"])
-    return ConfigError(f"{key} {wanted}, got {first['input']!r}")
+    return ConfigError(f"{key} {wanted}, got {repr(first['input'])[:200]}")
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:

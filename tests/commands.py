@@ -26,6 +26,7 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
 from lcc_rl.runs.interrupts import SIGNALS
@@ -77,7 +78,7 @@ def run_command(module: str, *words: str, cwd: Path, check: bool = False) -> Don
 
     The process's state is put back afterwards. An exception that a process would end on is raised.
     """
-    main, code = import_module(module).main, 0
+    main, code = main_guard(import_module(module).main), 0
     with process_state(module, words, cwd) as (out, err):
         try:
             main()

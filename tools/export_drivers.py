@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import pandas as pd
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.drivers.parameters import COLUMNS, IDM
 from lcc_rl.drivers.tables import load_drivers, models_of
 from lcc_rl.errors import DataError

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.config.schemas import as_text
 from lcc_rl.io.tensors import write_torch
 from lcc_rl.results.policies import load_policy

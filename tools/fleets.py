@@ -16,7 +16,7 @@ import pandas as pd
 from leaderboard import task_scores
 from matplotlib.figure import Figure
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import require
 from lcc_rl.figures.drawing import legend_above, new_figure, save, style
 from lcc_rl.functional.pattern import AUTOMATED

@@ -16,7 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl import results
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet

@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.commands.evaluation import strategies_of, task_of
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import build_env

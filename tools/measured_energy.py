@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel
 from lcc_rl.figures.drawing import INK, grid, new_figure, save, style
 from lcc_rl.io.files import read_parquet, write_parquet

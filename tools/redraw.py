@@ -19,7 +19,7 @@ import measured_energy
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import ConfigError

@@ -10,30 +10,60 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import pandas as pd
 import torch
+from pydantic import AfterValidator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.agent import Agent
+from lcc_rl.agents.agent import Agent, Whole
 from lcc_rl.agents.checks import check_learner
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config.schemas import TrainingConfig
-from lcc_rl.errors import Diverged, Interrupted, ResultsError
+from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import write_parquet
-from lcc_rl.io.tensors import read_torch, write_torch
+from lcc_rl.io.tensors import check_like, read_checked, write_torch
 from lcc_rl.pieces.rewards import REWARD, TERMS
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.settings import Settings
 
 # What the record of an iteration is made from.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 
 AgentT = TypeVar("AgentT", bound=Agent)
+
+
+def check_columns(columns: dict[str, Any]) -> dict[str, Any]:
+    """Check that the columns of a record are numbers in double precision."""
+    for name, value in columns.items():
+        if not isinstance(value, Tensor) or value.dtype != torch.float64 or value.ndim != 1:
+            raise ValueError(f"column {name!r} is no list of numbers in double precision")
+    return columns
+
+
+Columns = Annotated[dict[str, Any], AfterValidator(check_columns)]
+
+
+class Checkpoint(Settings):
+    """What a checkpoint holds."""
+
+    identity: str
+    iteration: Whole
+    updates: Whole
+    agent: dict[str, Any]
+    rows: Columns  # the record, an entry per iteration
+    times: Columns
+    memory: dict[str, Any]
+
+    def settled(self) -> None:
+        lengths = {len(column) for column in (*self.rows.values(), *self.times.values())}
+        if not {*lengths, *([] if self.rows else [0])} <= {self.iteration}:
+            raise ConfigError(f"iteration {self.iteration}, but rows of {sorted(lengths)}")
 
 
 class TrainingLoop(ABC, Generic[AgentT]):
@@ -173,19 +203,22 @@ class TrainingLoop(ABC, Generic[AgentT]):
             ResultsError: if it is missing, damaged or belongs to another configuration.
         """
         path = self.folder / "checkpoint.pt"
-        state = read_torch(path)
-        found = state.get("identity") if isinstance(state, dict) else None
-        if found != self.identity:
+        found = read_checked(path, Checkpoint, "checkpoint")
+        if found.identity != self.identity:
             raise ResultsError(
-                f"{path}: belongs to another configuration (hash {found}, not {self.identity})"
+                f"{path}: belongs to another configuration (hash {found.identity}, not "
+                f"{self.identity})"
             )
         try:
-            self.iteration, self.updates = int(state["iteration"]), int(state["updates"])
-            self.agent.load_state_dict(state["agent"])
-            self._remember(state["memory"])
-            self.rows, self.times = _rows(state["rows"]), _rows(state["times"])
+            if found.iteration > self.iterations:
+                raise ValueError(f"iteration {found.iteration} of {self.iterations}")
+            check_like(found.agent, self.agent.state_dict(), "agent")
+            self.agent.load_state_dict(found.agent)
+            self._remember(found.memory)
         except Exception as error:  # what a part that does not fit raises is of many kinds
             raise ResultsError(f"{path}: does not fit this training: {error!r}") from error
+        self.iteration, self.updates = found.iteration, found.updates
+        self.rows, self.times = _rows(found.rows), _rows(found.times)
 
 
 def episode_statistics(batch: TensorDictBase) -> dict[str, float]:

@@ -18,6 +18,7 @@ from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, episode_statistics
 from lcc_rl.agents.off_policy import OffPolicy
 from lcc_rl.envs import StringCollector
+from lcc_rl.io.tensors import check_like
 from lcc_rl.pieces.rewards import REWARD
 
 # What is learned from, as the environment names it and as the losses do.
@@ -152,6 +153,8 @@ class Trainer(TrainingLoop[OffPolicy]):
 
     def _remember(self, memory: dict[str, Any]) -> None:
         self.best = memory["best"]
+        if self.best is not None:
+            check_like(self.best["weights"], self.agent.policy.state_dict(), "best")
         self.buffer.load_state_dict(memory["buffer"])
         self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
 

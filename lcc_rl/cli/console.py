@@ -6,7 +6,9 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from lcc_rl.runs import interrupts
+from lcc_rl.cli.guard import main_guard
+from lcc_rl.errors import unknown_name
+from lcc_rl.runs.interrupts import ending_quietly
 from lcc_rl.version import __version__
 
 # Name, module and what it does. Each module has a main: of the first four, which Hydra reads,
@@ -29,6 +31,7 @@ TOOLS = {
 COMMANDS = {**HYDRA, **TOOLS}
 
 
+@main_guard
 def main(words: Sequence[str] | None = None) -> None:
     """Run ``lcc-rl <command> …``; exits as the command does.
 
@@ -41,10 +44,7 @@ def main(words: Sequence[str] | None = None) -> None:
     elif words[0] == "--version":
         print(f"lcc-rl {__version__}")
     elif words[0] not in COMMANDS:
-        from lcc_rl.errors import unknown_name
-
-        print(f"lcc-rl: error: {unknown_name('command', words[0], COMMANDS)}", file=sys.stderr)
-        sys.exit(interrupts.BAD_INPUT)
+        raise unknown_name("command", words[0], COMMANDS)
     else:
         _run(words[0], words[1:])
 
@@ -67,18 +67,13 @@ def _help() -> str:
 
 def _run(name: str, words: list[str]) -> None:
     """Run one command, with the words that follow it as this process's arguments."""
-    interrupts.end_quietly()
     sys.argv = [f"lcc-rl {name}", *words]
-    module = import_module(COMMANDS[name][0])
+    with ending_quietly():
+        module = import_module(COMMANDS[name][0])
     if name in HYDRA:
         module.main()
-    elif name == "status":
-        module.main(words)
     else:
-        from lcc_rl.cli.entry import main_guard
-
-        with interrupts.interruptible():
-            sys.exit(main_guard(module.main)(words))
+        sys.exit(module.main(words))
 
 
 if __name__ == "__main__":

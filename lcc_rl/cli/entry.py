@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 from unittest.mock import patch
 
 import hydra
@@ -19,22 +19,14 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed, root_key
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.errors import ConfigError, Interrupted, LccError
-from lcc_rl.runs.interrupts import (
-    BAD_INPUT,
-    INTERRUPTED,
-    ending_quietly,
-    interruptible,
-    was_interrupted,
-)
-from lcc_rl.runs.output import unbroken_output
-from lcc_rl.runs.states import CONFIG, Busy, forget, input_error, record
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
+from lcc_rl.runs.interrupts import ending_quietly, was_interrupted
+from lcc_rl.runs.states import CONFIG, Busy, forget, record, withdraw
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
 
-# OSError: a folder cannot be made, a disk is full, a file cannot be read.
-INPUT_ERRORS = (LccError, *HYDRA_ERRORS, OSError)
 TRACEBACK = "HYDRA_FULL_ERROR"
 SWEEP = {"-m", "--multirun"}
 
@@ -70,7 +62,7 @@ def entry_point(
         def job(config: DictConfig) -> Any:
             if is_sweep():
                 return run_job(checked, config, run_folder())
-            return main_guard(recorded(checked))(config)
+            return main_guard(explaining(recorded(checked)))(config)
 
         command = hydra.main(
             version_base="1.3", config_path="pkg://lcc_rl.conf", config_name=config_name
@@ -98,8 +90,7 @@ def start(command: Callable[[], Any]) -> None:
     os.environ.setdefault(TRACEBACK, "1")
     guarded = run_sorted if wanted else main_guard(explaining(run_sorted))
     try:
-        with interruptible(), unbroken_output():
-            guarded(command)
+        guarded(command)
     finally:
         if not wanted:
             os.environ.pop(TRACEBACK, None)
@@ -157,12 +148,20 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
                 raise
             typed = [word for word in sys.argv[1:] if "=" in word]
             raise input_error(error) or explained(error, typed) from error
+        except OSError as error:
+            if error.filename is not None or SweepCallback.target is None:
+                raise
+            # Of a file that Hydra writes itself.
+            raise ResultsError(f"{SweepCallback.target}: {error}") from error
 
     return explained_function
 
 
 def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """Write ``error.txt`` into the run's folder on an error, unless it held a run before."""
+    """Leave nothing of a command that was refused, and ``error.txt`` of one that failed at work.
+
+    A command that names another run by mistake leaves it as it was.
+    """
 
     def recording(cfg: DictConfig) -> Any:
         folder = run_folder()
@@ -172,44 +171,16 @@ def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], An
         except (Interrupted, Busy):
             raise
         except Exception as error:
-            # A command that names another run by mistake leaves it as it was.
-            if not before:
+            given = isinstance(input_error(error) or error, (LccError, OSError))
+            if given and not (folder / CONFIG).exists() and SweepCallback.made:
+                withdraw(SweepCallback.made)
+            elif not before:
                 record(folder, error)
             raise
         forget(folder)
         return result
 
     return recording
-
-
-def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn input errors into one line on stderr and exit code 2."""
-
-    @wraps(function)
-    def guarded(*arguments: Any, **settings: Any) -> Any:
-        try:
-            with unbroken_output():
-                return function(*arguments, **settings)
-        except INPUT_ERRORS as error:
-            _stop(error)
-        except KeyboardInterrupt:
-            print("lcc_rl: interrupted", file=sys.stderr)
-            sys.exit(INTERRUPTED)
-
-    return guarded
-
-
-def _stop(error: Exception) -> NoReturn:
-    """Print an error, or the input error that Hydra wraps, in one line and exit."""
-    cause = input_error(error)
-    text = " ".join(str(cause or error).split())
-    if isinstance(error, OSError) and error.filename is None and SweepCallback.target is not None:
-        text = f"{SweepCallback.target}: {text}"  # of a file that Hydra writes itself
-    if isinstance(cause, Interrupted):
-        print(f"lcc_rl: {text}", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    print(f"lcc_rl: error: {text}", file=sys.stderr)
-    sys.exit(BAD_INPUT)
 
 
 def run_folder() -> Path:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from lcc_rl.cli.entry import main_guard
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
-from lcc_rl.runs.interrupts import interruptible
-from lcc_rl.runs.output import unbroken_output
+from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.overview import counts, draw, headline, live, note, progress
 from lcc_rl.runs.states import survey
 from lcc_rl.runs.sweeps import read_plan
@@ -57,13 +55,12 @@ def look(folder: str, console: Console, watching: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Show the folder given on the command line."""
-    parser = argparse.ArgumentParser("lcc-rl status", description=__doc__)
+    parser = Arguments(prog="lcc-rl status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
     options = parser.parse_args(arguments)
-    with interruptible(), unbroken_output():
-        main_guard(look)(options.folder, Console(highlight=False), options.watch)
+    look(options.folder, Console(highlight=False), options.watch)
 
 
 if __name__ == "__main__":
-    main()
+    main_guard(main)()

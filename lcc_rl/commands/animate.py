@@ -7,16 +7,21 @@ lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file, in_words
+from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
+from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.settings import NonNegative
 
 KEPT = "evaluation.sample_episodes=4"
 
@@ -49,7 +54,7 @@ def run(
     """
     folder = with_steps(Path(folder))
     if out is not None:
-        check_ending(Path(out))
+        check_ending(new_file(out, "--out"))
     steps = read_parquet(folder / STEPS)
     if steps.empty:
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
@@ -94,14 +99,19 @@ def with_steps(folder: Path) -> Path:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Animate what is named on the command line; print the file's name."""
-    form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser = Arguments(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an evaluation, training or main job")
     parser.add_argument("--strategy", help="by default the last one of the evaluation")
-    parser.add_argument("--episode", type=int, default=0, help="which sample episode, from 0")
+    number = typed(NonNegative)
+    parser.add_argument(
+        "--episode",
+        type=typed(Annotated[int, Field(ge=0)]),
+        default=0,
+        help="which sample episode, from 0",
+    )
     parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(FORMS)}")
-    parser.add_argument("--start", type=float, default=0.0, help="first moment [s]")
-    parser.add_argument("--duration", type=float, help="by default to the end [s]")
+    parser.add_argument("--start", type=number, default=0.0, help="first moment [s]")
+    parser.add_argument("--duration", type=number, help="by default to the end [s]")
     given = parser.parse_args(words)
     file = run(given.run, given.strategy, given.episode, given.out, given.start, given.duration)
     print(file)

@@ -15,8 +15,8 @@ profiles.
 
 from __future__ import annotations
 
-import argparse
 import logging
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -35,13 +35,17 @@ from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, trained
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.io.atomic import new_file
+from lcc_rl.io.atomic import own_folder
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.policies import load_policy
+from lcc_rl.results.runs import EPISODES
 from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import as_rich, summary
+from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.runs.states import PROGRESS
+from lcc_rl.settings import Million
 
 DRIVERS = 12
 BLOCK = 480  # episodes planned side by side: a few GiB
@@ -50,12 +54,12 @@ PATH = {BOTH: "total_path_energy_kj", OWN: "cav_path_energy_kj"}
 KEYS = ["profile_id", "driver_id"]
 
 
-def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
+def plan(options: Namespace, overrides: list[str]) -> pd.DataFrame:
     """Evaluate human driver, policies and plans; write and return the rows of episodes.parquet."""
     own = ["variant=alcc", f"evaluation.drivers={DRIVERS}"]
     cfg = load("evaluate", [*own, *overrides])
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
-    place = new_file(options.out / "episodes.parquet", "--out")
+    folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     learned = [start(cfg, path, inputs) for path in options.policy or ["pretrained"]]
@@ -63,14 +67,14 @@ def plan(options: argparse.Namespace, overrides: list[str]) -> pd.DataFrame:
     parts = list(blocks(inputs, cfg.evaluation.drivers))
     work = len(parts) * len(learned) * (1 + options.regard) * options.iterations
     made, done = [], count(1)
-    with ProgressReporter("clairvoyant", work, folder=options.out) as progress:
+    with ProgressReporter("clairvoyant", work, folder=folder) as progress:
         for first, block in parts:
             tell = partial(_tell, progress, done)
             rows = pd.concat(block_rows(cfg, learned, block, options, tell))
             rows["profile_id"] += first
             made.append(rows)
     episodes = pd.concat(made, ignore_index=True)
-    write_parquet(episodes, place)
+    write_parquet(episodes, folder / EPISODES)
     return episodes
 
 
@@ -104,7 +108,7 @@ def block_rows(
     cfg: EvaluateConfig,
     learned: list[Strategy],
     block: Inputs,
-    options: argparse.Namespace,
+    options: Namespace,
     tell: Callable[[int, dict[str, float]], None],
 ) -> Iterator[pd.DataFrame]:
     """Yield the rows of everybody behind a block of windows."""
@@ -153,11 +157,10 @@ def regard(episodes: pd.DataFrame) -> str:
 
 def main(arguments: list[str]) -> int:
     """Plan and print the table."""
-    form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser = Arguments(description=__doc__)
     parser.add_argument("--policy", action="append", help="start of the plan (pretrained)")
     parser.add_argument("--regard", action="store_true", help="plan for the car alone, too")
-    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--iterations", type=typed(Million), default=400)
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)

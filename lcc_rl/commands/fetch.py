@@ -9,16 +9,19 @@ complete, with as many rows as the portal counts. It is read by ``data=ngsim``.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlencode
 
+from pydantic import Field
+
 from lcc_rl.errors import ConfigError, DataError, how_to_install
-from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.atomic import atomic_path, new_file
+from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.settings import Million
 
 BASE_URL = "https://data.transportation.gov"
 DATASET = "8ect-6jqj"
@@ -112,19 +115,22 @@ def joined(pages: Sequence[Path], total: int, output: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = Arguments(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--location", choices=LOCATIONS, help="one location (default: all four)")
     parser.add_argument("--output", type=Path, default=Path("data/ngsim.csv"), help="the CSV file")
-    parser.add_argument("--page-rows", type=int, default=PAGE_ROWS, help="rows per request")
-    parser.add_argument("--retries", type=int, default=RETRIES, help="per request")
+    parser.add_argument(
+        "--page-rows", type=typed(Million), default=PAGE_ROWS, help="rows per request"
+    )
+    parser.add_argument(
+        "--retries",
+        type=typed(Annotated[int, Field(ge=0, le=1000)]),
+        default=RETRIES,
+        help="per request",
+    )
     parser.add_argument("--base-url", default=BASE_URL, help="another portal")
     options = parser.parse_args(arguments)
-    if options.page_rows < 1:
-        parser.error("--page-rows must be at least 1")
-    if options.output.exists():
-        raise ConfigError(f"{options.output} exists already; remove it to download it again")
     rows = fetch(
-        options.output,
+        new_file(options.output, "--output"),
         options.location,
         options.base_url.rstrip("/"),
         options.page_rows,

@@ -6,7 +6,6 @@ sample episodes visit, of the learned strategies and of a tuned rule.
 
 from __future__ import annotations
 
-import argparse
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from lcc_rl.figures.policy_maps import policy_maps
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
 from lcc_rl.results.runs import STEPS, load_config, reading
+from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.precision import prepare_torch
 
 log = logging.getLogger("lcc_rl")
@@ -100,8 +100,7 @@ def grid_of(motions: Sequence[Motion]) -> tuple[list[float], list[float], list[f
 
 def main(words: Sequence[str] | None = None) -> int:
     """Map what is named on the command line; print the figures' names."""
-    form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser = Arguments(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an evaluation or main job")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     given = parser.parse_args(words)

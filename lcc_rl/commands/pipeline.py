@@ -6,7 +6,8 @@ import logging
 import multiprocessing
 import os
 import threading
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields
 from io import StringIO
 from pathlib import Path
@@ -52,7 +53,6 @@ log = logging.getLogger("lcc_rl")
 # Settings that only the pipeline has, and data, which a variant with other leaders would refuse;
 # all others are passed on to calibration and trainings.
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
-PATIENCE = 20.0  # a training ends after the iteration at hand [s]
 COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last one and its folder
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
@@ -203,20 +203,16 @@ def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
             watch({name: (folder / name, future) for name, future in futures.items()})
             for future in futures.values():
                 future.result()
-        except (KeyboardInterrupt, Interrupted):
-            _stop_children(list(futures.values()))
+        except (KeyboardInterrupt, BrokenProcessPool):
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()  # a training saves its state first
             raise Interrupted(f"stopped; complete it with: lcc-rl run resume={folder}") from None
-
-
-def _stop_children(futures: list[Future[None]]) -> None:
-    """Let trainings that heard the interrupt save and end; then tell those that did not."""
-    _, running = wait(futures, PATIENCE)
-    for process in multiprocessing.active_children() if running else ():
-        process.terminate()
 
 
 def _end_with_parent() -> None:
     """End this process once its parent was killed; it would wait for work forever."""
+    logging.getLogger().setLevel(logging.INFO)
     parent = multiprocessing.parent_process()
 
     def wait_for_end() -> None:
@@ -228,17 +224,22 @@ def _end_with_parent() -> None:
 
 
 def _train_one(cfg: TrainConfig, folder: str) -> None:
-    """Train one variant; runs in a process of its own, with a log file of its own."""
+    """Train one variant, with a log file of its own; runs in a process of the pool."""
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    logging.basicConfig(
-        filename=target / "train.log",
-        level=logging.INFO,
-        format="[%(asctime)s][%(levelname)s] %(message)s",
-    )
     if (target / "checkpoint.pt").exists():
         cfg.resume = folder
-    training.run(cfg, target, quiet=True)
+    handler = logging.FileHandler(target / "train.log")
+    handler.setFormatter(logging.Formatter("[%(asctime)s][%(levelname)s] %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    try:
+        training.run(cfg, target, quiet=True)
+    except Interrupted:
+        os._exit(INTERRUPTED)  # or the pool would give this process the next training
+    finally:
+        root.removeHandler(handler)
+        handler.close()
 
 
 def _finished(folder: Path) -> bool:

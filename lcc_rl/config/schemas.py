@@ -7,7 +7,6 @@ are built; :mod:`lcc_rl.config.nodes` checks them and completes their defaults.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -17,15 +16,12 @@ from pydantic import AfterValidator, Field
 from lcc_rl.config.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.functional.pattern import VehicleString, parse_string
-from lcc_rl.settings import Count, NonNegative, Positive, Settings, parse
+from lcc_rl.settings import Count, Million, NonNegative, Parallel, Positive, Settings, parse
 
-MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
-Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
 # Each names a folder in the job's.
 Variants = Annotated[list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]], Field(min_length=1)]
-Million = Annotated[int, Field(ge=1, le=1_000_000)]
 FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
 Format = Literal["png", "pdf", "svg"]
 

@@ -27,12 +27,12 @@ def check_used(content: Mapping[str, Any], overrides: Sequence[str], sweep: bool
         return
     reasons = dict(_of_traffic(content))
     if not sweep:
-        reasons |= dict(_of_agent(content))
+        reasons |= dict(_of_agent(content)) | {"sweep": "it names the folder of a sweep, -m"}
     typed = {item: item.lstrip("+~").partition("=")[0].partition("@")[0] for item in overrides}
     for item, key in typed.items():
         for unused, reason in reasons.items():
             if (key == unused or key.startswith(f"{unused}.")) and item not in NO_AGENT:
-                raise ConfigError(f"{item} has no effect: {reason}")
+                raise ConfigError(f"{item.removeprefix('++')} has no effect: {reason}")
 
 
 def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

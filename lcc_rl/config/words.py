@@ -33,3 +33,5 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     for word in words:
         if root_key(word) in given:
             raise ConfigError(f"{word}: {reason}")
+        if root_key(word) == "hydra":
+            raise ConfigError(f"{word} has no effect: this command chooses the folders itself")

@@ -109,12 +109,11 @@ class Plausible(Settings):
                 f"{SHORTEST:g} s"
             )
         kept, more_lines = _not_negative(kept)
-        self._check_units(kept, source, setting)
-        return kept, [*lines, *more_lines]
+        return kept, [*lines, *more_lines, *self._check_units(kept, source, setting)]
 
-    def _check_units(self, kept: pd.DataFrame, source: str, setting: str) -> None:
+    def _check_units(self, kept: pd.DataFrame, source: str, setting: str) -> list[str]:
         hard = hard_share(kept)
-        if hard > self.max_hard:
+        if hard is not None and hard > self.max_hard:
             raise DataError(
                 f"{source}: speeds change by more than {HARD:g} m/s within a second for "
                 f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; are they "
@@ -127,6 +126,8 @@ class Plausible(Settings):
                 f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; are speeds in km/h, mph "
                 "or ft/s, gaps in feet, or leader and follower exchanged?"
             )
+        few = f"too few samples to tell whether speeds are in m/s: fewer than {LEAST_SAMPLES}"
+        return [f"{few} a second apart"] if hard is None else []
 
     def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Fault]:
         """What may be outside of a threshold; ``first`` marks the first row of each record."""
@@ -155,7 +156,7 @@ class Plausible(Settings):
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
 
 
-def hard_share(table: pd.DataFrame) -> float:
+def hard_share(table: pd.DataFrame) -> float | None:
     """Return the largest share of samples whose speed changes by more than 4 m/s in a second.
 
     Args:
@@ -163,13 +164,13 @@ def hard_share(table: pd.DataFrame) -> float:
             counts.
 
     Returns:
-        The share; 0 where there are too few samples to tell.
+        The share; None where there are too few samples to tell.
     """
     step = usual_step(table)
     reach = max(1, round(1 / step)) if step > 0 else 1
     same = table["episode"].diff(reach) == 0
     if same.sum() < LEAST_SAMPLES:
-        return 0.0
+        return None
     names = [str(name) for name in table.columns if str(name).endswith("speed_mps")]
     time = table["time_s"].diff(reach)[same]
     shares = [(table[x].diff(reach)[same].abs() > HARD * time).mean() for x in names]

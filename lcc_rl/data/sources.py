@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import glob, has_magic
+from os.path import expanduser
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,7 @@ from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
-from lcc_rl.data.tables import TEXT_TAKES, check_map, unpacked_size
+from lcc_rl.data.tables import TEXT_TAKES, check_map, file_size
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
@@ -60,7 +61,7 @@ class NgsimSource(Settings):
         """
         files = find_files(self.path)
         if self.location is None:  # of one location of several, nobody knows how much there is
-            require_memory({f"reading {name}": TEXT_TAKES * unpacked_size(name) for name in files})
+            require_memory({f"reading {name}": TEXT_TAKES * file_size(name) for name in files})
         trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
@@ -153,7 +154,7 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
-        name = str(Path(entry).expanduser())
+        name = str(expanduser(entry))
         found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
         if has_magic(name) and not Path(name).exists():
             found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os.path import expanduser
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,7 @@ def read_speed_record(
         DataError: naming the file and the row or column at fault, also where a number is not
             malformed but implausible.
     """
-    file = Path(path).expanduser()
+    file = Path(expanduser(path))
     if not file.suffix and path in shipped_cycles():
         file = CYCLES / f"{path}.csv"
     if not file.is_file():

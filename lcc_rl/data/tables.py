@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import csv
 import gzip
-import os
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from io import BufferedReader, RawIOBase
+from os.path import expanduser  # that of pathlib raises for an unknown user
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError, unknown_name
-from lcc_rl.io.memory import require_memory
+from lcc_rl.io.memory import available, require_memory
 
 PARQUET = (".parquet", ".pq")
 BLANK = ["", "NA", "N/A", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
@@ -35,6 +36,7 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": 
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
 TEXT_TAKES, PARQUET_TAKES = 3, 8  # bytes of memory that reading a byte of a file takes
 LARGEST = 1e12  # in SI: beyond any time or place, and within every type
+LONGEST_TEXT = 1000  # of a name, signs
 LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
 THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
@@ -125,7 +127,7 @@ class TableFile:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path).expanduser()
+        self.path = Path(expanduser(path))
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
         if not self.path.is_file():
@@ -191,7 +193,7 @@ class TableFile:
         return {name: table[name] for name in names}
 
     def _open_text(self) -> None:
-        require_memory({f"reading {self.path}": TEXT_TAKES * unpacked_size(self.path)})
+        require_memory({f"reading {self.path}": TEXT_TAKES * file_size(self.path)})
         with reading(self.path) as file:
             content = file.read().removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
         if not is_text(content):
@@ -246,6 +248,10 @@ def checked(cells: Cells, column: Column, fault: Fault, scale: float = 1.0) -> N
     """
     if column.quantity == "text":
         texts = pc.utf8_trim_whitespace(pc.cast(cells, pa.string()))
+        lengths = np.asarray(pc.fill_null(pc.utf8_length(texts), 0))
+        if (lengths > LONGEST_TEXT).any():  # every cell would take as much memory
+            row = int(np.argmax(lengths > LONGEST_TEXT))
+            raise fault(row, f"holds a text of {lengths[row]:,} signs; expected a name")
         found = np.asarray(pc.fill_null(texts, "")).astype(str)
         if not column.blank and (found == "").any():
             raise fault(int(np.argmax(found == "")), "is blank")
@@ -390,26 +396,37 @@ def reading(name: str | Path) -> Iterator[IO[bytes]]:
         with open(name, "rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
-            yield gzip.GzipFile(fileobj=file) if packed else file  # type: ignore[misc]
+            yield BufferedReader(_Unpacked(file, name)) if packed else file
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
     except OSError as error:
         raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
 
 
-def unpacked_size(name: str | Path) -> int:
-    """Return the bytes of a file, or of the content of a compressed one; 0 for none."""
-    if not Path(name).is_file():  # a pipe would be waited for; who reads it raises the error
-        return 0
-    with suppress(OSError), open(name, "rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-        size = file.seek(0, os.SEEK_END)
-        if not packed:
-            return size
-        file.seek(max(0, size - 4))
-        # Size of the content modulo 4 GiB; the content is never smaller than the file.
-        return max(size, int.from_bytes(file.read(4), "little"))
-    return 0
+class _Unpacked(RawIOBase):
+    """The content of a gzipped file, which says nowhere how long it is.
+
+    Raises:
+        ConfigError: once more was unpacked than could be parsed in the memory that was free.
+    """
+
+    def __init__(self, file: IO[bytes], name: str | Path) -> None:
+        self.file, self.name = gzip.GzipFile(fileobj=file), name
+        self.size, self.free = 0, available()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        self.size += (count := self.file.readinto(buffer))
+        require_memory({f"reading {self.name}": TEXT_TAKES * self.size}, free=self.free)
+        return count
+
+
+def file_size(name: str | Path) -> int:
+    """Return the bytes of a file; 0 for none."""
+    # A pipe would be waited for; who reads it raises the error.
+    return Path(name).stat().st_size if Path(name).is_file() else 0
 
 
 def is_text(content: bytes) -> bool:

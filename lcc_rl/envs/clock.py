@@ -17,7 +17,7 @@ from lcc_rl.envs.step import tick
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
 
-MOST_SEED = 2**64 - 1  # of torch's generators
+MOST_SEED = 2**32 - 1  # torch's generators take no more bits of it
 
 
 def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
@@ -65,9 +65,6 @@ class Clock(EnvBase):
         if horizon < 1:
             raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
         batch = batch_shape(batch_size)
-        whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-        if not (whole and 0 <= seed <= MOST_SEED):
-            raise ConfigError(f"seed must be a whole number from 0 to {MOST_SEED}, got {seed!r}")
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon
         self.generator = torch.Generator()
@@ -97,7 +94,11 @@ class Clock(EnvBase):
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.generator.manual_seed(0 if seed is None else seed)
+        seed = 0 if seed is None else seed
+        whole = isinstance(seed, Integral) and not isinstance(seed, bool)
+        if not (whole and 0 <= seed <= MOST_SEED):
+            raise ConfigError(f"seed must be a whole number from 0 to {MOST_SEED}, got {seed!r}")
+        self.generator.manual_seed(seed)
 
     def draw_seeds(self) -> torch.Tensor:
         """Draw a seed for a new episode in every place of the batch, ``[*batch, 1]``, int64."""
@@ -110,7 +111,7 @@ class Clock(EnvBase):
         if seeds is None:
             seeds = self.draw_seeds()
         else:
-            require_option(SEED, seeds, 2**32)  # of which all bits count
+            require_option(SEED, seeds, MOST_SEED + 1)
         return self._moment(seeds, torch.zeros_like(seeds))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -160,10 +161,12 @@ class Traffic(TransformedEnv):
             )
         for key in self.action_keys:
             # Another shape may fit nevertheless: one action would drive every vehicle.
-            found, wanted = tensordict.get(key, None), self.full_action_spec[key].shape
-            if found is not None and found.shape != wanted:
-                name = ".".join(as_key(key))
-                raise ConfigError(f"{name} must be {list(wanted)}, got {list(found.shape)}")
+            # Another type would spread to what is observed.
+            found, wanted = tensordict.get(key, None), self.full_action_spec[key]
+            if found is None or (found.shape, found.dtype) == (wanted.shape, wanted.dtype):
+                continue
+            expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
+            raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
 
     def _check_options(self, given: TensorDictBase) -> None:
         """Check what a caller gives to ``reset``; TorchRL would ignore what it does not know.

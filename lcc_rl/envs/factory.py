@@ -22,7 +22,7 @@ from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, RING
-from lcc_rl.io.memory import require_memory
+from lcc_rl.io.memory import require_memory, torch_device
 from lcc_rl.pieces import (
     Action,
     CBFFilter,
@@ -68,7 +68,7 @@ def build_env(
     Raises:
         ConfigError: naming the option at fault, or saying what the batch needs in memory.
     """
-    scenario = cfg.scenario
+    scenario, device = cfg.scenario, device and torch_device(device)
     pieces = build_pieces(cfg, profiles, population, nominal)
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}

@@ -6,7 +6,6 @@ it contains the scales of the observation, the network and the safety filter, if
 
 from __future__ import annotations
 
-import argparse
 import json
 import logging
 import warnings
@@ -23,12 +22,13 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.strategies import with_weights
-from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.pieces import Action, CBFFilter, Observation
 from lcc_rl.pieces.entries import ENTRIES
 from lcc_rl.results.policies import load_policy
+from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
 # Entries computed inside from other measurements: v_ahead − v.
@@ -156,11 +156,9 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
     Examples:
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
-    path = Path(path)
+    path = new_file(path, "name")
     if path.suffix not in FORMS:
         raise unknown_name("ending", path.suffix, FORMS)
-    if path.exists():
-        raise ResultsError(f"{path}: exists already; remove it or choose another name")
     module = exported_policy(policy, trust)
     inputs = [item._asdict() for item in module.inputs()]
     about: dict[str, Any] = {"policy": str(policy), "lcc_rl": __version__, "inputs": inputs}
@@ -212,7 +210,7 @@ FORMS = {".onnx": _as_onnx, ".pt2": _as_pt2}
 
 def main(words: Sequence[str] | None = None) -> int:
     """Export the policy named on the command line."""
-    parser = argparse.ArgumentParser(description="Export a policy for other software.")
+    parser = Arguments(description="Export a policy for other software.")
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
     parser.add_argument("path", help="file to write, .onnx or .pt2")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")

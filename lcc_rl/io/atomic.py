@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -13,16 +13,53 @@ from lcc_rl.errors import ResultsError
 SUBFOLDERS = ("figures", "policies", "blocks")
 
 
-def new_file(path: str | Path, option: str) -> Path:
-    """Return the path of a file to write that must not be there yet.
+def new_file(path: str | Path, option: str, own: Callable[[Path], bool] | None = None) -> Path:
+    """Return the path of a file to write: the one door of commands that are given its name.
+
+    Args:
+        path: what was given.
+        option: the option that gave it, for the message.
+        own: whether a regular file that is there is this command's, to be replaced.
 
     Raises:
-        ResultsError: if it is.
+        ResultsError: if something else is there.
     """
-    path = Path(path)
-    if path.exists() or path.is_symlink():
+    path = _spelled(path)
+    if os.path.lexists(path) and not (
+        own and not path.is_symlink() and path.is_file() and own(path)
+    ):
         raise ResultsError(f"{path} is already there; choose another {option}, or remove it")
     return path
+
+
+def own_folder(path: str | Path, option: str, own: Callable[[set[str]], bool]) -> Path:
+    """Return the path of a folder to write into, the one door as above.
+
+    Args:
+        path: what was given.
+        option: the option that gave it, for the message.
+        own: whether the names in it, none of them hidden, are those of this command.
+
+    Raises:
+        ResultsError: if it holds something else, or is no folder.
+    """
+    path = _spelled(path)
+    if os.path.lexists(path):
+        if not path.is_dir():
+            raise ResultsError(f"{path} is no folder; choose another {option}")
+        names = {item.name for item in path.iterdir() if not item.name.startswith(".")}
+        if names and not own(names):
+            raise ResultsError(
+                f"{path} already holds {min(names)}, which is not this command's; choose another "
+                f"{option}"
+            )
+    return path
+
+
+def _spelled(path: str | Path) -> Path:
+    if "\0" in str(path):
+        raise ResultsError(f"{str(path)!r} cannot be the name of a file or folder")
+    return Path(path)
 
 
 @contextmanager

@@ -20,17 +20,20 @@ VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 UNITS = ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
 
 
-def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu") -> None:
+def require_memory(
+    needs: Mapping[str, float], device: torch.device | str = "cpu", free: int | None = None
+) -> None:
     """Check that what is about to be allocated fits into the memory that is free.
 
     Args:
         needs: bytes by the option, as it was given, that they are due to.
         device: where the tensors will live.
+        free: bytes that were free before a part of it was allocated; by default those now.
 
     Raises:
         ConfigError: naming the option that needs most, how much, and how much is free.
     """
-    free, total = available(device), sum(needs.values())
+    free, total = free or available(device), sum(needs.values())
     if free is None or total <= free:
         return
     worst = max(needs, key=lambda name: needs[name])
@@ -42,6 +45,20 @@ def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu
     )
 
 
+def torch_device(name: torch.device | str) -> torch.device:
+    """Return a device by its name, or raise a ConfigError where this machine has none such."""
+    import torch  # here: reading a table needs no torch
+
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    # Which error torch raises depends on how it was built.
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise ConfigError(f"device {str(name)!r} is not available: {reason}") from error
+    return device
+
+
 def available(device: torch.device | str = "cpu") -> int | None:
     """Return the bytes that can be allocated on a device; None where nobody knows.
 
@@ -49,9 +66,9 @@ def available(device: torch.device | str = "cpu") -> int | None:
     leave (Linux); the physical memory where the system says no more (macOS).
     """
     if str(device).startswith("cuda"):
-        import torch  # here: reading a table needs no torch
+        import torch
 
-        return int(torch.cuda.mem_get_info(torch.device(device))[0])
+        return int(torch.cuda.mem_get_info(torch_device(device))[0])
     return min([*_of_system(), *_of_groups()], default=None)
 
 

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
 
-from lcc_rl.errors import ResultsError
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.settings import Settings, parse
+
+S = TypeVar("S", bound=Settings)
+# Of what is stored here: weights, sums in double precision, counters, flags.
+KINDS = (torch.float32, torch.float64, torch.int64, torch.bool)
 
 
 def write_torch(content: Any, path: str | Path) -> None:
@@ -41,10 +49,75 @@ def read_torch(path: str | Path) -> Any:
     try:
         with zipfile.ZipFile(path) as archive:  # torch does not compare the checksums
             damaged = archive.testzip()
-        if damaged is not None:
+            packed = any(item.compress_type for item in archive.infolist())
+        if packed or damaged is not None:  # torch packs nothing; unpacked it may be any size
             raise zipfile.BadZipFile(damaged)
         return torch.load(path, weights_only=True, map_location="cpu")
+    except PermissionError as error:
+        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from error
     except Exception as error:  # torch raises many kinds for damaged or malicious files
         raise ResultsError(
             f"{path}: not a readable weights file: damaged, or made by something else"
         ) from error
+
+
+def read_checked(path: str | Path, kind: type[S], what: str) -> S:
+    """Read a file of tensors as a typed model, the one door of those that others may have made.
+
+    Args:
+        path: the file.
+        kind: the model.
+        what: what the file should be, for the message.
+
+    Raises:
+        ResultsError: as :func:`read_torch`, or naming the first entry at fault.
+    """
+    content = read_torch(path)
+    if not isinstance(content, dict):
+        raise ResultsError(f"{path}: not a {what}: it holds {type(content).__name__}")
+    try:
+        return parse(kind, {str(key): value for key, value in content.items()}, "")
+    except ConfigError as error:
+        raise ResultsError(f"{path}: not a {what}: {error}") from error
+
+
+def check_like(found: Any, wanted: Any, name: str) -> None:
+    """Check that a state may replace another one: the same entries, types and sizes, all numbers.
+
+    What the other one does not have yet, as an optimizer before its first step or a list that is
+    empty, may be any numbers.
+
+    Args:
+        found: nested containers of tensors.
+        wanted: the other one.
+        name: of the state, for messages.
+
+    Raises:
+        ValueError: naming the first entry at fault.
+    """
+    if isinstance(wanted, Mapping):
+        if not isinstance(found, Mapping) or set(wanted) - set(found):
+            missing = sorted(
+                map(str, set(wanted) - set(found if isinstance(found, Mapping) else ()))
+            )
+            raise ValueError(f"{name} lacks {', '.join(missing)}")
+    elif isinstance(wanted, Tensor):
+        kind, shape = getattr(found, "dtype", type(found)), getattr(found, "shape", None)
+        if kind != wanted.dtype or (wanted.numel() and shape != wanted.shape):
+            raise ValueError(f"{name} is {kind} {shape}, expected {wanted.dtype} {wanted.shape}")
+    elif wanted is not None and type(found) is not type(wanted):
+        raise ValueError(f"{name} is {found!r}, expected {wanted!r}")
+    if isinstance(found, Mapping):
+        known = wanted if isinstance(wanted, Mapping) else {}
+        for key, value in found.items():
+            check_like(value, known.get(key), f"{name}.{key}".removeprefix("."))
+    elif isinstance(found, list):
+        for place, value in enumerate(found):
+            check_like(value, None, f"{name}[{place}]")
+    elif isinstance(found, Tensor):
+        if found.dtype not in KINDS:
+            raise ValueError(f"{name} is of type {found.dtype}")
+        if not bool(torch.isfinite(found).all()):
+            raise ValueError(f"{name} holds values that are no numbers")
+    elif isinstance(found, float) and not math.isfinite(found):
+        raise ValueError(f"{name} is {found}")

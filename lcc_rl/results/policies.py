@@ -5,19 +5,39 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import AfterValidator, Field
 
 from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
-from lcc_rl.io.tensors import read_torch, write_torch
+from lcc_rl.io.tensors import check_like, read_checked, write_torch
 from lcc_rl.results.trust import trusted
+from lcc_rl.settings import Settings
 
 PRETRAINED = "pretrained"
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
+
+
+def check_weights(weights: dict[str, Any]) -> dict[str, Any]:
+    """Check that weights are finite numbers in single precision by name."""
+    for name, value in weights.items():
+        if not isinstance(value, torch.Tensor) or value.dtype != torch.float32:
+            kind = getattr(value, "dtype", type(value).__name__)
+            raise ValueError(f"{name!r} is {kind}, expected a tensor of torch.float32")
+    check_like(weights, weights, "weights")
+    return weights
+
+
+class PolicyFile(Settings):
+    """What a policy's file holds."""
+
+    weights: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(check_weights)]
+    config: str  # of its training, YAML
+    provenance: Any = None  # of one that ships
 
 
 def save_policy(weights: Mapping[str, Any], cfg: StudyConfig, path: Path) -> None:
@@ -67,24 +87,8 @@ def load_policy(
         path = pretrained_path(path.name if len(path.parts) > 1 else variant)
     if path.is_dir():
         path = path / "policy.pt"
-    content = read_torch(path)
-    if not isinstance(content, dict) or not {"weights", "config"} <= set(content):
-        raise ResultsError(f"{path}: not a policy: expected the entries weights and config")
-    weights = content["weights"]
-    check_weights(weights, path)
-    cfg, _ = trusted(parse_yaml(str(content["config"]), f"{path} (config)"), str(path), trust)
+    content = read_checked(path, PolicyFile, "policy")
+    cfg, _ = trusted(parse_yaml(content.config, f"{path} (config)"), str(path), trust)
     if not isinstance(cfg, StudyConfig) or cfg.agent is None:
         raise ResultsError(f"{path}: not the configuration of a training: it has no agent")
-    return weights, cfg
-
-
-def check_weights(weights: Any, path: Path) -> None:
-    """Check that weights are finite numbers by name; an error names the file and the entry."""
-    if not isinstance(weights, dict) or not weights:
-        raise ResultsError(f"{path}: weights are {type(weights).__name__}, expected named tensors")
-    for name, value in weights.items():
-        if not isinstance(name, str) or not isinstance(value, torch.Tensor):
-            kind = type(value).__name__
-            raise ResultsError(f"{path}: weight {name!r} is {kind}, expected a named tensor")
-        if not bool(torch.isfinite(value).all()):
-            raise ResultsError(f"{path}: weight {name!r} holds values that are no numbers")
+    return content.weights, cfg

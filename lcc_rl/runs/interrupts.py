@@ -1,4 +1,4 @@
-"""Handlers of SIGINT and SIGTERM for commands."""
+"""Handlers of the signals that end a command: Ctrl-C, a scheduler's, a closed terminal's."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
 # Exit codes.
 BAD_INPUT, INTERRUPTED = 2, 130
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (
+    signal.SIGINT,
+    signal.SIGTERM,
+    *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
+)
+TOGETHER = 1.0  # a scheduler, a terminal and a parent process may all send one [s]
 Restore = Callable[[], None]
 
 
@@ -36,8 +42,10 @@ def is_command() -> bool:
 
 
 @contextmanager
-def _handled_by(action: Callable[[Restore], None], also_ignored: bool) -> Iterator[None]:
-    """Let signals call ``action(restore)`` in the main thread; restore the handlers at the end."""
+def _handled_by(
+    action: Callable[[int, Restore], None], also_ignored: Collection[int] = ()
+) -> Iterator[None]:
+    """Let signals call ``action(signal, restore)`` in the main thread; restore them at the end."""
     main = threading.current_thread() is threading.main_thread()
     before = {kind: signal.getsignal(kind) for kind in SIGNALS} if main else {}
 
@@ -46,8 +54,8 @@ def _handled_by(action: Callable[[Restore], None], also_ignored: bool) -> Iterat
             signal.signal(kind, previous)
 
     for kind, previous in before.items():
-        if also_ignored or previous is not signal.SIG_IGN:
-            signal.signal(kind, lambda number, frame: action(restore))
+        if kind in also_ignored or previous is not signal.SIG_IGN:
+            signal.signal(kind, lambda number, frame: action(number, restore))
     try:
         yield
     finally:
@@ -56,19 +64,19 @@ def _handled_by(action: Callable[[Restore], None], also_ignored: bool) -> Iterat
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGTERM and SIGINT."""
+    """Raise KeyboardInterrupt on a signal that ends a command."""
 
-    def interrupt(restore: Restore) -> None:
+    def interrupt(number: int, restore: Restore) -> None:
         raise KeyboardInterrupt
 
-    with _handled_by(interrupt, also_ignored=False):
+    with _handled_by(interrupt):
         yield
 
 
 @contextmanager
 def ending_quietly() -> Iterator[None]:
-    """Exit on SIGTERM and SIGINT as :func:`end_quietly` does, while a command imports more."""
-    with _handled_by(_end, also_ignored=False):
+    """Exit on a signal as :func:`end_quietly` does, while a command imports more."""
+    with _handled_by(_end):
         yield
 
 
@@ -81,12 +89,22 @@ def was_interrupted(error: BaseException | None) -> bool:
 
 @contextmanager
 def stop_signal() -> Iterator[threading.Event]:
-    """Set the event on the first SIGINT or SIGTERM; the second one acts as before."""
+    """Set the event on the first signal; one that comes a second later acts as before.
+
+    SIGINT counts although the shell that started the process in the background ignores it; an
+    ignored SIGHUP (``nohup``) does not.
+    """
     event = threading.Event()
+    last = 0.0
 
-    def request(restore: Restore) -> None:
-        event.set()
-        restore()
+    def request(number: int, restore: Restore) -> None:
+        nonlocal last
+        if not event.is_set():
+            event.set()
+            last = time.monotonic() + TOGETHER
+        elif time.monotonic() > last:
+            restore()
+            signal.raise_signal(number)
 
-    with _handled_by(request, also_ignored=True):
+    with _handled_by(request, also_ignored=(signal.SIGINT, signal.SIGTERM)):
         yield event

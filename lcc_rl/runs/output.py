@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
+from io import TextIOWrapper
 from typing import Any, cast
 
 # Between INFO, the details, and WARNING: what somebody who waits wants to know.
@@ -41,16 +42,20 @@ def headlines() -> Iterator[None]:
 
 
 class Unbroken:
-    """A stream of text that drops what is written once nobody reads it.
+    """A stream of text that drops what is written once that is impossible.
 
     ``lcc-rl train … | head -1`` trains to the end: its results are files.
 
     Args:
         stream: the stream itself.
+
+    Attributes:
+        failure: what went wrong, unless the reader went away; None so far.
     """
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
+        self.failure: OSError | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -67,7 +72,9 @@ class Unbroken:
     def _attempt(self, action: Callable[[], Any]) -> None:
         try:
             action()
-        except BrokenPipeError:
+        except OSError as error:
+            if not isinstance(error, BrokenPipeError):
+                self.failure = self.failure or error
             # What is still buffered, and all that follows, goes nowhere.
             with suppress(OSError):
                 nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -77,13 +84,40 @@ class Unbroken:
 
 @contextmanager
 def unbroken_output() -> Iterator[None]:
-    """Let standard output and error drop what nobody reads, instead of raising."""
+    """Let no output end a command: it is dropped where nobody reads it or nothing takes it.
+
+    A stream that was closed (``>&-``) becomes one to nowhere, and a sign that the terminal's
+    encoding lacks is written as its code.
+
+    Raises:
+        OSError: at the end, if output could not be written although somebody reads it.
+    """
+    own = {}
     with ExitStack() as stack:
-        for stream, redirect in ((sys.stdout, redirect_stdout), (sys.stderr, redirect_stderr)):
+        _open_closed()
+        for name, redirect in (("output", redirect_stdout), ("error", redirect_stderr)):
+            stream = getattr(sys, f"std{name[:3]}")
             if not isinstance(stream, Unbroken):
-                stack.enter_context(redirect(cast(Any, Unbroken(stream))))
+                own[f"standard {name}"] = unbroken = Unbroken(stream)
+                stack.enter_context(redirect(cast(Any, unbroken)))
         try:
             yield
         finally:
             for stream in (sys.stdout, sys.stderr):
                 stream.flush()
+    for name, stream in own.items():
+        if stream.failure is not None:
+            raise OSError(stream.failure.errno, stream.failure.strerror, name)
+
+
+def _open_closed() -> None:
+    """Give closed standard streams a place; a file opened later would get their numbers."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115
+        if number and isinstance(getattr(sys, name), TextIOWrapper):
+            getattr(sys, name).reconfigure(errors="backslashreplace")

@@ -7,7 +7,7 @@ import logging
 import torch
 
 from lcc_rl.config.schemas import BaseConfig
-from lcc_rl.errors import ConfigError
+from lcc_rl.io.memory import torch_device
 
 log = logging.getLogger("lcc_rl")
 
@@ -16,13 +16,7 @@ SINGLE = 1e-4  # relative error beyond which products are no longer single preci
 
 def prepare_torch(cfg: BaseConfig) -> torch.device:
     """Set up torch and return the device."""
-    try:
-        device = torch.device(cfg.device)
-        torch.empty(0, device=device)
-    # Which error torch raises depends on how it was built.
-    except (RuntimeError, AssertionError, TypeError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise ConfigError(f"device {cfg.device!r} is not available: {reason}") from error
+    device = torch_device(cfg.device)
     torch.set_num_threads(cfg.threads)
     set_precision(cfg.matmul_precision)
     # TorchRL logs every buffer it allocates.

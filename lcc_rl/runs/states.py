@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from filelock import FileLock, Timeout
-from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.errors import Interrupted, LccError, ResultsError
+from lcc_rl.errors import Interrupted, LccError, ResultsError, input_error, one_line
 from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 
-LOCK, ERROR, PROGRESS = ".lock", "error.txt", "progress.json"
+LOCK, ERROR, PROGRESS, HYDRA = ".lock", "error.txt", "progress.json", ".hydra"
 # The table that a run writes last: a training or evaluation, a calibration.
 RESULTS = ("episodes.parquet", "drivers.parquet")
 CONFIG = "config.yaml"
@@ -66,12 +66,13 @@ def claim(folder: Path) -> Iterator[None]:
     """
     made, lock = False, FileLock(folder / LOCK)
     try:
+        str(folder.resolve()).encode()  # pyarrow knows names in UTF-8 only
         made = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout:
         raise busy(folder) from None
-    except (OSError, NotImplementedError) as error:
+    except (OSError, NotImplementedError, ValueError) as error:  # the last one: of a name
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
     try:
         remove_leftovers(folder)
@@ -126,29 +127,28 @@ def forget(folder: Path) -> None:
         (folder / ERROR).unlink(missing_ok=True)
 
 
+def withdraw(folders: Sequence[Path]) -> None:
+    """Remove the folder of a run that did not begin, and those above it, if they hold no more."""
+    own = folders[0]
+    if {path.name for path in own.iterdir() if path.suffix != ".log"} <= {HYDRA, ERROR, LOCK}:
+        shutil.rmtree(own)
+        with suppress(OSError):  # one that holds something else
+            for folder in folders[1:]:
+                folder.rmdir()
+
+
 def record(folder: Path, error: Exception) -> None:
     """Write ``error.txt``: the error in one line, with a traceback unless it is an input error."""
-    text = one_line(error) + "\n"
+    text = described(error) + "\n"
     if not isinstance(input_error(error) or error, (LccError, OSError)):
         text += "\n" + "".join(traceback.format_exception(error))
     with suppress(ResultsError), atomic_path(folder / ERROR) as temporary:
         temporary.write_text(text)
 
 
-def input_error(error: BaseException) -> LccError | None:
-    """Return the error of this package that another one wraps."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, LccError):
-        # OmegaConf sets its resolvers' errors as context, not as cause.
-        resolving = isinstance(cause, OmegaConfBaseException)
-        cause = cause.__cause__ or (cause.__context__ if resolving else None)
-    return cause
-
-
-def one_line(error: BaseException) -> str:
+def described(error: BaseException) -> str:
     """Return an error as one line; its type comes first unless it is an input error."""
-    text = str(input_error(error) or f"{type(error).__name__}: {error}")
-    return " ".join(text.split())
+    return one_line(str(input_error(error) or f"{type(error).__name__}: {error}"))
 
 
 def is_finished(folder: Path) -> bool:
@@ -173,7 +173,7 @@ def _inspected(folder: Path, name: str) -> RunState:
     if (folder / ERROR).exists():
         with suppress(ResultsError):
             lines = read_text(folder / ERROR).splitlines()
-            return RunState(name, "failed", done, total, error=lines[0] if lines else "")
+            return RunState(name, "failed", done, total, error=one_line(lines[0] if lines else ""))
     if is_finished(folder):
         return RunState(name, "finished", done, total)
     return RunState(name, "stopped", done, total)
@@ -200,7 +200,7 @@ def run_folders(root: Path) -> list[Path]:
     found = []
     # A folder that cannot be listed may be a run, whose state says so.
     for place, folders, files in os.walk(root, onerror=lambda e: found.append(Path(e.filename))):
-        is_run = bool(MARKS.intersection(files)) or ".hydra" in folders
+        is_run = bool(MARKS.intersection(files)) or HYDRA in folders
         own = SUBFOLDERS if is_run else ()
         folders[:] = sorted(x for x in folders if not x.startswith(".") and x not in own)
         if is_run:

@@ -31,7 +31,7 @@ from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.search import register as register_search
-from lcc_rl.runs.states import Busy, busy, is_claimed, one_line, record, survey
+from lcc_rl.runs.states import Busy, busy, described, is_claimed, record, survey
 
 log = logging.getLogger("lcc_rl")
 
@@ -105,6 +105,7 @@ class SweepCallback(Callback):
 
     folder: Path | None = None  # of this process's sweep; Hydra does not keep it
     target: ClassVar[Path | None] = None  # the folder that Hydra writes to
+    made: ClassVar[list[Path]] = []  # it and those above it that this command makes
     table: Live | None = None
     lines: ClassVar[Any] = None  # logging configuration without a table
 
@@ -112,6 +113,7 @@ class SweepCallback(Callback):
         """Exit with one line before Hydra writes into the folder of another process's run."""
         try:
             type(self).target = folder = Path(config.hydra.run.dir)
+            type(self).made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]
         except OmegaConfBaseException:  # resume=nowhere: Hydra says so itself when it gets there
             return
         if is_claimed(folder):
@@ -231,7 +233,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         return NO_RESULT
     except Exception as error:
         record(folder, error)
-        log.error("%s failed: %s", folder.name, one_line(error))
+        log.error("%s failed: %s", folder.name, described(error))
         return NO_RESULT
 
 

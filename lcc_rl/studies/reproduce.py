@@ -14,20 +14,22 @@ resumed, failed ones are listed and do not stop the others.
 
 from __future__ import annotations
 
-import argparse
 import logging
 import shlex
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from lcc_rl.config import check_overrides
 from lcc_rl.config.schemas import FORMATS
+from lcc_rl.io.atomic import own_folder
+from lcc_rl.runs.arguments import Arguments
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import report as hcfs_report
 from lcc_rl.studies.hcfs import study as hcfs
-from lcc_rl.studies.runner import FINISHED, Outcome, read_notes
+from lcc_rl.studies.runner import FINISHED, NOTES, Outcome, read_notes
 
 log = logging.getLogger("lcc_rl")
 
@@ -40,7 +42,7 @@ OTHERS = "further formats of figures: " + ",".join(FORMATS[1:])
 REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
 
 
-def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
+def reproduce_alcc(arguments: Namespace, command: str) -> int:
     """Run the ALCC study and write its page; 1 if a training failed."""
     usual = None if alcc.chooses_agent(arguments.overrides) else "paper_alcc"
     study = alcc.Study(
@@ -51,16 +53,16 @@ def reproduce_alcc(arguments: argparse.Namespace, command: str) -> int:
     return concluded(outcomes, study.folder, "alcc", arguments.formats)
 
 
-def reproduce_hcfs(arguments: argparse.Namespace, command: str) -> int:
+def reproduce_hcfs(arguments: Namespace, command: str) -> int:
     """Run the HCFS study and write its page; 1 if a training failed."""
     study = hcfs.Study(**common(arguments, "paper_hcfs"))
     return concluded(hcfs.run(study, command), study.folder, "hcfs", arguments.formats)
 
 
-def common(arguments: argparse.Namespace, recipe: str | None) -> dict[str, Any]:
+def common(arguments: Namespace, recipe: str | None) -> dict[str, Any]:
     """Return the settings that every study has, with the recipe's default."""
     return {
-        "folder": arguments.out,
+        "folder": own_folder(arguments.out, "--out", lambda names: NOTES in names),
         "recipe": arguments.recipe or recipe,
         "seeds": arguments.seeds,
         "overrides": tuple(arguments.overrides),
@@ -81,17 +83,16 @@ def concluded(
     return 1 if wrong else 0
 
 
-def rewrite(arguments: argparse.Namespace, command: str) -> int:
+def rewrite(arguments: Namespace, command: str) -> int:
     """Rewrite tables, figures and page of a study's folder."""
     study = read_notes(arguments.folder).get("study", "alcc")
     log.info("wrote %s", REPORTS[study](arguments.folder, arguments.formats, arguments.page))
     return 0
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> ArgumentParser:
     """Return the command line: a subcommand per study, and ``report``."""
-    form = argparse.RawDescriptionHelpFormatter
-    top = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    top = Arguments(description=__doc__)
     commands = top.add_subparsers(required=True)
     one = study_parser(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
     one.set_defaults(run=reproduce_alcc)
@@ -108,9 +109,9 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+def study_parser(commands: Any, name: str, text: str) -> ArgumentParser:
     """Add the subcommand of a study, with the options that every study has."""
-    one: argparse.ArgumentParser = commands.add_parser(name, help=text)
+    one: ArgumentParser = commands.add_parser(name, help=text)
     folder = Path("outputs") / name
     one.add_argument("--out", type=Path, default=folder, help="the study's folder")
     one.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
@@ -122,9 +123,7 @@ def study_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser
     return one
 
 
-def listing(
-    target: argparse.ArgumentParser, name: str, default: tuple[str, ...], text: str
-) -> None:
+def listing(target: ArgumentParser, name: str, default: tuple[str, ...], text: str) -> None:
     """Add an option that takes names separated by commas."""
     target.add_argument(name, type=lambda words: words.split(","), default=default, help=text)
 

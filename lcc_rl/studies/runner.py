@@ -18,12 +18,13 @@ from typing import Any
 
 from lcc_rl.config import NOT_IDENTITY, identity, load
 from lcc_rl.config.schemas import StudyConfig, as_plain
-from lcc_rl.errors import Interrupted, require
+from lcc_rl.errors import Interrupted, require, unknown_name
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import CONFIG, EPISODES, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
+from lcc_rl.settings import MOST_PARALLEL
 
 log = logging.getLogger("lcc_rl")
 
@@ -85,8 +86,9 @@ class BaseStudy:
     accept: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "jobs"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1")
+        for name, most in (("seeds", 10**6), ("jobs", MOST_PARALLEL)):
+            given = getattr(self, name)
+            require(1 <= given <= most, f"{name} must lie from 1 to {most}, got {given}")
 
 
 def quoted(path: str | Path) -> str:
@@ -106,6 +108,15 @@ def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> li
         for key in differing(found, asked)
         if not any(key == item or key.startswith(f"{item}.") for item in ignored)
     ]
+
+
+def check_accepted(accept: Sequence[str], wanted: StudyConfig) -> None:
+    """Check that settings that may differ exist."""
+    known = [key.split(".") for key, _ in flatten(as_plain(wanted))]
+    for item in accept:
+        parts = item.split(".")
+        if not any(key[: len(parts)] == parts for key in known):
+            raise unknown_name("setting in accept", item, {key[0] for key in known})
 
 
 def up_to_date(cfg: StudyConfig, folder: Path, policies: Sequence[Path] = ()) -> bool:

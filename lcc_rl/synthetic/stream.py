@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import field, replace
 from datetime import UTC, datetime, timedelta
 from filecmp import cmp
+from os.path import expanduser
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
@@ -112,7 +113,7 @@ class StreamSource(Settings):
         stream = self.generate()
         if self.keep is not None:
             with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
-                kept = Path(self.keep).expanduser()
+                kept = Path(expanduser(self.keep))
                 path = Path(folder) / kept.name
                 write_stream(stream, path)
                 keep_files({path: kept, truth_path(path): truth_path(kept)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 from commands import DATA, NO_AGENT, QUICK, TINY, content, jobs_in_threads, run_command
 
+from lcc_rl.drivers.tables import load_drivers
 from lcc_rl.runs.states import claim, inspect_run
 
 RULE = ("variant=idm", *NO_AGENT)
@@ -35,34 +37,94 @@ def run(finished, tmp_path) -> Path:
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("console trian", "'train'"),
-        ("train variant=alccc", "'alccc'.*'alcc'"),
-        ("train variant=idm --experiment 3", "--experiment.*key=value"),
-        ("calibrate --seed 3", "--seed"),
-        ("train data=ngsim data.path=nowhere.csv", "nowhere.csv"),
-        ("train resume=nowhere", "nowhere"),
-        ("evaluate variant=alcc policy=nowhere", "nowhere"),
-        ("pipeline variants=[]", "variants"),
-        ("pipeline variant=idm", "variant=idm has no effect on lcc-rl run"),
-        (f"pipeline {' '.join(NO_AGENT)} data.recordings=1", "split.by=vehicle"),
-        (f"train -m variant=idm {' '.join(LISTS)}", "at most 100000 runs"),
-        ("train hydra.run.dir=file/run", "Not a directory"),
-        (f"train hydra.run.dir={'x' * 5000}", "too long"),
-    ],
+# What is typed after lcc-rl, and the words of the error.
+REFUSED = {
+    # names
+    "trian": "'train'",
+    "train variant=alccc": "'alccc'.*'alcc'",
+    "train variant=idm --experiment 3": "--experiment.*key=value",
+    "calibrate --seed 3": "--seed",
+    "train data=ngsim data.path=nowhere.csv": "nowhere.csv",
+    "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: cannot be read",
+    "train data=ngsim data.path=[]": "no file is named",
+    "train resume=nowhere": "nowhere",
+    "evaluate variant=alcc policy=nowhere": "nowhere",
+    "run variants=[]": "variants",
+    "run variant=idm": "variant=idm has no effect on lcc-rl run",
+    f"train -m variant=idm {' '.join(LISTS)}": "at most 100000 runs",
+    "train hydra.run.dir=file/run": "Not a directory",
+    f"train hydra.run.dir={'x' * 5000}": "too long",
+    "train variant=idm sweep=mine": "sweep=mine has no effect.* -m",
+    # flags
+    "fetch --retries -1": "--retries: must be greater than or equal to 0, got '-1'",
+    "fetch --page-rows many": "--page-rows: must be a valid integer",
+    "fetch --banana": "unrecognized arguments: --banana",
+    "animate nowhere --start nan": "--start: must be a finite number",
+    "animate nowhere": "nowhere: not a run folder",
+    "maps nowhere": "nowhere: not a run folder",
+    "clairvoyant --iterations 0": "--iterations: must be greater than or equal to 1",
+    "export pretrained/alcc policy.banana": "'.banana'; valid: .onnx",
+    "status nowhere": "nowhere: no such folder",
+    "reproduce alcc --recipe smok": "smok",
+    "reproduce alcc --recipe smoke --jobs 1000000000": "jobs must lie from 1 to",
+    "reproduce hcfs --recipe smoke --accept nonsense": "setting in accept 'nonsense'",
+    "reproduce alcc --recipe smoke hydra.run.dir=x": "hydra.run.dir=x has no effect",
+    "reproduce report nowhere": "no evaluation/episodes.parquet",
+}
+# Commands that write what they are told to, and never over what is there: {file}, {run}.
+NAMED = (
+    *("clairvoyant --out {run}", "clairvoyant --out {file}", "animate {run} --out {file}"),
+    *("export pretrained/alcc {file}", "fetch --output {file}", "fetch --output /dev/null"),
+    "reproduce alcc --recipe smoke --seeds 1 --out {run}",
 )
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path, words, expected) -> None:
-    (tmp_path / "file").write_text("kept")
-    entry, *typed = words.split()
-    done = run_command(f"lcc_rl.cli.{entry}", *typed, cwd=tmp_path)
+
+
+def refused(words: list[str], cwd: Path, module: str = "lcc_rl.cli.console") -> str:
+    """Return the one line of a command that ends with exit code 2 and leaves all as it was."""
+    before = sorted(cwd.rglob("*")), content(cwd)
+    done = run_command(module, *words, cwd=cwd)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1, done.stderr
-    assert "error: " in done.stderr
-    assert re.search(expected, done.stderr)
-    assert (tmp_path / "file").read_text() == "kept"
-    assert not [*tmp_path.rglob("*.parquet"), *tmp_path.rglob("nowhere")]
+    assert done.stderr.startswith("lcc_rl: error: ")
+    assert (sorted(cwd.rglob("*")), content(cwd)) == before
+    return done.stderr
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_bad_input_is_one_line_and_exit_code_2_and_leaves_nothing(tmp_path, words) -> None:
+    (tmp_path / "file").write_text("kept")
+    assert re.search(REFUSED[words], refused(words.split(), tmp_path))
+
+
+def test_a_job_that_fails_once_its_data_are_read_is_recorded(tmp_path) -> None:
+    words = (*NO_AGENT, "data.recordings=1", "hydra.run.dir=job")
+    done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path)
+    assert done.stderr.count("\n") == 1
+    assert "split.by=vehicle" in inspect_run(tmp_path / "job").error
+
+
+@pytest.mark.parametrize("words", NAMED)
+def test_nothing_that_is_there_is_written_over(run, tmp_path, words) -> None:
+    (tmp_path / "v.html").write_text("kept")
+    said = refused(words.format(file="v.html", run="run").split(), tmp_path)
+    assert re.search("is already there|already holds|is no folder", said)
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "expected"),
+    [
+        ("benchmarks.command", ["env", "--out", "run/episodes.parquet"], "is already there"),
+        ("benchmarks.command", ["env", "--threads", "100000"], "--threads: must be less"),
+        ("benchmarks.command", ["env", "--device", "banana"], "--device: must match"),
+        ("benchmarks.command", ["reed"], "Did you mean 'read'"),
+        ("benchmarks.command", ["calibrate", "--episodes", "nowhere.parquet"], "nowhere"),
+        ("export_drivers", ["run/d.parquet", "run/d.parquet"], "is already there"),
+    ],
+)
+def test_so_do_the_tools(run, tmp_path, monkeypatch, module, words, expected) -> None:
+    load_drivers(mode="local").head(3).to_parquet(run / "d.parquet")
+    monkeypatch.setattr("sys.argv", ["tool", *words])
+    assert expected in refused(words, tmp_path, module)
 
 
 def test_flags_may_stand_anywhere(tmp_path) -> None:
@@ -138,12 +200,11 @@ def test_a_run_whose_settings_were_changed_is_not_resumed(run, tmp_path) -> None
     assert content(run) == before
 
 
-def test_a_failed_start_is_recorded_and_forgotten_once_it_works(tmp_path) -> None:
-    words = (*RULE, "hydra.run.dir=run")
-    run_command("lcc_rl.cli.train", *words, "evaluation.drivers=0", cwd=tmp_path)
-    assert inspect_run(tmp_path / "run").state == "failed"
-    run_command("lcc_rl.cli.train", *words, cwd=tmp_path, check=True)
-    assert inspect_run(tmp_path / "run").state == "finished"
+def test_a_folder_that_is_not_utf_8_is_refused_before_work_begins(tmp_path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    folder.mkdir()
+    said = refused(["train", *RULE], folder)
+    assert "can't encode" in said
 
 
 @pytest.mark.parametrize("entry", COMMANDS)
@@ -159,14 +220,35 @@ def test_the_second_process_in_a_folder_touches_nothing(tmp_path, entry, monkeyp
     assert done.stderr == f"lcc_rl: error: {folder}: another process is working on this run\n"
 
 
-# -- output that nobody reads ----------------------------------------------------------------------
+# -- output that goes nowhere --------------------------------------------------------------------
+
+OUTPUTS = [
+    ("status run | true", 0, ""),
+    ("-h | true", 0, ""),
+    ("--version >&-", 0, ""),
+    ("status run >&- 2>&- <&-", 0, ""),
+    ("--version >/dev/full", 2, "lcc_rl: error: .*No space left on device: 'standard output'\n"),
+    ("trian 2>/dev/full", 2, ""),
+]
 
 
-def test_a_closed_pipe_ends_nothing_and_says_nothing(run, tmp_path) -> None:
-    command = [sys.executable, "-m", "lcc_rl.cli.status", "run"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, cwd=tmp_path, **pipes) as child:
-        child.stdout.close()  # as head -0 does
-        errors = child.stderr.read().decode()
-        assert child.wait(timeout=300) == 0, errors
-    assert errors == ""
+@pytest.mark.parametrize(("words", "code", "said"), OUTPUTS)
+def test_output_that_cannot_be_written_ends_nothing(run, tmp_path, words, code, said) -> None:
+    command = f"{sys.executable} -m lcc_rl {words}; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == code
+    assert re.fullmatch(said, done.stderr)
+
+
+def test_signs_that_the_terminal_lacks_and_control_codes(tmp_path) -> None:
+    (tmp_path / "é" / "run").mkdir(parents=True)
+    (tmp_path / "é" / "run" / "error.txt").write_text("red \x1b[31m é\a")
+    done = subprocess.run(
+        [sys.executable, "-m", "lcc_rl", "status", "é"],
+        cwd=tmp_path,
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert rb"red [31m \xe9" in done.stdout
+    assert b"\x1b" not in done.stdout

@@ -74,7 +74,7 @@ def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
     ("size", "seed", "words"),
     [
         (10**30, 0, r"batch_size=.* needs about \d+.* of memory"),
-        *(((), seed, "seed must be") for seed in (-1, 2**64, 1.0, True, "1")),
+        *(((), seed, "seed must be") for seed in (-1, 2**32, 1.0, True, "1")),
     ],
 )
 def test_an_impossible_batch_or_seed(size, seed, words) -> None:
@@ -82,14 +82,38 @@ def test_an_impossible_batch_or_seed(size, seed, words) -> None:
         make_env("alcc", size, DATA, seed=seed)
 
 
-def test_an_action_of_another_shape(envs) -> None:
-    moment = envs["single"].reset().set("action", torch.zeros(2))
-    with pytest.raises(ConfigError, match=r"action must be \[2, 1\], got"):
-        envs["single"].step(moment)
-    three = small_env("ddpg", 2, ["scenario.string=automated*3"])
-    moment = three.reset().set(("automated", "action"), torch.zeros(2, 1, 1))
-    with pytest.raises(ConfigError, match=r"automated.action must be \[2, 3, 1\], got \[2, 1, 1\]"):
-        three.step(moment)
+def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
+    env = envs["group"]
+    env.set_seed(2**32 - 1)
+    last = env.reset()[SEED]
+    env.set_seed(0)
+    assert not torch.equal(env.reset()[SEED], last)
+    for seed in (2**32, 2**33, -1):
+        with pytest.raises(ConfigError, match="seed must be a whole number from 0 to 4294967295"):
+            env.set_seed(seed)
+
+
+@pytest.mark.parametrize("device", ["banana", *([] if torch.cuda.is_available() else ["cuda"])])
+def test_a_device_that_there_is_not(device) -> None:
+    with pytest.raises(ConfigError, match=f"device '{device}' is not available"):
+        make_env("alcc", 2, DATA, device=device)
+
+
+@pytest.mark.parametrize(
+    ("kind", "action"),
+    [
+        ("single", torch.zeros(2)),
+        ("single", torch.zeros(2, 1, dtype=torch.float64)),
+        ("three", torch.zeros(2, 1, 1)),
+        ("three", torch.zeros(2, 3, 1, dtype=torch.int64)),
+    ],
+)
+def test_an_action_of_another_shape_or_type(envs, kind, action) -> None:
+    env = envs.get(kind) or small_env("ddpg", 2, ["scenario.string=automated*3"])
+    key = env.action_key
+    wanted = r"\[2, 1\]" if kind == "single" else r"\[2, 3, 1\]"
+    with pytest.raises(ConfigError, match=f"action must be {wanted} torch.float32, got"):
+        env.step(env.reset().set(key, action))
 
 
 # -- controllers that remember -----------------------------------------------------------------

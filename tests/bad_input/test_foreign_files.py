@@ -7,13 +7,17 @@ import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import pandas as pd
 import pytest
 import torch
 import yaml
 from commands import content, run_command, tiny
+from helpers import POPULATION, wavy_profiles
 
+from lcc_rl.agents.factory import build_agent, make_trainer
+from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.commands import evaluation, training
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
@@ -145,6 +149,15 @@ def one_wrong_byte(path: Path) -> None:
     path.write_bytes(old)
 
 
+def packed(path: Path) -> None:
+    """Compress the entries of a file, as torch never does."""
+    with ZipFile(path) as old:
+        entries = {name: old.read(name) for name in old.namelist()}
+    with ZipFile(path, "w", ZIP_DEFLATED) as new:
+        for name, entry in entries.items():
+            new.writestr(name, entry)
+
+
 # What a policy's file may not be.
 DAMAGED: dict[str, Callable[[Path], object]] = {
     "malicious pickle": lambda path: path.write_bytes(pickle.dumps(Evil())),
@@ -153,6 +166,9 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
     "one wrong byte": one_wrong_byte,
     "list": lambda path: policy_with(path, [1]),
     "not a number": lambda path: policy_with(path, {WEIGHT: torch.full((16, 7), torch.nan)}),
+    "bytes": lambda path: policy_with(path, {WEIGHT: torch.ones(16, 7, dtype=torch.int8)}),
+    "complex": lambda path: policy_with(path, {WEIGHT: torch.ones(16, 7) * 1j}),
+    "packed": packed,
     "no entries": lambda path: torch.save({"config": ""}, path),
     "no agent": lambda path: policy_with(path, agent=None),
 }
@@ -206,6 +222,81 @@ def test_what_is_no_file_is_not_waited_for(tmp_path, place) -> None:
     for read in (load_policy, read_parquet):
         with pytest.raises(ResultsError, match=r"(not a file|no such file)$"):
             read(tmp_path / place)
+
+
+# -- checkpoints -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def loops(tmp_path_factory) -> dict[str, TrainingLoop]:
+    """Return loops that took two iterations, and saved them."""
+    made = {}
+    for agent in ("ddpg", "analytic"):
+        words = ["variant=alcc", f"agent={agent}", "training.episodes=16"]
+        cfg = tiny("train", *words, agent=agent == "ddpg")
+        folder = tmp_path_factory.mktemp(agent)
+        made[agent] = make_trainer(
+            cfg, build_agent(cfg, POPULATION), wavy_profiles(), POPULATION, folder
+        )
+        made[agent].run()
+    return made
+
+
+def first(state: object) -> tuple[dict, str]:
+    """Return the first mapping in a state that holds a tensor, and its name there."""
+    for name, value in state.items():
+        if isinstance(value, torch.Tensor):
+            return state, name
+        if isinstance(value, dict) and (found := first(value)):
+            return found
+    return ()
+
+
+def cast(kind: torch.dtype) -> Callable[[dict], None]:
+    def change(state: dict) -> None:
+        entries, name = first(state["agent"])
+        entries[name] = entries[name].to(kind)
+
+    return change
+
+
+def spoil_optimizer(state: dict) -> None:
+    agent = state["agent"]
+    steps = agent.get("optimizer") or next(iter(agent["optimizers"].values()))
+    steps["state"][0]["exp_avg"].view(-1)[0] = torch.nan
+
+
+TAMPERED: dict[str, tuple[Callable[[dict], object], str]] = {
+    **{
+        f"iteration {value!r}": (lambda state, v=value: state.update(iteration=v), "iteration")
+        for value in (-3, 1.5, "1", 10**9, 0, 1)
+    },
+    "updates": (lambda state: state.update(updates=-7), "updates must be greater"),
+    "no rows": (lambda state: state.update(rows={}), "iteration 2, but rows of"),
+    "words": (lambda state: state["rows"].update(iteration=["a", "b"]), "rows: column 'iteration'"),
+    "no agent": (lambda state: state.update(agent=[]), "agent must be"),
+    "empty": (lambda state: state.update(agent={}), "agent lacks"),
+    "more": (lambda state: state.update(more=1), "'more'"),
+    "less": (lambda state: state.pop("memory"), "memory is required"),
+    "bytes": (cast(torch.int8), "weight is torch.int8"),
+    "complex": (cast(torch.complex64), "weight is torch.complex64"),
+    "optimizer": (spoil_optimizer, r"0\.exp_avg holds values that are no numbers"),
+}
+
+
+@pytest.mark.parametrize("agent", ["ddpg", "analytic"])
+def test_a_checkpoint_that_was_tampered_with_is_refused(loops, agent) -> None:
+    loop = loops[agent]
+    path = loop.folder / "checkpoint.pt"
+    before = path.read_bytes()
+    for change, words in TAMPERED.values():
+        state = torch.load(path, weights_only=True)
+        change(state)
+        torch.save(state, path)
+        with pytest.raises(ResultsError, match=rf"checkpoint\.pt: .*{words}"):
+            loop.load()
+        path.write_bytes(before)
+    loop.load()
 
 
 # -- tables ----------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
-from lcc_rl.io.atomic import atomic_path, new_file
+from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.runs import save_config
@@ -107,8 +107,6 @@ def test_only_regular_files_are_replaced(tmp_path) -> None:
             atomic_path(tmp_path / name),
         ):
             pass
-    with pytest.raises(ResultsError, match="pipe is already there; choose another --out"):
-        new_file(tmp_path / "pipe", "--out")
 
 
 class Mishap:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 from time import perf_counter
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ from table_text import long_table
 from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
+from lcc_rl.data import tables
 from lcc_rl.data.leaders import Mixture
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import ConfigError
@@ -70,6 +72,7 @@ IGNORED = {
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "variant=idm training.episodes=20": "variant idm learns nothing",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
+    "sweep=mine": "names the folder of a sweep, -m",
     "evaluation.full_length=true": "unused with evaluation.rows=episodes",
 }
 
@@ -135,12 +138,14 @@ def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
         evaluation.run(cfg, tmp_path)
 
 
-def test_a_table_larger_than_memory(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize("more", [b"", gzip.compress(b"")])  # its size is that of all members
+def test_a_table_larger_than_memory(tmp_path, monkeypatch, more) -> None:
     path = tmp_path / "big.csv.gz"
-    long_table(rows=200).to_csv(path, index=False)
+    path.write_bytes(gzip.compress(long_table(rows=200).to_csv(index=False).encode()) + more)
     columns = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
     source = TableSource(path=str(path), columns=columns)
     source.load()
-    monkeypatch.setattr(memory, "available", lambda device: 29_000)
+    for module in (memory, tables):
+        monkeypatch.setattr(module, "available", lambda device="cpu": 29_000)
     with pytest.raises(ConfigError, match=r"reading .*big\.csv\.gz needs about"):
         source.load()

@@ -114,6 +114,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", table(v=1e20), r"data row 501, column 'v' holds '1e\+20'"),
     ("table", table(gap="-inf"), "data row 501, column 'gap' holds '-inf'"),
     ("table", table(id=""), "data row 501, column 'id' is blank"),
+    ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 signs"),
     ("episodes", episodes(6, gap_m=np.nan), "row 7, column 'gap_m' holds nothing"),
     ("episodes", episodes(1, episode=""), "row 2, column 'episode' is blank"),
     ("drives", DRIVES + ",0.1,1\n", "data row 2, column 'drive' is blank"),

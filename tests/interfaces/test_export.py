@@ -71,7 +71,7 @@ def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_
     program = torch.export.load(path, extra_files=about).module()
     torch.testing.assert_close(program(states(module)), module(states(module)))
     assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
-    with pytest.raises(ResultsError, match="exists already"):
+    with pytest.raises(ResultsError, match="is already there"):
         lcc_rl.export("pretrained/i80-follow", path)
 
 

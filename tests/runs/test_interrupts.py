@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from commands import (
 
 from lcc_rl.commands import training
 from lcc_rl.io.files import read_parquet
-from lcc_rl.runs.interrupts import interruptible, stop_signal
+from lcc_rl.runs.interrupts import SIGNALS, interruptible, stop_signal
 
 LONGER = ("training.episodes=240", "variant=alcc")
 IMPORTS = "import sys; sys.argv = ['-m']; import lcc_rl; print('on', flush=True); input()"
@@ -36,7 +37,7 @@ def ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", SIGNALS)
 def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", IMPORTS], text=True, **pipes) as child:
@@ -46,14 +47,25 @@ def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
     assert (child.returncode, errors) == (130, "lcc_rl: interrupted\n")
 
 
-def test_the_first_signal_asks_and_the_second_acts() -> None:
+@pytest.mark.parametrize("kind", SIGNALS)
+def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch, kind) -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # importing changes no handler
     with interruptible(), stop_signal() as stop:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), kind)
         assert stop.is_set()
+        os.kill(os.getpid(), kind)  # as a scheduler does, to this process and by its parent
+        monkeypatch.setattr("lcc_rl.runs.interrupts.time.monotonic", lambda: math.inf)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_closed_terminal_is_ignored_where_nohup_says_so() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with interruptible(), stop_signal() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert not stop.is_set()
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +76,7 @@ def whole(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("kind", [*SIGNALS, signal.SIGKILL])
 def test_a_training_that_is_ended_resumes_to_the_same_rows(whole, tmp_path, kind) -> None:
     with start("lcc_rl.cli.train", *TINY, *LONGER, "hydra.run.dir=run", cwd=tmp_path) as child:
         wait_for(tmp_path / "run" / "checkpoint.pt", child)
@@ -83,16 +95,20 @@ def test_a_training_that_is_ended_resumes_to_the_same_rows(whole, tmp_path, kind
 
 
 @pytest.mark.slow
-def test_an_interrupted_pipeline_is_completed(tmp_path, monkeypatch) -> None:
-    words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc]", "hydra.run.dir=job"]
-    with start("lcc_rl.cli.pipeline", *words, cwd=tmp_path) as process:
+@pytest.mark.parametrize("send", [os.kill, os.killpg])
+def test_an_interrupted_pipeline_starts_no_further_training(tmp_path, monkeypatch, send) -> None:
+    words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc,reference]", "jobs=1"]
+    with start("lcc_rl.cli.pipeline", *words, "hydra.run.dir=job", cwd=tmp_path) as process:
         wait_for(tmp_path / "job/alcc/checkpoint.pt", process)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process of the job
+        send(process.pid, signal.SIGINT)  # a terminal sends it to every process of the job
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "resume=" in errors
     assert not (tmp_path / "job/alcc/episodes.parquet").exists()
+    assert not (tmp_path / "job/reference").exists()
     jobs_in_threads(monkeypatch)
     run_command("lcc_rl.cli.pipeline", "resume=job", cwd=tmp_path, check=True)
-    assert len(read_parquet(tmp_path / "job/alcc/training.parquet")) == 50
+    for name in ("alcc", "reference"):
+        assert len(read_parquet(tmp_path / "job" / name / "training.parquet")) == 50
+        assert f"train {name}: iteration 50/50" in (tmp_path / f"job/{name}/train.log").read_text()
     assert (tmp_path / "job/evaluation/figures/overview.png").exists()

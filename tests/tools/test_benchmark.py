@@ -39,21 +39,6 @@ def test_quick_run_writes_sane_rows(tmp_path, capsys, name) -> None:
     assert name in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["reed"], "Did you mean 'read'"),
-        (["calibrate", "--episodes", "missing.parquet"], "missing.parquet"),
-    ],
-)
-def test_bad_input_ends_in_one_line(tmp_path, capsys, arguments, message) -> None:
-    assert command.main([*arguments, "--quick", "--out", str(tmp_path / "rows.parquet")]) == 1
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "rows.parquet").exists()
-
-
 def test_a_wrong_plain_loop_is_not_timed(monkeypatch) -> None:
     monkeypatch.setattr("benchmarks.plain.motor_power", lambda speed, acceleration: speed)
     options = command.parse(["env", "--quick", "--device", "cpu"])

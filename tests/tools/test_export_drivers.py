@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from xml.etree import ElementTree
 
 import export_drivers
@@ -10,7 +9,7 @@ import pandas as pd
 import pytest
 
 from lcc_rl.drivers.tables import load_drivers
-from lcc_rl.errors import DataError, ResultsError
+from lcc_rl.errors import DataError
 
 
 @pytest.fixture
@@ -48,10 +47,3 @@ def test_bad_drivers_end_in_one_line(drivers, tmp_path, change, words) -> None:
     with pytest.raises(DataError, match=words):
         export_drivers.main([drivers, str(target)])
     assert not target.exists()
-
-
-def test_nothing_that_is_there_is_overwritten(drivers, tmp_path) -> None:
-    before = Path(drivers).read_bytes()
-    with pytest.raises(ResultsError, match="is already there; choose another target"):
-        export_drivers.main([drivers, drivers])
-    assert Path(drivers).read_bytes() == before

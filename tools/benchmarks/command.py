@@ -7,12 +7,9 @@ Every row also goes into one parquet file (--out). What each measures: docs/benc
 
 from __future__ import annotations
 
-import argparse
 import logging
-import sys
-from argparse import Namespace
+from argparse import BooleanOptionalAction, Namespace
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from shutil import which
 
 import pandas as pd
@@ -30,9 +27,14 @@ from benchmarks.loading import loading, start
 from benchmarks.read import read
 from benchmarks.train import train
 from benchmarks.update import update
+from lcc_rl.config.schemas import Device
 from lcc_rl.data.tables import TableFile
-from lcc_rl.errors import LccError, ResultsError, how_to_install, unknown_name
+from lcc_rl.errors import how_to_install, unknown_name
+from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import processor, write_parquet
+from lcc_rl.io.memory import torch_device
+from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.settings import Million, Parallel
 
 LISTED = (read, loading, start, env, collect, update, train, calibrate, evaluate)
 NO_DEVICE = ("read", "loading", "start")  # always on the processor
@@ -43,27 +45,29 @@ BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
 
 def parse(arguments: Sequence[str] | None) -> Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
+    parser = Arguments(description=__doc__.partition("\n")[0] if __doc__ else None)
     listed = f"{', '.join(BENCHMARKS)}; all by default, which takes minutes"
     parser.add_argument("names", nargs="*", metavar="name", help=listed)
     parser.add_argument("--ngsim", help="18-column CSV to read (default: a synthetic stream)")
     parser.add_argument("--episodes", help="episode table to calibrate (default: the stream's)")
     parser.add_argument(
-        "--compile", action=argparse.BooleanOptionalAction, help="compiled cases (default: yes)"
+        "--compile", action=BooleanOptionalAction, help="compiled cases (default: yes)"
     )
-    parser.add_argument("--device", help="cpu or cuda (default: cpu, and cuda where there is one)")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch")
+    parser.add_argument(
+        "--device",
+        type=typed(Device),
+        help="cpu or cuda (default: cpu, and cuda where there is one)",
+    )
+    parser.add_argument("--threads", type=typed(Parallel), default=1, help="threads of torch")
     parser.add_argument(
         "--clock", choices=[*harness.TIMERS], default="wall", help="processor: for a loaded machine"
     )
-    parser.add_argument("--repeats", type=int, default=5, help="repeats of every case")
+    parser.add_argument("--repeats", type=typed(Million), default=5, help="repeats of every case")
     parser.add_argument(
         "--quick", action="store_true", help="two repeats of tiny sizes, not compiled, as a trial"
     )
     parser.add_argument("--out", default="outputs/benchmark.parquet", help="where the rows go")
     options = parser.parse_args(arguments)
-    if min(options.threads, options.repeats) < 1:
-        parser.error("--threads and --repeats must be at least 1")
     options.repeats = 2 if options.quick else options.repeats
     if options.compile is None:
         options.compile = not options.quick and which("c++") is not None
@@ -71,8 +75,14 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print and write; return 1 if the input is at fault."""
+    """Measure, print and write."""
     options = parse(arguments)
+    for name in options.names:
+        if name not in BENCHMARKS:
+            raise unknown_name("benchmark", name, BENCHMARKS)
+    out = new_file(options.out, "--out", lambda path: "benchmark" in TableFile(path).header)
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    chosen = [str(torch_device(options.device))] if options.device else devices
     torch.set_num_threads(options.threads)
     harness.timer = options.clock
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -86,24 +96,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "machine": processor(),
         "torch": torch.__version__,
     }
-    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    try:
-        if Path(options.out).exists() and "benchmark" not in TableFile(options.out).header:
-            raise ResultsError(f"{options.out} is no table of benchmarks; choose another --out")
-        for name in options.names:
-            if name not in BENCHMARKS:
-                raise unknown_name("benchmark", name, BENCHMARKS)
-        for name in options.names or BENCHMARKS:
-            chosen = [options.device] if options.device else devices
-            for device in ["cpu"] if name in NO_DEVICE else chosen:
-                measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))
-                console.print(drawn(f"{name}, {device}", measured))
-                rows += [{"benchmark": name, **row, "device": device} for row in measured]
-                # After each, so that what is measured stays whatever happens to the next.
-                table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
-                write_parquet(table, options.out)
-    except LccError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    console.print(f"{len(rows)} rows: {options.out}")
+    for name in options.names or BENCHMARKS:
+        for device in ["cpu"] if name in NO_DEVICE else chosen:
+            measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))
+            console.print(drawn(f"{name}, {device}", measured))
+            rows += [{"benchmark": name, **row, "device": device} for row in measured]
+            # After each, so that what is measured stays whatever happens to the next.
+            table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
+            write_parquet(table, out)
+    console.print(f"{len(rows)} rows: {out}")
     return 0

@@ -18,6 +18,7 @@ from lcc_rl.studies.runner import (
     BaseStudy,
     Outcome,
     Run,
+    check_accepted,
     differences,
     note,
     note_problems,
@@ -167,7 +168,7 @@ def run(study: Study, parts: Sequence[str] = PARTS, command: str = "") -> list[O
     """
     series = _series(study, parts)
     for folder, change in series.items():  # before any work
-        study.runs(folder, change)[0].compose()
+        check_accepted(study.accept, study.runs(folder, change)[0].compose())
     calibration = _calibration(study)
     if command:
         note(study.folder, "alcc", command)

@@ -34,6 +34,7 @@ from lcc_rl.studies.runner import (
     BaseStudy,
     Outcome,
     Run,
+    check_accepted,
     note,
     note_problems,
     run_all,
@@ -89,6 +90,7 @@ def run(study: Study, command: str = "") -> list[Outcome]:
         LccError: one clear error for wrong settings or files.
     """
     cfg = study.evaluation()
+    check_accepted(study.accept, study.runs()[0].compose())
     if command:
         note(study.folder, "hcfs", command)
     outcomes = run_all(study.runs(), study.jobs, study.accept)

@@ -1,0 +1,46 @@
+"""What every command does: its streams, its signals, its exit codes, one line for an error."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import wraps
+from typing import Any, NoReturn
+
+from lcc_rl.errors import Interrupted, input_error, of_hydra, one_line
+from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
+from lcc_rl.runs.output import unbroken_output
+
+
+def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function a command: the one place for streams, signals and exit codes.
+
+    Wrong input (this package's errors, Hydra's, OSError) is one line on stderr and exit code 2,
+    an interrupt is exit code 130; any other error shows its traceback, exit code 1. Commands may
+    be nested.
+    """
+
+    @wraps(function)
+    def guarded(*arguments: Any, **settings: Any) -> Any:
+        try:
+            with unbroken_output(), interruptible():
+                return function(*arguments, **settings)
+        except KeyboardInterrupt:
+            stop("interrupted", INTERRUPTED)
+        except Exception as error:
+            cause = input_error(error)
+            if isinstance(cause, Interrupted):
+                stop(str(cause), INTERRUPTED)
+            if cause is None and not (isinstance(error, OSError) or of_hydra(error)):
+                raise
+            stop(f"error: {cause or error}", BAD_INPUT)
+
+    return guarded
+
+
+def stop(text: str, code: int) -> NoReturn:
+    """Print a line on stderr and exit."""
+    with suppress(OSError), unbroken_output():
+        print(f"lcc_rl: {one_line(text)}", file=sys.stderr)
+    sys.exit(code)

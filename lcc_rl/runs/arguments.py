@@ -1,0 +1,40 @@
+"""Flags of commands: words of a command line, read as typed values and refused in one line."""
+
+from __future__ import annotations
+
+import re
+from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from lcc_rl.errors import ConfigError
+
+FINITE = ConfigDict(allow_inf_nan=False)
+
+
+class Arguments(ArgumentParser):
+    """A parser that keeps the lines of its description and raises a ConfigError."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(
+            **{"formatter_class": RawDescriptionHelpFormatter, "allow_abbrev": False, **settings}
+        )
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} ({self.prog} -h lists what there is)")
+
+
+def typed(kind: Any) -> Callable[[str], Any]:
+    """Return what reads a flag's word as an annotated type: :data:`lcc_rl.settings.Count` …."""
+    adapter = TypeAdapter(kind, config=FINITE)
+
+    def read(word: str) -> Any:
+        try:
+            return adapter.validate_strings(word)
+        except ValidationError as error:
+            wanted = re.sub(r"^\w+ should", "must", error.errors()[0]["msg"])
+            raise ArgumentTypeError(f"{wanted}, got {word!r}") from None
+
+    return read
