@@ -1,0 +1,360 @@
+"""Functions of tensors as loops over rows of numbers, in machine code.
+
+An operation on a tensor costs torch some microseconds, however small the tensor. A step of one
+episode is about 300 operations on one row; as statements on single numbers it takes a few
+microseconds. The statements are not written anywhere: they are recorded from the function itself.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import cache, reduce
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numba.core.errors import NumbaError
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+log = logging.getLogger("lcc_rl")
+
+Array = np.ndarray[Any, Any]
+TensorFunction = Callable[..., Sequence[Tensor]]
+
+MOST_STATEMENTS = 4000  # numba takes about a second for each thousand
+
+TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
+
+
+@numba.njit
+def pick(condition: Any, one: Any, other: Any) -> Any:
+    """Return one of two numbers; as a function, so that the loop has no branches."""
+    return one if condition else other
+
+
+@numba.njit(boundscheck=True)
+def read(table: Any, place: Any) -> Any:
+    """Return an entry of a table.
+
+    Raises:
+        IndexError: if there is none at that place.
+    """
+    return table[place]
+
+
+NAMES = {
+    "pick": pick,
+    "read": read,
+    "f32": np.float32,
+    "f64": np.float64,
+    "i64": np.int64,
+    "flag": np.bool_,
+    "np": np,
+    "inf": np.inf,
+    "nan": np.nan,
+}
+ARITHMETIC = {
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "rsub": "{1} - {0}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "abs": "abs({0})",
+    "reciprocal": "f32(1) / {0}",
+    "sqrt": "np.sqrt({0})",
+    "rsqrt": "f32(1) / np.sqrt({0})",
+    "exp": "np.exp({0})",
+    "log": "np.log({0})",
+    "sin": "np.sin({0})",
+    "atanh": "np.arctanh({0})",
+    "tanh": "np.tanh({0})",
+    "pow": "{0} ** {1}",
+    "lerp": "{0} + {2} * ({1} - {0})",
+    # What is not a number stays so, as in torch.
+    "maximum": "pick(({0} > {1}) | ({0} != {0}), {0}, {1})",
+    "minimum": "pick(({0} < {1}) | ({0} != {0}), {0}, {1})",
+    "bitwise_and": "{0} & {1}",
+    "bitwise_or": "{0} | {1}",
+    "bitwise_xor": "{0} ^ {1}",
+    "__rshift__": "{0} >> {1}",
+    "logical_and": "{0} & {1}",
+    "logical_or": "{0} | {1}",
+    "logical_not": "{0} == 0",
+    "_to_copy": "{0}",
+}
+COMPARISONS = {
+    "gt": "{0} > {1}",
+    "ge": "{0} >= {1}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+}
+FOLDS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
+# They move entries, whatever these are, and are applied to the numbers of the variables.
+MOVES = {
+    "_unsafe_view", "alias", "cat", "clone", "detach", "expand", "flip", "permute", "repeat",
+    "select", "slice", "split", "split_with_sizes", "squeeze", "stack", "t", "transpose", "unbind",
+    "unsqueeze", "view",
+}  # fmt: skip
+# They take no more than the shape of what they are given.
+SHAPES = {"zeros_like", "ones_like", "full_like", "empty_like", "new_zeros", "new_ones", "new_full"}
+
+
+class Untranslatable(Exception):
+    """An operation has no counterpart on single numbers."""
+
+
+class Recorder(TorchDispatchMode):
+    """Records operations on tensors as statements on numbers.
+
+    Every entry of a tensor that depends on the inputs is a variable; of such a tensor the numbers
+    of its variables are kept, in a tensor of the same shape. All other tensors are constants.
+
+    Attributes:
+        statements: the expression of each variable, and the variables that it reads.
+        tables: constants that are read at a place that depends on the inputs.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.statements: list[tuple[str, tuple[int, ...]]] = []
+        self.known: dict[tuple[str, tuple[int, ...]], int] = {}
+        self.variables: dict[int, tuple[Tensor, Tensor]] = {}  # by the id of the tensor
+        self.tables: list[Tensor] = []
+
+    def add(self, tensor: Tensor, variables: Tensor) -> None:
+        """Say of which variables a tensor consists."""
+        self.variables[id(tensor)] = (tensor, variables)  # kept, so that its id stays its own
+
+    def of(self, value: Any) -> Tensor | None:
+        """Return the variables of a tensor; None for a constant."""
+        found = self.variables.get(id(value))
+        return None if found is None else found[1]
+
+    def state(self, expression: str, reads: tuple[int, ...]) -> int:
+        """Return the variable with the value of an expression, ``{0}`` for the first one read."""
+        statement = (expression, reads)
+        if statement not in self.known:
+            self.known[statement] = len(self.statements)
+            self.statements.append(statement)
+            if len(self.statements) > MOST_STATEMENTS:
+                raise Untranslatable(f"it takes more than {MOST_STATEMENTS} statements")
+        return self.known[statement]
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        result = func(*args, **kwargs)
+        name = func.overloadpacket.__name__
+        given = [part for x in args for part in (x if isinstance(x, (list, tuple)) else [x])]
+        if name in SHAPES or all(self.of(x) is None for x in given):
+            return result
+        if name in MOVES:
+            self._move(func, args, kwargs, result)
+        elif (record := getattr(self, f"_{name}", None)) is not None:
+            self.add(result, record(result, *args, **kwargs))
+        elif name in FOLDS:
+            self.add(result, self._fold(name, result, *args, **kwargs))
+        elif name == "_to_copy" or (name in {*ARITHMETIC, *COMPARISONS} and not kwargs):
+            self.add(result, self._each(name, result.dtype, *given))
+        else:
+            raise Untranslatable(str(func))
+        return result
+
+    def _each(self, name: str, dtype: torch.dtype, *values: Any) -> Tensor:
+        """Record an operation on single entries."""
+        if name in ARITHMETIC:
+            return self._stated(ARITHMETIC[name], [self._numbers(x, dtype) for x in values])
+        common = torch.result_type(*values)
+        return self._stated(COMPARISONS[name], [self._numbers(x, common) for x in values])
+
+    def _stated(self, formula: str, parts: Sequence[Tensor]) -> Tensor:
+        """Record a formula for every entry of variables; return the variables of the results."""
+        parts = torch.broadcast_tensors(*parts)
+        rows = zip(*(part.flatten().tolist() for part in parts), strict=True)
+        found = [self.state(formula, row) for row in rows]
+        return torch.tensor(found, dtype=torch.int64).reshape(parts[0].shape)
+
+    def _numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
+        """Return the variables of a value as numbers of a type."""
+        if (kind := TYPES.get(dtype)) is None:
+            raise Untranslatable(f"numbers of {dtype}")
+        variables = self.of(value)
+        if variables is not None:
+            same = value.dtype == dtype
+            return variables if same else self._stated(f"{kind}({{0}})", [variables])
+        value = torch.as_tensor(value, dtype=dtype)
+        literals = [self.state(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
+        return torch.tensor(literals, dtype=torch.int64).reshape(value.shape)
+
+    def _move(self, func: Any, args: tuple[Any, ...], kwargs: Any, result: Any) -> None:
+        results = (result,) if isinstance(result, Tensor) else result
+        dtype = results[0].dtype
+
+        def moved(value: Any) -> Any:
+            if isinstance(value, (list, tuple)):
+                return [moved(part) for part in value]
+            return self._numbers(value, dtype) if isinstance(value, Tensor) else value
+
+        found = func(*moved(args), **kwargs)
+        parts = (found,) if isinstance(found, Tensor) else found
+        for tensor, variables in zip(results, parts, strict=True):
+            self.add(tensor, variables)
+
+    def _fold(
+        self, name: str, result: Tensor, value: Tensor, dims: Any = None, *_: Any, **__: Any
+    ) -> Tensor:
+        dims = (
+            list(range(value.ndim)) if dims is None else [dims] if isinstance(dims, int) else dims
+        )
+        variables = self._numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
+        parts = variables.flatten(0, len(dims) - 1).unbind(0)
+        formula = ARITHMETIC[FOLDS[name]]
+        return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
+
+    def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:
+        return self._each("bitwise_xor", result.dtype, value, -1)
+
+    def _where(self, result: Tensor, condition: Tensor, *values: Any) -> Tensor:
+        parts = [self._numbers(x, result.dtype) for x in values]
+        return self._stated("pick({0}, {1}, {2})", [self._numbers(condition, torch.bool), *parts])
+
+    def _clamp(self, result: Tensor, value: Tensor, low: Any = None, high: Any = None) -> Tensor:
+        variables = self._numbers(value, result.dtype)
+        for bound, order in ((low, "<"), (high, ">")):
+            if bound is not None:
+                parts = [variables, self._numbers(bound, result.dtype)]
+                variables = self._stated(f"pick({{0}} {order} {{1}}, {{1}}, {{0}})", parts)
+        return variables
+
+    def _index(self, result: Tensor, value: Tensor, places: Sequence[Tensor | None]) -> Tensor:
+        variables = self.of(value)
+        if variables is None:
+            return self._read(result, value, places)
+        if any(self.of(place) is not None for place in places):
+            raise Untranslatable("an index that depends on the inputs, into what does, too")
+        return variables[tuple(slice(None) if x is None else x for x in places)]
+
+    def _read(self, result: Tensor, table: Tensor, places: Sequence[Tensor | None]) -> Tensor:
+        """Record reading a constant at places that depend on the inputs."""
+        if any(place is None for place in places):
+            raise Untranslatable("an index that is not of the first dimensions")
+        inner = table.shape[len(places) :]
+        outer = torch.broadcast_tensors(*(self._numbers(x, torch.int64) for x in places))
+        parts = [x.reshape(*x.shape, *[1] * len(inner)) for x in outer]
+        for axis, size in enumerate(inner):
+            each = self._numbers(torch.arange(size), torch.int64)
+            parts.append(each.reshape(size, *[1] * (len(inner) - 1 - axis)))
+        where = ", ".join(f"{{{i}}}" for i in range(len(parts)))
+        return self._stated(f"read({self._table(table)}, ({where},))", parts)
+
+    def _searchsorted(
+        self, result: Tensor, table: Tensor, value: Tensor, right: bool = False, **more: Any
+    ) -> Tensor:
+        if more or table.ndim != 1 or self.of(table) is not None:
+            raise Untranslatable("a search in what is not one constant list")
+        side = "right" if right else "left"
+        formula = f"i64(np.searchsorted({self._table(table)}, {{0}}, '{side}'))"
+        return self._stated(formula, [self._numbers(value, table.dtype)])
+
+    def _table(self, table: Tensor) -> str:
+        places = [i for i, known in enumerate(self.tables) if known is table]
+        if not places:
+            self.tables.append(table)
+        return f"t{places[0] if places else len(self.tables) - 1}"
+
+
+class Rows:
+    """A function of rows of numbers, computed row by row in machine code.
+
+    If an operation of the function has no counterpart on single numbers, the function itself is
+    called, with tensors.
+
+    Args:
+        function: maps tensors ``[n, width]`` to tensors ``[n, width]``; rows do not mix.
+        examples: a row of each argument, ``[1, width]``.
+        what: its name in the line of the log that says that it is not translated.
+
+    Attributes:
+        translated: whether it runs as machine code.
+    """
+
+    def __init__(self, function: TensorFunction, examples: Sequence[Tensor], what: str) -> None:
+        self.function = function
+        with torch.no_grad():
+            results = function(*examples)
+        self.widths = [(x.shape[-1], x.numpy().dtype) for x in results]
+        try:
+            self.kernel, self.tables = translated(function, examples)
+            self.translated = True
+            self(*(x.numpy() for x in examples))
+        except (Untranslatable, NumbaError) as error:
+            log.info("%s runs by tensors: %s", what, str(error).strip().splitlines()[0])
+            self.translated = False
+
+    def __call__(self, *arguments: Array) -> tuple[Array, ...]:
+        """Return the results of all rows, arrays ``[n, width]``.
+
+        Args:
+            *arguments: arrays ``[n, width]`` of the types of the examples.
+        """
+        if self.translated:
+            count = len(arguments[0])
+            results = tuple([np.empty((count, width), dtype) for width, dtype in self.widths])
+            self.kernel(*arguments, *results, *self.tables)
+            return results
+        with torch.no_grad():
+            tensors = self.function(*(torch.from_numpy(x) for x in arguments))
+        return tuple(x.numpy() for x in tensors)
+
+
+def translated(
+    function: TensorFunction, examples: Sequence[Tensor]
+) -> tuple[Callable[..., None], list[Array]]:
+    """Return a function as machine code, and the tables that are its last arguments.
+
+    Raises:
+        Untranslatable: naming the operation that has no counterpart on single numbers.
+    """
+    recorder = Recorder()
+    examples = [example.clone() for example in examples]
+    for place, example in enumerate(examples):
+        columns = range(example.shape[-1])
+        variables = [recorder.state(f"x{place}[row, {column}]", ()) for column in columns]
+        recorder.add(example, torch.tensor(variables).reshape(1, -1))
+    with torch.no_grad(), recorder:
+        results = function(*examples)
+    outputs = [recorder._numbers(x, x.dtype).flatten().tolist() for x in results]
+    needed = {variable for output in outputs for variable in output}
+    for variable in reversed(range(len(recorder.statements))):
+        if variable in needed:
+            needed |= set(recorder.statements[variable][1])
+    lines = [
+        f"v{i} = " + expression.format(*(f"v{x}" for x in reads))
+        for i, (expression, reads) in enumerate(recorder.statements)
+        if i in needed
+    ]
+    lines += [
+        f"y{place}[row, {column}] = v{variable}"
+        for place, output in enumerate(outputs)
+        for column, variable in enumerate(output)
+    ]
+    counts = (("x", examples), ("y", outputs), ("t", recorder.tables))
+    names = ", ".join(f"{name}{i}" for name, each in counts for i in range(len(each)))
+    body = "".join(f"        {line}\n" for line in lines)
+    source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
+    return compiled(source), [table.numpy() for table in recorder.tables]
+
+
+@cache
+def compiled(source: str) -> Callable[..., None]:
+    """Return a function as machine code; environments of the same settings share it."""
+    scope = dict(NAMES)
+    exec(source, scope)
+    return numba.njit(error_model="numpy")(scope["kernel"])
