@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.clock import reset_options
 from lcc_rl.envs.finite import ACTION, check_numbers
-from lcc_rl.envs.rows import Array, Rows
+from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.envs.step import TERMINATED, TRUNCATED, Step, closure, entries, pieces_of
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
@@ -25,7 +25,7 @@ SEEN = (AUTOMATED, OBSERVATION)
 
 
 class ArrayEpisodes:
-    """Episodes of one automated vehicle, stepped as rows of arrays by :class:`Rows`.
+    """Episodes of one automated vehicle, stepped as rows of arrays by :class:`Rowwise`.
 
     Everything random in an episode follows from its seed; each place draws the seeds of its
     episodes from a generator of its own, as an environment of one episode does.
@@ -46,8 +46,8 @@ class ArrayEpisodes:
         self.terms = [str(name) for name in totals[-1].terms]
         self.written = [REWARD, TERMINATED, TRUNCATED, *((*TERMS, name) for name in self.terms)]
         first, seed = self._first(pieces), torch.zeros(1, 1, dtype=torch.int64)
-        self.advance = Rows(self._advance, (self._packed(first), torch.zeros(1, 1)), "a step")
-        self.begin = Rows(self._begin, (seed,), "a reset")
+        self.advance = Rowwise(self._advance, (self._packed(first), torch.zeros(1, 1)), "a step")
+        self.begin = Rowwise(self._begin, (seed,), "a reset")
         self.generators = [torch.Generator() for _ in range(self.count)]
         for generator in self.generators:
             generator.seed()  # at random, until a reset gives a seed

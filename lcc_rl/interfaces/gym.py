@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 
 from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.envs.factory import make_env
-from lcc_rl.envs.rows import Array
+from lcc_rl.envs.rowwise import Array
 from lcc_rl.errors import ConfigError
 
 VARIANTS = ("alcc", "reference", "own_energy")

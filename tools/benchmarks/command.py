@@ -24,6 +24,7 @@ from benchmarks.calibrate import calibrate
 from benchmarks.collect import collect
 from benchmarks.env import env
 from benchmarks.evaluate import evaluate
+from benchmarks.gym import gym
 from benchmarks.harness import EXTRA, Row, drawn, installed
 from benchmarks.read import read
 from benchmarks.train import train
@@ -32,7 +33,7 @@ from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import LccError, ResultsError, how_to_install, unknown_name
 from lcc_rl.io.files import processor, write_parquet
 
-LISTED = (read, env, collect, update, train, calibrate, evaluate)
+LISTED = (read, env, gym, collect, update, train, calibrate, evaluate)
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
 }

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcc_rl.envs.rows import Rows
+from lcc_rl.envs.rowwise import Rowwise
 
 TABLE = torch.linspace(-1.0, 1.0, 12).reshape(4, 3)
 PLACES = torch.tensor([3, 0, 2])
@@ -40,7 +40,7 @@ def test_a_translated_function_gives_what_torch_gives(name) -> None:
     def function(*given):
         return (FUNCTIONS[name](*given),)
 
-    rows = Rows(function, examples(1), name)
+    rows = Rowwise(function, examples(1), name)
     assert rows.translated
     given = examples(50)
     (found,), (wanted,) = rows(*(x.numpy() for x in given)), function(*given)
@@ -60,14 +60,14 @@ def test_a_translated_function_gives_what_torch_gives(name) -> None:
     ],
 )
 def test_what_has_no_translation_is_computed_by_tensors(function) -> None:
-    rows, given = Rows(function, examples(1), "a test"), examples(5)
+    rows, given = Rowwise(function, examples(1), "a test"), examples(5)
     assert not rows.translated
     (found,), (wanted,) = rows(*(x.numpy() for x in given)), function(*given)
     np.testing.assert_array_equal(found, wanted)
 
 
 def test_a_place_beyond_a_table_is_an_error() -> None:
-    rows = Rows(lambda n: (TABLE[:, 0][n],), [torch.zeros(1, 1, dtype=torch.int64)], "a test")
+    rows = Rowwise(lambda n: (TABLE[:, 0][n],), [torch.zeros(1, 1, dtype=torch.int64)], "a test")
     assert rows.translated
     with pytest.raises(IndexError):
         rows(np.array([[4]]))

@@ -270,7 +270,7 @@ class Recorder(TorchDispatchMode):
         return f"t{places[0] if places else len(self.tables) - 1}"
 
 
-class Rows:
+class Rowwise:
     """A function of rows of numbers, computed row by row in machine code.
 
     If an operation of the function has no counterpart on single numbers, the function itself is
