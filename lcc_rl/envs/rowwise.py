@@ -24,7 +24,7 @@ log = logging.getLogger("lcc_rl")
 Array = np.ndarray[Any, Any]
 TensorFunction = Callable[..., Sequence[Tensor]]
 
-MOST_STATEMENTS = 4000  # numba takes about a second for each thousand
+MOST_STATEMENTS = 4000  # numba takes 2 to 4 s for each thousand
 
 TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
 
@@ -94,6 +94,7 @@ COMPARISONS = {
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
 }
+OTHERS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
 FOLDS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
 # They move entries, whatever these are, and are applied to the numbers of the variables.
 MOVES = {
@@ -136,7 +137,7 @@ class Recorder(TorchDispatchMode):
         found = self.variables.get(id(value))
         return None if found is None else found[1]
 
-    def state(self, expression: str, reads: tuple[int, ...]) -> int:
+    def variable(self, expression: str, reads: tuple[int, ...]) -> int:
         """Return the variable with the value of an expression, ``{0}`` for the first one read."""
         statement = (expression, reads)
         if statement not in self.known:
@@ -157,8 +158,8 @@ class Recorder(TorchDispatchMode):
             return result
         if name in MOVES:
             self._move(func, args, kwargs, result)
-        elif (record := getattr(self, f"_{name}", None)) is not None:
-            self.add(result, record(result, *args, **kwargs))
+        elif name in OTHERS:
+            self.add(result, getattr(self, f"_{name}")(result, *args, **kwargs))
         elif name in FOLDS:
             self.add(result, self._fold(name, result, *args, **kwargs))
         elif name == "_to_copy" or (name in {*ARITHMETIC, *COMPARISONS} and not kwargs):
@@ -169,16 +170,18 @@ class Recorder(TorchDispatchMode):
 
     def _each(self, name: str, dtype: torch.dtype, *values: Any) -> Tensor:
         """Record an operation on single entries."""
-        if name in ARITHMETIC:
-            return self._stated(ARITHMETIC[name], [self._numbers(x, dtype) for x in values])
-        common = torch.result_type(*values)
-        return self._stated(COMPARISONS[name], [self._numbers(x, common) for x in values])
+        if name in COMPARISONS:
+            dtype = torch.result_type(*values)
+        formula = COMPARISONS.get(name) or ARITHMETIC[name]
+        if f"{{{len(values) - 1}}}" not in formula:
+            raise Untranslatable(f"{name} of {len(values)} arguments")
+        return self._stated(formula, [self._numbers(x, dtype) for x in values])
 
     def _stated(self, formula: str, parts: Sequence[Tensor]) -> Tensor:
         """Record a formula for every entry of variables; return the variables of the results."""
         parts = torch.broadcast_tensors(*parts)
         rows = zip(*(part.flatten().tolist() for part in parts), strict=True)
-        found = [self.state(formula, row) for row in rows]
+        found = [self.variable(formula, row) for row in rows]
         return torch.tensor(found, dtype=torch.int64).reshape(parts[0].shape)
 
     def _numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
@@ -190,7 +193,7 @@ class Recorder(TorchDispatchMode):
             same = value.dtype == dtype
             return variables if same else self._stated(f"{kind}({{0}})", [variables])
         value = torch.as_tensor(value, dtype=dtype)
-        literals = [self.state(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
+        literals = [self.variable(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
         return torch.tensor(literals, dtype=torch.int64).reshape(value.shape)
 
     def _move(self, func: Any, args: tuple[Any, ...], kwargs: Any, result: Any) -> None:
@@ -208,11 +211,9 @@ class Recorder(TorchDispatchMode):
             self.add(tensor, variables)
 
     def _fold(
-        self, name: str, result: Tensor, value: Tensor, dims: Any = None, *_: Any, **__: Any
+        self, name: str, result: Tensor, value: Tensor, dims: Any = None, *keep: Any, **more: Any
     ) -> Tensor:
-        dims = (
-            list(range(value.ndim)) if dims is None else [dims] if isinstance(dims, int) else dims
-        )
+        dims = [dims] if isinstance(dims, int) else dims or list(range(value.ndim))
         variables = self._numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
         parts = variables.flatten(0, len(dims) - 1).unbind(0)
         formula = ARITHMETIC[FOLDS[name]]
@@ -264,10 +265,10 @@ class Recorder(TorchDispatchMode):
         return self._stated(formula, [self._numbers(value, table.dtype)])
 
     def _table(self, table: Tensor) -> str:
-        places = [i for i, known in enumerate(self.tables) if known is table]
-        if not places:
+        """Return the name of a table, by which a statement reads it."""
+        if not any(known is table for known in self.tables):
             self.tables.append(table)
-        return f"t{places[0] if places else len(self.tables) - 1}"
+        return f"t{[known is table for known in self.tables].index(True)}"
 
 
 class Rowwise:
@@ -326,7 +327,7 @@ def translated(
     examples = [example.clone() for example in examples]
     for place, example in enumerate(examples):
         columns = range(example.shape[-1])
-        variables = [recorder.state(f"x{place}[row, {column}]", ()) for column in columns]
+        variables = [recorder.variable(f"x{place}[row, {column}]", ()) for column in columns]
         recorder.add(example, torch.tensor(variables).reshape(1, -1))
     with torch.no_grad(), recorder:
         results = function(*examples)

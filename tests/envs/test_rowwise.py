@@ -55,6 +55,7 @@ def test_a_translated_function_gives_what_torch_gives(name) -> None:
         lambda x, n: (x if x.sum() > 0.0 else -x,),  # another graph for other numbers
         lambda x, n: (torch.div(x, 2.0, rounding_mode="floor"),),
         lambda x, n: (x.half(),),
+        lambda x, n: (torch.rsub(x, 1.0, alpha=2.0),),
         lambda x, n: (x.gather(-1, n),),  # no constant to read from
         lambda x, n: (x.clone().mul_(2.0),),  # changes what it is given
     ],
