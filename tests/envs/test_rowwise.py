@@ -14,6 +14,7 @@ PLACES = torch.tensor([3, 0, 2])
 FUNCTIONS = {
     "arithmetic": lambda x, n: (x * 2.0 - x / (x.abs() + 1.0)).neg() + 3 - 1.0 / (x * x + 1.0),
     "functions": lambda x, n: x.abs().log() + x.exp() * x.sin() + x.tanh() - x.abs().rsqrt(),
+    "normal": lambda x, n: torch.special.ndtri(n * 0.2 + 0.1),
     "powers": lambda x, n: x**2 + x.abs() ** 1.7 + x.square().sqrt(),
     "clamp": lambda x, n: x.clamp(-0.5, 0.5) + x.clamp(min=0.0) + torch.minimum(x, x.flip(-1)),
     "choice": lambda x, n: torch.where((x > 0.0) & ~(n == 2), x, 0.1 * n),

@@ -46,7 +46,8 @@ def test_gymnasium_accepts_it(env) -> None:
     [
         ("alcc", [], True),
         ("reference", ["scenario.string=automated human*2", "+filter=cbf"], True),
-        ("alcc", ["scenario.controllers.human.wiener=0.1"], False),
+        ("alcc", ["scenario.controllers.human.wiener=0.1"], True),
+        ("alcc", ["scenario.string={size: 3, penetration: 0.3}"], False),  # places are drawn
     ],
 )
 def test_whole_episodes_are_those_of_the_torchrl_environment(
