@@ -11,17 +11,20 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from tensordict import TensorDictBase
 
+from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.envs.factory import make_env
+from lcc_rl.envs.rowwise import Array
+from lcc_rl.errors import ConfigError
 
 VARIANTS = ("alcc", "reference", "own_energy")
-TERMS = "reward_terms"
-Array = np.ndarray[Any, Any]
+TERMS, MASK = "reward_terms", "reset_mask"
+LARGEST = 1e6  # beyond every speed [m/s], gap [m] and time [s] of a string, scaled
+FIRST = np.zeros(1, np.int64)  # the place of the only episode
 
 
 def register() -> None:
@@ -36,13 +39,10 @@ def register() -> None:
             )
 
 
-def _spaces(size: int) -> tuple[Box, Box]:
-    """Return the spaces of observation (unbounded) and action (a share of 3 m/s²)."""
-    return Box(-np.inf, np.inf, (size,), np.float32), Box(-1.0, 1.0, (1,), np.float32)
-
-
-def _terms(td: TensorDictBase) -> dict[str, Array]:
-    return {str(name): value.squeeze(-1).numpy() for name, value in td.get(TERMS).items()}
+def _spaces(episodes: ArrayEpisodes) -> tuple[Box, Box]:
+    """Return the spaces of observation and action (a share of 3 m/s²)."""
+    shape = episodes.observation.shape[1:]
+    return Box(-LARGEST, LARGEST, shape, np.float32), Box(-1.0, 1.0, (1,), np.float32)
 
 
 class CarFollowing(gymnasium.Env[Array, Array]):
@@ -71,38 +71,41 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         held_out: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        self.env = make_env(variant, (), overrides, held_out=held_out, single=True)
-        size = self.env.observation_spec["observation"].shape[-1]
-        self.observation_space, self.action_space = _spaces(size)
-        self.render_mode = render_mode
-        self._td: TensorDictBase | None = None
+        env = make_env(variant, 1, overrides, held_out=held_out, single=True)
+        self.episodes, self.render_mode = ArrayEpisodes(env), render_mode
+        self.observation_space, self.action_space = _spaces(self.episodes)
+        self.running = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode; with a seed, the same series of episodes as ever with it."""
+        """Begin an episode; with a seed, the same series of episodes as ever with it.
+
+        Args:
+            seed: of the series; None: the next episode of the series.
+            options: see :meth:`lcc_rl.envs.arrays.ArrayEpisodes.reset`.
+        """
         super().reset(seed=seed)
-        if seed is not None:
-            self.env.set_seed(seed)
-        self._td = self.env.reset()
-        return self._td["observation"].numpy(), {}
+        observation = self.episodes.reset(FIRST, [seed], options)[0]
+        self.running = True
+        return observation, {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Play one step."""
-        if self._td is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        given = torch.as_tensor(np.asarray(action), dtype=torch.float32)
-        after = self.env.step(self._td.set("action", given))["next"]
-        self._td = after.exclude("reward", TERMS)
-        ends = bool(after["terminated"]), bool(after["truncated"])
-        info = {TERMS: {name: float(value) for name, value in _terms(after).items()}}
-        return after["observation"].numpy(), float(after["reward"]), *ends, info
+        if not self.running:
+            raise ResetNeeded("call reset before the first step, and after the last of an episode")
+        results = self.episodes.step(np.asarray(action)[np.newaxis])
+        reward, terminated, truncated, *terms = results[0].tolist()
+        self.running = not (terminated or truncated)
+        info = {TERMS: dict(zip(self.episodes.terms, terms, strict=True))}
+        return self.episodes.observation[0], reward, bool(terminated), bool(truncated), info
 
 
 class CarFollowingVector(VectorEnv[Array, Array, Array]):
     """Episodes side by side in one batch; those that end begin anew in the same step.
 
-    ``info["final_obs"]`` holds the last observations where ``info["_final_obs"]`` is true.
+    Every place plays what a :class:`CarFollowing` of its seed plays. ``info["final_obs"]`` holds
+    the last observations where ``info["_final_obs"]`` is true.
 
     Args:
         num_envs: episodes side by side.
@@ -119,40 +122,58 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         held_out: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        self.env = make_env(variant, num_envs, overrides, held_out=held_out, single=True)
-        size = self.env.observation_spec["observation"].shape[-1]
-        self.single_observation_space, self.single_action_space = _spaces(size)
+        env = make_env(variant, num_envs, overrides, held_out=held_out, single=True)
+        self.episodes = ArrayEpisodes(env)
+        self.single_observation_space, self.single_action_space = _spaces(self.episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._td: TensorDictBase | None = None
+        self.running = np.zeros(num_envs, np.bool_)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin all episodes; one seed for all of them."""
-        if isinstance(seed, Sequence):
-            seed = seed[0]
-        super().reset(seed=seed)
-        if seed is not None:
-            self.env.set_seed(seed)
-        self._td = self.env.reset()
-        return self._td["observation"].numpy().copy(), {}
+        """Begin episodes.
+
+        Args:
+            seed: of the first place, one more for each further one; or the seed of each place,
+                None where its series is to go on.
+            options: see :meth:`lcc_rl.envs.arrays.ArrayEpisodes.reset`; besides, ``"reset_mask"``
+                says where episodes begin, by default everywhere.
+
+        Raises:
+            ConfigError: if seeds or mask do not fit the number of places.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        options, count = dict(options or {}), self.num_envs
+        mask = np.asarray(options.pop(MASK, np.ones(count, np.bool_)))
+        if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+            raise ConfigError(f"{MASK} must be {count} truth values, one true, got {mask}")
+        seeds = [seed + i for i in range(count)] if isinstance(seed, int) else seed
+        if seeds is not None and len(seeds) != count:
+            raise ConfigError(f"seed must be a number or a list of {count}, got {seed}")
+        observation = self.episodes.reset(np.flatnonzero(mask), seeds, options)
+        self.running |= mask
+        return observation, {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Play one step of every episode."""
-        if self._td is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        given = torch.as_tensor(np.asarray(actions), dtype=torch.float32)
-        data, self._td = self.env.step_and_maybe_reset(self._td.set("action", given))
-        after = data["next"]
-        done = after["done"].squeeze(-1).numpy()
-        info: dict[str, Any] = {TERMS: _terms(after)}
+        if not self.running.all():
+            raise ResetNeeded("call reset before step")
+        results = self.episodes.step(actions)
+        observation = self.episodes.observation
+        ends = results[:, 1:3] > 0.0
+        done = ends.any(1)
+        info: dict[str, Any] = {
+            TERMS: dict(zip(self.episodes.terms, results[:, 3:].T, strict=True))
+        }
         if done.any():
-            info |= {"final_obs": after["observation"].numpy(), "_final_obs": done}
-        observation = self._td["observation"].numpy().copy()
-        flat = (after[name].squeeze(-1).numpy() for name in ("reward", "terminated", "truncated"))
-        return observation, *flat, info
+            info |= {"final_obs": observation, "_final_obs": done}
+            observation = self.episodes.reset(np.flatnonzero(done))
+        return observation, results[:, 0], ends[:, 0], ends[:, 1], info
 
 
 register()

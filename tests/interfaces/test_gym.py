@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 import lcc_rl
+from lcc_rl.envs.arrays import ArrayEpisodes
+from lcc_rl.errors import LccError
+from lcc_rl.pieces.base import SEED
 
 gymnasium = pytest.importorskip("gymnasium", reason="extra interfaces")
 
@@ -14,7 +20,9 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 import lcc_rl.interfaces.gym  # noqa: E402
 
-SHORT = ["scenario.horizon=20", "data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
+DATA = ["data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
+SHORT = [*DATA, "scenario.horizon=20"]
+STILL = np.zeros((3, 1), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -22,43 +30,125 @@ def env():
     return gymnasium.make("lcc_rl/alcc-v0", overrides=SHORT)
 
 
-@pytest.mark.filterwarnings("ignore:.*Box.*:UserWarning", "ignore:.*spec.*:UserWarning")
+@pytest.fixture(scope="module")
+def many():
+    return gymnasium.make_vec("lcc_rl/alcc-v0", num_envs=3, overrides=SHORT)
+
+
 def test_gymnasium_accepts_it(env) -> None:
-    check_env(env.unwrapped, skip_render_check=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True)
 
 
-def test_an_episode_is_that_of_the_torchrl_environment(env) -> None:
-    own = lcc_rl.make_env("alcc", (), SHORT)
-    own.set_seed(7)
-    td = own.reset()
-    seen, _ = env.reset(seed=7)
-    rng = np.random.default_rng(0)
-    for step in range(20):
-        np.testing.assert_array_equal(seen, td["observation"].numpy())
-        action = rng.uniform(-1, 1, 1).astype(np.float32)
-        seen, reward, terminated, truncated, info = env.step(action)
+@pytest.mark.parametrize(
+    ("variant", "overrides", "translated"),
+    [
+        ("alcc", [], True),
+        ("reference", ["scenario.string=automated human*2", "+filter=cbf"], True),
+        ("alcc", ["scenario.controllers.human.wiener=0.1"], True),
+        ("alcc", ["scenario.string={size: 3, penetration: 0.3}"], False),  # places are drawn
+    ],
+)
+def test_whole_episodes_are_those_of_the_torchrl_environment(
+    variant, overrides, translated
+) -> None:
+    count, overrides = 8, [*DATA, *overrides]
+    own = lcc_rl.make_env(variant, count, overrides)
+    episodes = ArrayEpisodes(lcc_rl.make_env(variant, count, overrides))
+    assert episodes.advance.translated == translated
+    seen = episodes.reset(np.arange(count), range(count))
+    td = own.reset(TensorDict({SEED: torch.as_tensor(episodes.state[:, :1]).long()}, [count]))
+    rng, running = np.random.default_rng(0), np.ones(count, bool)
+    for _ in range(300):
+        np.testing.assert_allclose(seen[running], td["observation"][running], atol=1e-5)
+        action = rng.uniform(-0.5, 0.3, (count, 1)).astype(np.float32)
+        results, seen = episodes.step(action), episodes.observation
         td = own.step(td.set("action", torch.as_tensor(action)))["next"]
-        assert reward == pytest.approx(float(td["reward"]))
-        assert sum(info["reward_terms"].values()) == pytest.approx(reward, abs=1e-4)
-        if terminated:
-            break
-        assert truncated == (step == 19)
+        terms = [td["reward_terms", name] for name in episodes.terms]
+        found = torch.cat([td["reward"], td["terminated"], td["truncated"], *terms], -1)
+        np.testing.assert_allclose(results[running], found[running], atol=1e-5)
+        running &= ~td["terminated"].squeeze(-1).numpy()
         td = td.exclude("reward", "reward_terms")
+    assert running.sum() >= 2
+    assert td["done"].all()
 
 
-def test_the_vector_begins_anew_in_the_same_step_and_hands_over_the_last_observation() -> None:
-    env = gymnasium.make_vec("lcc_rl/reference-v0", num_envs=3, overrides=SHORT)
-    first, _ = env.reset(seed=3)
-    again, _ = env.reset(seed=3)
-    np.testing.assert_array_equal(first, again)
-    assert env.observation_space.shape == (3, 4)
-    for step in range(20):
-        seen, reward, terminated, truncated, info = env.step(np.zeros((3, 1), np.float32))
-        assert reward.shape == (3,)
-        assert ("final_obs" in info) == bool((terminated | truncated).any())
-        assert truncated[~terminated].all() == (step == 19)
-    assert info["_final_obs"].all()
-    assert not np.array_equal(seen, info["final_obs"])
+def test_a_place_of_the_vector_plays_what_one_environment_of_its_seed_plays(env, many) -> None:
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (45, 3, 1)).astype(np.float32)
+    first, _ = many.reset(seed=3)
+    together = [many.step(each) for each in actions]
+    for place in range(3):
+        seen, _ = env.reset(seed=3 + place)
+        np.testing.assert_array_equal(first[place], seen)
+        for given, (after, rewards, *_, info) in zip(actions[:, place], together, strict=True):
+            seen, reward, terminated, truncated, own = env.step(given)
+            assert reward == rewards[place]
+            assert sum(own["reward_terms"].values()) == pytest.approx(reward, abs=1e-4)
+            assert ("final_obs" in info and info["_final_obs"][place]) == (terminated or truncated)
+            if terminated or truncated:
+                np.testing.assert_array_equal(info["final_obs"][place], seen)
+                seen, _ = env.reset()
+            np.testing.assert_array_equal(after[place], seen)
+
+
+def test_seeds_masks_and_options_take_effect(env, many) -> None:
+    first, _ = many.reset(seed=[3, 4, 3])
+    np.testing.assert_array_equal(first[0], first[2])
+    moved, *_ = many.step(STILL)
+    only_one = {"reset_mask": np.array([False, True, False])}
+    again, _ = many.reset(seed=[None, 3, None], options=only_one)
+    np.testing.assert_array_equal(again[1], first[0])
+    np.testing.assert_array_equal(again[0], moved[0])
+    other, _ = many.reset(options={"episode.seed": [5, 6, 5], "leader.profile": 1})
+    np.testing.assert_array_equal(other[0], other[2])
+    options = {"episode.seed": 5, "leader.profile": 1, "human.driver": 7}
+    seen, _ = env.reset(options=options)
+    own = lcc_rl.make_env("alcc", (), SHORT)
+    given = {tuple(name.split(".")): torch.tensor([value]) for name, value in options.items()}
+    given["human", "driver"] = given["human", "driver"].unsqueeze(-1)
+    np.testing.assert_array_equal(seen, own.reset(TensorDict(given, []))["observation"])
+
+
+def test_an_action_of_double_precision_changes_no_type(env, many) -> None:
+    for each, action in ((env, np.full(1, 0.3)), (many, np.full((3, 1), 0.3))):
+        seen = []
+        for given in (action, action.astype(np.float32)):
+            each.reset(seed=0)
+            seen.append(each.step(given)[0])
+        assert seen[0].dtype == np.float32
+        np.testing.assert_array_equal(*seen)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda one, many: many.reset(seed=[]), "seed must be a number or a list of 3"),
+        (lambda one, many: many.reset(options={"reset_mask": np.zeros(3, bool)}), "one true"),
+        (lambda one, many: many.reset(options={"reset_mask": [0, 1, 1]}), "3 truth values"),
+        (lambda one, many: one.reset(options={"leader.profil": 1}), "leader.profil"),
+        (lambda one, many: one.reset(options={"leader.profile": 0.5}), "1 whole number"),
+        (lambda one, many: many.reset(options={"leader.start": [1, 2]}), "1 or 3 whole numbers"),
+        (lambda one, many: one.reset(options={"leader.profile": 10**6}), "must lie in 0…"),
+        (lambda one, many: many.step(np.zeros((2, 1))), r"must be \[3, 1\], got \[2, 1\]"),
+        (lambda one, many: many.step(STILL + np.nan), "automated.action is nan at step 1"),
+    ],
+)
+def test_what_cannot_take_effect_is_refused_in_one_line(env, many, call, message) -> None:
+    env.reset(seed=0)
+    many.reset(seed=0)
+    with pytest.raises(LccError, match=message) as error:
+        call(env, many)
+    assert "\n" not in str(error.value)
+
+
+def test_an_episode_that_has_ended_takes_no_further_step(env) -> None:
+    env.reset(seed=0)
+    while not any(env.step(STILL[0])[2:4]):
+        pass
+    with pytest.raises(gymnasium.error.ResetNeeded, match="after the last"):
+        env.step(STILL[0])
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from benchmarks.calibrate import calibrate
 from benchmarks.collect import collect
 from benchmarks.env import env
 from benchmarks.evaluate import evaluate
+from benchmarks.gym import gym
 from benchmarks.harness import EXTRA, Row, drawn, installed
 from benchmarks.loading import loading, start
 from benchmarks.read import read
@@ -36,7 +37,7 @@ from lcc_rl.io.memory import torch_device
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million, Parallel
 
-LISTED = (read, loading, start, env, collect, update, train, calibrate, evaluate)
+LISTED = (read, loading, start, env, gym, collect, update, train, calibrate, evaluate)
 NO_DEVICE = ("read", "loading", "start")  # always on the processor
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED

@@ -1,0 +1,163 @@
+"""Episodes side by side as arrays: what Gymnasium's environments step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from lcc_rl.envs.clock import reset_options
+from lcc_rl.envs.finite import ACTION, check_numbers
+from lcc_rl.envs.rowwise import Array, Rowwise
+from lcc_rl.envs.step import TERMINATED, TRUNCATED, Step, closure, entries, pieces_of
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform, as_key
+from lcc_rl.pieces.observation import OBSERVATION
+from lcc_rl.pieces.rewards import REWARD, TERMS, TotalReward
+
+SEEN = (AUTOMATED, OBSERVATION)
+
+
+class ArrayEpisodes:
+    """Episodes of one automated vehicle, stepped as rows of arrays by :class:`Rowwise`.
+
+    Everything random in an episode follows from its seed; each place draws the seeds of its
+    episodes from a generator of its own, as an environment of one episode does.
+
+    Args:
+        env: an environment in the view of one automated vehicle, ``[n]`` episodes.
+
+    Attributes:
+        terms: names of the terms of the reward.
+        observation: the observations, ``[n, entries]``, float32; never written to.
+    """
+
+    def __init__(self, env: TransformedEnv) -> None:
+        self.env, self.count = env, env.batch_size.numel()
+        pieces = closure(pieces_of(env), {SEEN, REWARD, TERMINATED, TRUNCATED})
+        self.one_step = Step(pieces, env.base_env.horizon)
+        totals = [piece for piece in pieces if isinstance(piece, TotalReward)]
+        self.terms = [str(name) for name in totals[-1].terms]
+        self.written = [REWARD, TERMINATED, TRUNCATED, *((*TERMS, name) for name in self.terms)]
+        first, seed = self._first(pieces), torch.zeros(1, 1, dtype=torch.int64)
+        self.advance = Rowwise(self._advance, (self._packed(first), torch.zeros(1, 1)), "a step")
+        self.begin = Rowwise(self._begin, (seed,), "a reset")
+        self.generators = [torch.Generator() for _ in range(self.count)]
+        for generator in self.generators:
+            generator.seed()  # at random, until a reset gives a seed
+        self.observation = np.zeros((self.count, first[SEEN].shape[-1]), np.float32)
+        self.state = np.zeros((self.count, sum(self.sizes)))
+
+    def _first(self, pieces: Sequence[Any]) -> State:
+        """Return the first moment of an episode, and choose what a step reads of a moment."""
+        with torch.no_grad():
+            first = self.one_step.begin(torch.zeros(1, 1, dtype=torch.int64))
+        read: set[Key] = {SEED, STEP}
+        for piece in pieces:
+            if isinstance(piece, StepTransform):
+                read |= {key for late, key in piece.needs if not late} | set(piece.constants)
+        self.keys = [key for key in first if key in read]
+        self.types = [(first[key].shape[1:], first[key].dtype) for key in self.keys]
+        self.sizes = [shape.numel() for shape, _ in self.types]
+        self.step_column = sum(self.sizes[: self.keys.index(STEP)])
+        return first
+
+    def _packed(self, moment: State) -> Tensor:
+        """Return what a step reads as rows of numbers; double ones also hold a seed exactly."""
+        return torch.cat([moment[key].flatten(1).double() for key in self.keys], 1)
+
+    def _advance(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return state, observation and what :meth:`step` returns, after a step."""
+        columns = zip(self.keys, self.types, state.split(self.sizes, 1), strict=True)
+        before = {key: x.to(dtype).reshape(-1, *shape) for key, (shape, dtype), x in columns}
+        before[ACTION] = action.unsqueeze(1)
+        reached = self.one_step(before)
+        seen = reached[SEEN].flatten(1)
+        results = [reached[key].flatten(1).to(seen.dtype) for key in self.written]
+        total = seen.sum(1, keepdim=True) + results[0]
+        finite = (total - total == 0.0).to(seen.dtype)  # neither infinity nor NaN is
+        return self._packed(reached), seen, torch.cat([*results, finite], 1)
+
+    def _begin(self, seeds: Tensor) -> tuple[Tensor, Tensor]:
+        """Return state and observation at the beginning of episodes."""
+        first = self.one_step.begin(seeds)
+        return self._packed(first), first[SEEN].flatten(1)
+
+    def reset(
+        self,
+        places: Array,
+        seeds: Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> Array:
+        """Begin new episodes in some places.
+
+        Args:
+            places: numbers of the places.
+            seeds: for the generator of every place of the batch; None where it goes on.
+            options: by the dotted names of the environment's reset options, ``"leader.profile"``:
+                a whole number for all episodes, or those of every episode of the batch.
+
+        Returns:
+            The observations of all places.
+
+        Raises:
+            ConfigError: naming the option that does not exist, or its range.
+        """
+        for place in places if seeds is not None else ():
+            if (seed := seeds[place]) is not None:  # type: ignore[index]
+                self.generators[place].manual_seed(seed)
+        drawn = [torch.randint(2**31, (1, 1), generator=self.generators[i]) for i in places]
+        if options:
+            every = torch.zeros(self.count, 1, dtype=torch.int64)
+            every[places] = torch.cat(drawn)
+            moment = entries(self.env.reset(self._given(every, options)))
+            state, seen = self._packed(moment)[places].numpy(), moment[OBSERVATION,][places].numpy()
+        else:
+            state, seen = self.begin(torch.cat(drawn).numpy())
+        self.state, self.observation = self.state.copy(), self.observation.copy()
+        self.state[places], self.observation[places] = state, seen
+        return self.observation
+
+    def _given(self, seeds: Tensor, options: Mapping[str, Any]) -> TensorDict:
+        """Return seeds and reset options as the TorchRL environment takes them."""
+        given, specs = TensorDict({SEED: seeds}, [self.count]), reset_options(self.env)
+        for name, value in options.items():
+            if (spec := specs.get(as_key(name))) is None:
+                raise unknown_name("reset option", name, [".".join(key) for key in specs])
+            array, size = np.asarray(value), spec.shape.numel()
+            if array.dtype.kind not in "iu" or array.size not in (1, size):
+                raise ConfigError(f"reset: {name} must be 1 or {size} whole numbers, got {value!r}")
+            whole = torch.as_tensor(array.astype(np.int64)).flatten()
+            given.set(as_key(name), whole.expand(size).reshape(spec.shape).clone())
+        return given
+
+    def step(self, actions: Array) -> Array:
+        """Take every episode a step further, also those that have ended.
+
+        Args:
+            actions: ``[n, 1]``, in [−1, 1].
+
+        Returns:
+            ``[n, 3 + terms]``, float32: reward, terminated, truncated and the terms of the reward.
+
+        Raises:
+            ConfigError: if the actions have another shape.
+            Diverged: if an action, an observation or a reward is not a finite number.
+        """
+        given = np.ascontiguousarray(actions, np.float32)
+        if given.shape != (self.count, 1):
+            raise ConfigError(f"actions must be {[self.count, 1]}, got {list(given.shape)}")
+        self.state, self.observation, results = self.advance(self.state, given)
+        if not results[:, -1].all():
+            named: dict[Key, Array] = {ACTION: given, SEEN: self.observation}
+            named[REWARD] = results[:, :1]
+            numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
+            step = int(self.state[:, self.step_column].max())
+            check_numbers(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
+        return results[:, :-1]

@@ -1,0 +1,230 @@
+"""Records operations on tensors as statements on single numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+MOST_STATEMENTS = 4000  # numba takes 2 to 4 s for each thousand
+
+TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
+# Formulas of operations by their names in torch; numbers are {0}, {1}, …
+ARITHMETIC = {
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "rsub": "{1} - {0}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "abs": "abs({0})",
+    "reciprocal": "f32(1) / {0}",
+    "sqrt": "np.sqrt({0})",
+    "rsqrt": "f32(1) / np.sqrt({0})",
+    "exp": "np.exp({0})",
+    "log": "np.log({0})",
+    "sin": "np.sin({0})",
+    "atanh": "np.arctanh({0})",
+    "tanh": "np.tanh({0})",
+    "special_ndtri": "f32(ndtri({0}))",
+    "pow": "{0} ** {1}",
+    "lerp": "{0} + {2} * ({1} - {0})",
+    # What is not a number stays so, as in torch.
+    "maximum": "pick(({0} > {1}) | ({0} != {0}), {0}, {1})",
+    "minimum": "pick(({0} < {1}) | ({0} != {0}), {0}, {1})",
+    "bitwise_and": "{0} & {1}",
+    "bitwise_or": "{0} | {1}",
+    "bitwise_xor": "{0} ^ {1}",
+    "__rshift__": "{0} >> {1}",
+    "logical_and": "{0} & {1}",
+    "logical_or": "{0} | {1}",
+    "logical_not": "{0} == 0",
+    "_to_copy": "{0}",
+}
+COMPARISONS = {
+    "gt": "{0} > {1}",
+    "ge": "{0} >= {1}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+}
+OTHERS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
+FOLDS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
+# They move entries, whatever these are, and are applied to the numbers of the variables.
+MOVES = {
+    "_unsafe_view", "alias", "cat", "clone", "detach", "expand", "flip", "permute", "repeat",
+    "select", "slice", "split", "split_with_sizes", "squeeze", "stack", "t", "transpose", "unbind",
+    "unsqueeze", "view",
+}  # fmt: skip
+# They take no more than the shape of what they are given.
+SHAPES = {"zeros_like", "ones_like", "full_like", "empty_like", "new_zeros", "new_ones", "new_full"}
+
+
+class Untranslatable(Exception):
+    """An operation has no counterpart on single numbers."""
+
+
+class Recorder(TorchDispatchMode):
+    """Records operations on tensors as statements on numbers.
+
+    Every entry of a tensor that depends on the inputs is a variable; of such a tensor the numbers
+    of its variables are kept, in a tensor of the same shape. All other tensors are constants.
+
+    Attributes:
+        statements: the expression of each variable, and the variables that it reads.
+        tables: constants that are read at a place that depends on the inputs.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.statements: list[tuple[str, tuple[int, ...]]] = []
+        self.known: dict[tuple[str, tuple[int, ...]], int] = {}
+        self.variables: dict[int, tuple[Tensor, Tensor]] = {}  # by the id of the tensor
+        self.tables: list[Tensor] = []
+
+    def add(self, tensor: Tensor, variables: Tensor) -> None:
+        """Say of which variables a tensor consists."""
+        self.variables[id(tensor)] = (tensor, variables)  # kept, so that its id stays its own
+
+    def of(self, value: Any) -> Tensor | None:
+        """Return the variables of a tensor; None for a constant."""
+        found = self.variables.get(id(value))
+        return None if found is None else found[1]
+
+    def variable(self, expression: str, reads: tuple[int, ...]) -> int:
+        """Return the variable with the value of an expression, ``{0}`` for the first one read."""
+        statement = (expression, reads)
+        if statement not in self.known:
+            self.known[statement] = len(self.statements)
+            self.statements.append(statement)
+            if len(self.statements) > MOST_STATEMENTS:
+                raise Untranslatable(f"it takes more than {MOST_STATEMENTS} statements")
+        return self.known[statement]
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        result = func(*args, **kwargs)
+        name = func.overloadpacket.__name__
+        given = [part for x in args for part in (x if isinstance(x, (list, tuple)) else [x])]
+        if name in SHAPES or all(self.of(x) is None for x in given):
+            return result
+        if name in MOVES:
+            self._move(func, args, kwargs, result)
+        elif name in OTHERS:
+            self.add(result, getattr(self, f"_{name}")(result, *args, **kwargs))
+        elif name in FOLDS:
+            self.add(result, self._fold(name, result, *args, **kwargs))
+        elif name == "_to_copy" or (name in {*ARITHMETIC, *COMPARISONS} and not kwargs):
+            self.add(result, self._each(name, result.dtype, *given))
+        else:
+            raise Untranslatable(str(func))
+        return result
+
+    def _each(self, name: str, dtype: torch.dtype, *values: Any) -> Tensor:
+        """Record an operation on single entries."""
+        if name in COMPARISONS:
+            dtype = torch.result_type(*values)
+        formula = COMPARISONS.get(name) or ARITHMETIC[name]
+        if f"{{{len(values) - 1}}}" not in formula:
+            raise Untranslatable(f"{name} of {len(values)} arguments")
+        return self._stated(formula, [self._numbers(x, dtype) for x in values])
+
+    def _stated(self, formula: str, parts: Sequence[Tensor]) -> Tensor:
+        """Record a formula for every entry of variables; return the variables of the results."""
+        parts = torch.broadcast_tensors(*parts)
+        rows = zip(*(part.flatten().tolist() for part in parts), strict=True)
+        found = [self.variable(formula, row) for row in rows]
+        return torch.tensor(found, dtype=torch.int64).reshape(parts[0].shape)
+
+    def _numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
+        """Return the variables of a value as numbers of a type."""
+        if (kind := TYPES.get(dtype)) is None:
+            raise Untranslatable(f"numbers of {dtype}")
+        variables = self.of(value)
+        if variables is not None:
+            same = value.dtype == dtype
+            return variables if same else self._stated(f"{kind}({{0}})", [variables])
+        value = torch.as_tensor(value, dtype=dtype)
+        literals = [self.variable(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
+        return torch.tensor(literals, dtype=torch.int64).reshape(value.shape)
+
+    def _move(self, func: Any, args: tuple[Any, ...], kwargs: Any, result: Any) -> None:
+        results = (result,) if isinstance(result, Tensor) else result
+        dtype = results[0].dtype
+
+        def moved(value: Any) -> Any:
+            if isinstance(value, (list, tuple)):
+                return [moved(part) for part in value]
+            return self._numbers(value, dtype) if isinstance(value, Tensor) else value
+
+        found = func(*moved(args), **kwargs)
+        parts = (found,) if isinstance(found, Tensor) else found
+        for tensor, variables in zip(results, parts, strict=True):
+            self.add(tensor, variables)
+
+    def _fold(
+        self, name: str, result: Tensor, value: Tensor, dims: Any = None, *keep: Any, **more: Any
+    ) -> Tensor:
+        dims = [dims] if isinstance(dims, int) else dims or list(range(value.ndim))
+        variables = self._numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
+        parts = variables.flatten(0, len(dims) - 1).unbind(0)
+        formula = ARITHMETIC[FOLDS[name]]
+        return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
+
+    def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:
+        return self._each("bitwise_xor", result.dtype, value, -1)
+
+    def _where(self, result: Tensor, condition: Tensor, *values: Any) -> Tensor:
+        parts = [self._numbers(x, result.dtype) for x in values]
+        return self._stated("pick({0}, {1}, {2})", [self._numbers(condition, torch.bool), *parts])
+
+    def _clamp(self, result: Tensor, value: Tensor, low: Any = None, high: Any = None) -> Tensor:
+        variables = self._numbers(value, result.dtype)
+        for bound, order in ((low, "<"), (high, ">")):
+            if bound is not None:
+                parts = [variables, self._numbers(bound, result.dtype)]
+                variables = self._stated(f"pick({{0}} {order} {{1}}, {{1}}, {{0}})", parts)
+        return variables
+
+    def _index(self, result: Tensor, value: Tensor, places: Sequence[Tensor | None]) -> Tensor:
+        variables = self.of(value)
+        if variables is None:
+            return self._read(result, value, places)
+        if any(self.of(place) is not None for place in places):
+            raise Untranslatable("an index that depends on the inputs, into what does, too")
+        return variables[tuple(slice(None) if x is None else x for x in places)]
+
+    def _read(self, result: Tensor, table: Tensor, places: Sequence[Tensor | None]) -> Tensor:
+        """Record reading a constant at places that depend on the inputs."""
+        if any(place is None for place in places):
+            raise Untranslatable("an index that is not of the first dimensions")
+        inner = table.shape[len(places) :]
+        outer = torch.broadcast_tensors(*(self._numbers(x, torch.int64) for x in places))
+        parts = [x.reshape(*x.shape, *[1] * len(inner)) for x in outer]
+        for axis, size in enumerate(inner):
+            each = self._numbers(torch.arange(size), torch.int64)
+            parts.append(each.reshape(size, *[1] * (len(inner) - 1 - axis)))
+        where = ", ".join(f"{{{i}}}" for i in range(len(parts)))
+        return self._stated(f"read({self._table(table)}, ({where},))", parts)
+
+    def _searchsorted(
+        self, result: Tensor, table: Tensor, value: Tensor, right: bool = False, **more: Any
+    ) -> Tensor:
+        if more or table.ndim != 1 or self.of(table) is not None:
+            raise Untranslatable("a search in what is not one constant list")
+        side = "right" if right else "left"
+        formula = f"i64(np.searchsorted({self._table(table)}, {{0}}, '{side}'))"
+        return self._stated(formula, [self._numbers(value, table.dtype)])
+
+    def _table(self, table: Tensor) -> str:
+        """Return the name of a table, by which a statement reads it."""
+        if not any(known is table for known in self.tables):
+            self.tables.append(table)
+        return f"t{[known is table for known in self.tables].index(True)}"

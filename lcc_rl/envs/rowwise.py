@@ -1,0 +1,150 @@
+"""Functions of tensors as loops over rows of numbers, in machine code.
+
+An operation on a tensor costs torch some microseconds, however small the tensor. A step of one
+episode is about 300 operations on one row; as statements on single numbers it takes a few
+microseconds. The statements are not written anywhere: they are recorded from the function itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numba.core.errors import NumbaError
+from numba.extending import get_cython_function_address
+from torch import Tensor
+
+from lcc_rl.envs.recorder import Recorder, Untranslatable
+
+log = logging.getLogger("lcc_rl")
+
+Array = np.ndarray[Any, Any]
+TensorFunction = Callable[..., Sequence[Tensor]]
+
+
+@numba.njit
+def pick(condition: Any, one: Any, other: Any) -> Any:
+    """Return one of two numbers; as a function, so that the loop has no branches."""
+    return one if condition else other
+
+
+@numba.njit(boundscheck=True)
+def read(table: Any, place: Any) -> Any:
+    """Return an entry of a table.
+
+    Raises:
+        IndexError: if there is none at that place.
+    """
+    return table[place]
+
+
+NAMES = {
+    "pick": pick,
+    "read": read,
+    "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
+        get_cython_function_address("scipy.special.cython_special", "ndtri")
+    ),
+    "f32": np.float32,
+    "f64": np.float64,
+    "i64": np.int64,
+    "flag": np.bool_,
+    "np": np,
+    "inf": np.inf,
+    "nan": np.nan,
+}
+
+
+class Rowwise:
+    """A function of rows of numbers, computed row by row in machine code.
+
+    If an operation of the function has no counterpart on single numbers, the function itself is
+    called, with tensors.
+
+    Args:
+        function: maps tensors ``[n, width]`` to tensors ``[n, width]``; rows do not mix.
+        examples: a row of each argument, ``[1, width]``.
+        what: its name in the line of the log that says that it is not translated.
+
+    Attributes:
+        translated: whether it runs as machine code.
+    """
+
+    def __init__(self, function: TensorFunction, examples: Sequence[Tensor], what: str) -> None:
+        self.function = function
+        with torch.no_grad():
+            results = function(*examples)
+        self.widths = [(x.shape[-1], x.numpy().dtype) for x in results]
+        try:
+            self.kernel, self.tables = translated(function, examples)
+            self.translated = True
+            self(*(x.numpy() for x in examples))
+        except (Untranslatable, NumbaError) as error:
+            log.info("%s runs by tensors: %s", what, str(error).strip().splitlines()[0])
+            self.translated = False
+
+    def __call__(self, *arguments: Array) -> tuple[Array, ...]:
+        """Return the results of all rows, arrays ``[n, width]``.
+
+        Args:
+            *arguments: arrays ``[n, width]`` of the types of the examples.
+        """
+        if self.translated:
+            count = len(arguments[0])
+            results = tuple([np.empty((count, width), dtype) for width, dtype in self.widths])
+            self.kernel(*arguments, *results, *self.tables)
+            return results
+        with torch.no_grad():
+            tensors = self.function(*(torch.from_numpy(x) for x in arguments))
+        return tuple(x.numpy() for x in tensors)
+
+
+def translated(
+    function: TensorFunction, examples: Sequence[Tensor]
+) -> tuple[Callable[..., None], list[Array]]:
+    """Return a function as machine code, and the tables that are its last arguments.
+
+    Raises:
+        Untranslatable: naming the operation that has no counterpart on single numbers.
+    """
+    recorder = Recorder()
+    examples = [example.clone() for example in examples]
+    for place, example in enumerate(examples):
+        columns = range(example.shape[-1])
+        variables = [recorder.variable(f"x{place}[row, {column}]", ()) for column in columns]
+        recorder.add(example, torch.tensor(variables).reshape(1, -1))
+    with torch.no_grad(), recorder:
+        results = function(*examples)
+    outputs = [recorder._numbers(x, x.dtype).flatten().tolist() for x in results]
+    needed = {variable for output in outputs for variable in output}
+    for variable in reversed(range(len(recorder.statements))):
+        if variable in needed:
+            needed |= set(recorder.statements[variable][1])
+    lines = [
+        f"v{i} = " + expression.format(*(f"v{x}" for x in reads))
+        for i, (expression, reads) in enumerate(recorder.statements)
+        if i in needed
+    ]
+    lines += [
+        f"y{place}[row, {column}] = v{variable}"
+        for place, output in enumerate(outputs)
+        for column, variable in enumerate(output)
+    ]
+    counts = (("x", examples), ("y", outputs), ("t", recorder.tables))
+    names = ", ".join(f"{name}{i}" for name, each in counts for i in range(len(each)))
+    body = "".join(f"        {line}\n" for line in lines)
+    source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
+    return compiled(source), [table.numpy() for table in recorder.tables]
+
+
+@cache
+def compiled(source: str) -> Callable[..., None]:
+    """Return a function as machine code; environments of the same settings share it."""
+    scope = dict(NAMES)
+    exec(source, scope)
+    return numba.njit(error_model="numpy")(scope["kernel"])

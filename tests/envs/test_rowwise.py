@@ -1,0 +1,75 @@
+"""Functions of rows of numbers in machine code give what torch gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from lcc_rl.envs.rowwise import Rowwise
+
+TABLE = torch.linspace(-1.0, 1.0, 12).reshape(4, 3)
+PLACES = torch.tensor([3, 0, 2])
+
+FUNCTIONS = {
+    "arithmetic": lambda x, n: (x * 2.0 - x / (x.abs() + 1.0)).neg() + 3 - 1.0 / (x * x + 1.0),
+    "functions": lambda x, n: x.abs().log() + x.exp() * x.sin() + x.tanh() - x.abs().rsqrt(),
+    "normal": lambda x, n: torch.special.ndtri(n * 0.2 + 0.1),
+    "powers": lambda x, n: x**2 + x.abs() ** 1.7 + x.square().sqrt(),
+    "clamp": lambda x, n: x.clamp(-0.5, 0.5) + x.clamp(min=0.0) + torch.minimum(x, x.flip(-1)),
+    "choice": lambda x, n: torch.where((x > 0.0) & ~(n == 2), x, 0.1 * n),
+    "lerp": lambda x, n: torch.lerp(x, n.float(), torch.tensor([0.1, 0.5, 0.9, 0.0])),
+    "not": lambda x, n: ~n + (~(x > 0.0)).logical_not(),
+    "bits": lambda x, n: ((n * 0x7EB352D ^ n >> 3) & 0xFFFF).float() * 2.0**-16,
+    "moves": lambda x, n: torch.cat([x[..., 1:], x[..., :1]], -1).unflatten(-1, (2, 2)).flatten(1),
+    "folds": lambda x, n: x.sum(-1, keepdim=True) * (x > 1.0).any(-1, keepdim=True),
+    "tables": lambda x, n: TABLE[n].sum(-2) + TABLE[:, 1][n][..., :3] - x[..., PLACES],
+    "search": lambda x, n: torch.searchsorted(TABLE[1], x[..., :3].contiguous()) + n[..., :3] * 0.5,
+    "truth": lambda x, n: (x > 0.0) * x + (x <= 0.0).to(x.dtype) + (x > 0.0).double(),
+}
+
+
+def examples(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(count, 4, generator=generator)
+    x[-1, 0] = torch.nan
+    return x, torch.randint(4, (count, 4), generator=generator)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_translated_function_gives_what_torch_gives(name) -> None:
+    def function(*given):
+        return (FUNCTIONS[name](*given),)
+
+    rows = Rowwise(function, examples(1), name)
+    assert rows.translated
+    given = examples(50)
+    (found,), (wanted,) = rows(*(x.numpy() for x in given)), function(*given)
+    assert found.dtype == wanted.numpy().dtype
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x, n: (x.sort(-1).values,),  # no such operation on numbers
+        lambda x, n: (x if x.sum() > 0.0 else -x,),  # another graph for other numbers
+        lambda x, n: (torch.div(x, 2.0, rounding_mode="floor"),),
+        lambda x, n: (x.half(),),
+        lambda x, n: (torch.rsub(x, 1.0, alpha=2.0),),
+        lambda x, n: (x.gather(-1, n),),  # no constant to read from
+        lambda x, n: (x.clone().mul_(2.0),),  # changes what it is given
+    ],
+)
+def test_what_has_no_translation_is_computed_by_tensors(function) -> None:
+    rows, given = Rowwise(function, examples(1), "a test"), examples(5)
+    assert not rows.translated
+    (found,), (wanted,) = rows(*(x.numpy() for x in given)), function(*given)
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_place_beyond_a_table_is_an_error() -> None:
+    rows = Rowwise(lambda n: (TABLE[:, 0][n],), [torch.zeros(1, 1, dtype=torch.int64)], "a test")
+    assert rows.translated
+    with pytest.raises(IndexError):
+        rows(np.array([[4]]))
