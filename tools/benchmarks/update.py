@@ -38,7 +38,12 @@ def update(options: Namespace) -> list[Row]:
     for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
         agent = kind(batch_size=batch).start(Scene(7, device=options.device))
         name = kind.__name__
-        own, plain, loss, other = f"{name}.update", f"plain {name}", f"TorchRL's {name}Loss", OTHER
+        own, plain, loss, other = (
+            f"{name}.update",
+            f"plain {name}",
+            f"TorchRL's {name}Loss",
+            f"{OTHER} {name}",
+        )
         slow = kind(batch_size=batch, fused=False).start(Scene(7, device=options.device))
         runs: dict[str, Run] = {
             own: times(count, own_update(agent, played)),
