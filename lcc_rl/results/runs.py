@@ -82,7 +82,8 @@ def read_settings(path: Path) -> dict[str, Any]:
     content = parse_yaml(read_text(path), str(path))
     for name in SECTIONS:
         if not isinstance(content.get(name, {}), Mapping):
-            raise ResultsError(f"{path}: damaged: {name} is {content[name]!r}; expected settings")
+            got = f"must be a mapping of settings, got {content[name]!r}"
+            raise ResultsError(f"{path}: damaged: {name} {got}")
     return content
 
 

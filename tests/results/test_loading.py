@@ -178,7 +178,7 @@ MOVED |= {"time_s": [0.1, 0.2], "cav_speed": [9.0, 9.0], "cav_gap": [20.0, 20.0]
         ({"strategy": ["idm"] * 2}, {}, r"a: not what a run writes: KeyError: 'training_seed'"),
         ({"a": [1]}, {}, r"a: not what a run writes: KeyError: 'strategy'"),
         (MOVED, {}, r"a: not what a run writes: KeyError: 'scenario'"),
-        (MOVED, {"scenario": "x"}, r"config\.yaml: damaged: scenario is 'x'"),
+        (MOVED, {"scenario": "x"}, r"config\.yaml: damaged: scenario must be a mapping .*'x'"),
         (MOVED, {"scenario": {"road": 3}}, r"a: not what a run writes: KeyError: 'string'"),
     ],
 )
