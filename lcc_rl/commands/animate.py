@@ -58,8 +58,7 @@ def run(
     steps = read_parquet(folder / STEPS)
     if steps.empty:
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
-    scenario = stored_config(folder)["scenario"]
-    with reading(folder / STEPS):
+    with reading(folder):
         names = list(dict.fromkeys(map(str, steps["strategy"])))
         strategy = names[-1] if strategy is None else strategy
         if strategy not in names:
@@ -68,7 +67,7 @@ def run(
         if not 0 <= episode < len(found):
             raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
         label, rows = list(found.items())[episode]
-        motion = _cut(motion_of(rows, scenario), start, duration)
+        motion = _cut(motion_of(rows, stored_config(folder)["scenario"]), start, duration)
     title = f"{in_words(strategy)}: {label}"
     default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
     return animate(motion, title, out or default)

@@ -8,12 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config.schemas import SECTIONS, BaseConfig, ScenarioConfig, as_plain, as_text
+from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_plain, as_text
 from lcc_rl.errors import ConfigError, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
-from lcc_rl.settings import parse
 
 log = logging.getLogger("lcc_rl")
 
@@ -70,18 +69,8 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
 
 
 def stored_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration of a run to draw by, not to build from: it may name any module.
-
-    Raises:
-        ResultsError: if it, or its scenario, is damaged.
-    """
-    path = folder / CONFIG
-    content = read_settings(path)
-    try:
-        parse(ScenarioConfig, content.get("scenario", {}), "scenario")
-    except ConfigError as error:
-        raise ResultsError(f"{path}: damaged: {error}") from error
-    return content
+    """Read the configuration of a run to draw by, not to build from: it may name any module."""
+    return read_settings(folder / CONFIG)
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -93,13 +82,14 @@ def read_settings(path: Path) -> dict[str, Any]:
     content = parse_yaml(read_text(path), str(path))
     for name in SECTIONS:
         if not isinstance(content.get(name, {}), Mapping):
-            raise ResultsError(f"{path}: damaged: {name} is {content[name]!r}; expected settings")
+            got = f"must be a mapping of settings, got {content[name]!r}"
+            raise ResultsError(f"{path}: damaged: {name} {got}")
     return content
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Name the table of a run whose rows are not what its reader expects.
+    """Name a run, or a table, whose rows or settings are not what their reader expects.
 
     Raises:
         ResultsError: instead of what pandas raises.

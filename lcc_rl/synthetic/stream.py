@@ -37,7 +37,7 @@ from lcc_rl.settings import Count, Settings, Share, given_as
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
-SAMPLE = 600  # bytes that a sample of a vehicle costs while the file is written and read back
+SAMPLE = 600  # bytes that a sample of a vehicle costs while the stream is made
 Duration = Annotated[float, Field(ge=1.0, le=36_000.0)]
 Range = Annotated[tuple[Duration, Duration], Field(strict=False)]
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]

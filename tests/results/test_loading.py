@@ -163,33 +163,23 @@ def test_a_folder_that_cannot_be_entered_is_named(open_folder, capsys, mode) -> 
         closed.chmod(0o700)
 
 
-SCENARIO = {
-    "name": "a",
-    "horizon": 9,
-    "time_step": 0.1,
-    "string": "automated human",
-    "road": "open",
-    "vehicle_length": 5.0,
-    "initial_speed": 0.0,
-    "controllers": {},
-    "start": {},
-    "filters": {},
-    "pieces": {},
+MOVED = {
+    "strategy": ["idm"] * 2,
+    "training_seed": [0, 0],
+    "profile": ["a"] * 2,
+    "driver_id": [1, 1],
 }
-GOOD = {"scenario": SCENARIO}
+MOVED |= {"time_s": [0.1, 0.2], "cav_speed": [9.0, 9.0], "cav_gap": [20.0, 20.0]}
 
 
 @pytest.mark.parametrize(
     ("steps", "settings", "message"),
     [
-        (
-            {"strategy": ["idm"] * 2},
-            GOOD,
-            r"steps\.parquet: not what a run writes: .*training_seed",
-        ),
-        ({"a": [1]}, GOOD, r"steps\.parquet: not what a run writes"),
-        ({"strategy": ["idm"]}, {"scenario": "x"}, r"config\.yaml: damaged: scenario is 'x'"),
-        ({"strategy": ["idm"]}, {"scenario": {"road": 3}}, r"config\.yaml: damaged: scenario"),
+        ({"strategy": ["idm"] * 2}, {}, r"a: not what a run writes: KeyError: 'training_seed'"),
+        ({"a": [1]}, {}, r"a: not what a run writes: KeyError: 'strategy'"),
+        (MOVED, {}, r"a: not what a run writes: KeyError: 'scenario'"),
+        (MOVED, {"scenario": "x"}, r"config\.yaml: damaged: scenario must be a mapping .*'x'"),
+        (MOVED, {"scenario": {"road": 3}}, r"a: not what a run writes: KeyError: 'string'"),
     ],
 )
 def test_an_animation_of_foreign_files_is_refused_in_a_line(
