@@ -24,7 +24,10 @@ TOOLS = {
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study, to one page"),
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
-    "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX or PyTorch program"),
+    "export": (
+        "lcc_rl.interfaces.export",
+        "a trained policy as a program (ONNX, PyTorch) or a page",
+    ),
 }
 COMMANDS = {**HYDRA, **TOOLS}
 

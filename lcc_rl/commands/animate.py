@@ -1,8 +1,9 @@
-"""Animate a sample episode of an evaluation: lcc-rl animate outputs/evaluate/<run>.
+"""Animate sample episodes of an evaluation: lcc-rl animate outputs/evaluate/<run>.
 
 lcc-rl animate RUN                                  # the last strategy, into RUN/figures
 lcc-rl animate RUN --strategy "idm tuned" --episode 1 --out idm.gif
 lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
+lcc-rl animate RUN --strategy human --strategy "alcc=one car in 22 automated" --out ring.svg
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+
+import pandas as pd
 
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.figures.animation import FORMS, animate, check_ending
@@ -23,7 +26,7 @@ KEPT = "evaluation.sample_episodes=4"
 
 def run(
     folder: str | Path,
-    strategy: str | None = None,
+    strategies: Sequence[str] = (),
     episode: int = 0,
     out: str | Path | None = None,
     start: float = 0.0,
@@ -33,8 +36,9 @@ def run(
 
     Args:
         folder: of an evaluation, a training or a main job.
-        strategy: whose episode; None for the last one of the table.
-        episode: which of its sample episodes, from 0.
+        strategies: who drives, each a name of the table, or ``"<name>=<words for the reader>"``;
+            none for the last one of the table. An ``.svg`` shows several beside each other.
+        episode: which of their sample episodes, from 0.
         out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
             run's folder ``figures``.
         start: when the animation begins [s].
@@ -49,22 +53,29 @@ def run(
     """
     folder = with_steps(Path(folder))
     if out is not None:
-        check_ending(Path(out))
-    steps = read_parquet(folder / STEPS)
+        check_ending(Path(out), len(strategies))
+    steps, scenario = read_parquet(folder / STEPS), stored_config(folder)["scenario"]
     if steps.empty:
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
-    names = list(dict.fromkeys(map(str, steps["strategy"])))
-    strategy = names[-1] if strategy is None else strategy
-    if strategy not in names:
-        raise unknown_name("strategy", strategy, names)
-    found = sample_episodes(steps, strategy)
+    known = list(dict.fromkeys(map(str, steps["strategy"])))
+    named = [name.partition("=")[::2] for name in strategies or known[-1:]]
+    motions = {}
+    for strategy, words in named:
+        if strategy not in known:
+            raise unknown_name("strategy", strategy, known)
+        label, rows = _episode(steps, strategy, episode)
+        motion = _cut(motion_of(rows, scenario), start, duration)
+        motions[words or f"{in_words(strategy)}: {label}"] = motion
+    default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
+    return animate(motions, out or default)
+
+
+def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.DataFrame]:
+    """Return name and rows of a sample episode."""
+    found = list(sample_episodes(steps, strategy).items())
     if not 0 <= episode < len(found):
         raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
-    label, rows = list(found.items())[episode]
-    motion = _cut(motion_of(rows, stored_config(folder)["scenario"]), start, duration)
-    title = f"{in_words(strategy)}: {label}"
-    default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
-    return animate(motion, title, out or default)
+    return found[episode]
 
 
 def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
@@ -95,7 +106,8 @@ def main(words: Sequence[str] | None = None) -> int:
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     parser.add_argument("run", type=Path, help="folder of an evaluation, training or main job")
-    parser.add_argument("--strategy", help="by default the last one of the evaluation")
+    words_of = "name, or name=words for the reader; by default the last one of the evaluation"
+    parser.add_argument("--strategy", action="append", default=[], help=words_of)
     parser.add_argument("--episode", type=int, default=0, help="which sample episode, from 0")
     parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(FORMS)}")
     parser.add_argument("--start", type=float, default=0.0, help="first moment [s]")

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.energy.fuel import STANDSTILL, STILL
+from lcc_rl.energy.fuel import STANDSTILL, STILL, CirclesFuel
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.step import pieces_of
@@ -34,7 +34,8 @@ from lcc_rl.settings import values
 
 TASK = ("variant=alcc", "task=ring-22")
 RULES = ("follower_stopper", "pi_saturation")
-LAYERS = (nn.Linear, nn.ReLU, nn.Tanh)  # that the page computes
+# What the page computes.
+LAYERS, VIEWS = (nn.Linear, nn.ReLU, nn.Tanh), ("self", "ahead", "behind", "memory")
 
 
 def ring_page(policy: str | Path, trust: Sequence[str] = ()) -> str:
@@ -56,7 +57,8 @@ def ring_page(policy: str | Path, trust: Sequence[str] = ()) -> str:
 def page_data(policy: str | Path, trust: Sequence[str] = ()) -> dict[str, Any]:
     """Return all numbers of the page; arguments as of :func:`ring_page`."""
     cfg = load("evaluate", TASK)
-    scenario, (energy,) = cfg.scenario, build_energy(cfg).models
+    scenario, energy = cfg.scenario, build_energy(cfg).models[0]
+    assert isinstance(energy, CirclesFuel)
     rules = {name: Driver(name, scenario.time_step).pieces[0] for name in RULES}
     return {
         "policy": str(policy),
@@ -94,13 +96,14 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
         raise ConfigError(f"{policy}: a rule; a page needs a policy")
     module, memory = driver.module, driver.pieces
     layers = [x for x in module.network.modules() if not list(x.children())]
+    kept = [(name, time) for x in memory for name in x.sources for time in x.seconds]
+    seen = [*module.names, *(name for name, _ in kept)]
     strange = [type(x).__name__ for x in layers if not isinstance(x, LAYERS)]
+    strange += [name for name in seen if name.partition(".")[0] not in VIEWS]
     strange += ["stacked memory"] if any(x.stacked for x in memory) else []
     strange += ["late filter"] if module.safety is not None and module.safety.late else []
     if strange:
         raise ConfigError(f"{policy}: the page cannot compute its {', '.join(strange)}")
-    sources = [name for x in memory for name in x.sources for _ in x.seconds]
-    shares = [share for x in memory for share in x.shares.tolist()]
     return {
         "layers": [_layer(layer) for layer in layers],
         "names": module.names,
@@ -108,7 +111,7 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
         "scales": module.constants.tolist(),
         "max_acceleration": module.largest,
         "filter": None if module.safety is None else _filter(module.safety),
-        "memory": [{"source": name, "share": x} for name, x in zip(sources, shares, strict=True)],
+        "memory": [{"source": name, "seconds": time} for name, time in kept],
     }
 
 

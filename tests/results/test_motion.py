@@ -110,7 +110,7 @@ def test_a_page_holds_the_motion_of_all_vehicles_and_needs_nothing_else(ring) ->
 
 @pytest.mark.parametrize("ring", [False, True])
 def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
-    with Image.open(animate(drifting(2, ring), "drifting", tmp_path / "x.gif")) as image:
+    with Image.open(animate({"drifting": drifting(2, ring)}, tmp_path / "x.gif")) as image:
         assert image.n_frames == 11
         shown = []
         for frame in (0, 10):
