@@ -23,7 +23,8 @@ height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anc
 .name {{ fill: #1b1f24; font-weight: 600 }} .soft {{ fill: #5a6370 }} .mark {{ stroke: #0b5fc0 }}
 .bar {{ fill: #0b5fc0 }}
 @media (prefers-color-scheme: dark) {{ .card {{ fill: #181c22; stroke: #2b323b }}
-.road {{ stroke: #262c34 }} .name {{ fill: #e8ecf1 }} .soft {{ fill: #9ba6b4 }}
+.road {{ stroke: #2b323b }} .car {{ stroke: #ffffffa0; stroke-width: 1.2 }}
+.name {{ fill: #e8ecf1 }} .soft {{ fill: #9ba6b4 }}
 .mark {{ stroke: #6fb4ff }} .bar {{ fill: #6fb4ff }} }}</style>
 <rect class="card" x=".5" y=".5" width="{inner}" height="{below}" rx="12"/>
 {panels}
@@ -72,7 +73,7 @@ def _panel(name: str, motion: Motion, place: int, top: float) -> str:
         mark = f'<circle class="mark" cx="{RADIUS}" r="{0.8 * long:.1f}" fill="none" '
         mark += 'stroke-width="2.5"/>'
         cars.append(
-            f'<g>{mark * (role == AUTOMATED)}<rect x="{RADIUS - CAR / 2}" y="{-long / 2:.1f}" '
+            f'<g>{mark * (role == AUTOMATED)}<rect class="car" x="{RADIUS - CAR / 2}" y="{-long / 2:.1f}" '
             f'width="{CAR}" height="{long:.1f}" rx="3.5">'
             f'<animate attributeName="fill" {dur} values="{hues}"/></rect>'
             f'<animateTransform attributeName="transform" type="rotate" {dur} '
