@@ -6,13 +6,12 @@ import math
 from collections.abc import Mapping
 from html import escape
 
-import numpy as np
 from matplotlib.colors import to_hex
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.figures.space_time import COLOURS
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.results.motion import Motion
+from lcc_rl.results.motion import Motion, Series
 
 FASTER, STEP = 20.0, 1.5  # times as fast as it was driven; between two key frames [s]
 WIDE, HIGH, RADIUS, ROAD, CAR = 330, 380, 118, 24, 12  # of a panel, its ring, road and cars [px]
@@ -46,39 +45,24 @@ def ring_picture(motions: Mapping[str, Motion]) -> str:
         raise ConfigError("an .svg shows the ring road only; write an .html, .gif or .mp4")
     top = max(float(motion.speed.max()) for motion in motions.values())
     panels = [_panel(*item, place, top) for place, item in enumerate(motions.items())]
-    wide, high = WIDE * len(motions), HIGH
-    time = next(iter(motions.values())).time
-    return FRAME.format(
-        wide=wide,
-        high=high,
-        inner=wide - 1,
-        below=high - 1,
-        title=escape("; ".join(motions)),
-        panels="\n".join(panels),
-        time=_time(time, wide),
-    )
+    wide = WIDE * len(motions)
+    size = {"wide": wide, "high": HIGH, "inner": wide - 1, "below": HIGH - 1}
+    bar = _bar(next(iter(motions.values())), wide)
+    title = escape("; ".join(motions))
+    return FRAME.format(**size, title=title, panels="\n".join(panels), time=bar)
 
 
 def _panel(name: str, motion: Motion, place: int, top: float) -> str:
     """Return one ring with its cars."""
     step = float(motion.time[1] - motion.time[0])
     shown = motion.at(slice(None, None, max(round(STEP / step), 1)))
-    turns = -360.0 / float(motion.circumference or 1.0) * (shown.position - 0.5 * motion.length)
-    long = 2.0 * math.pi * RADIUS * motion.length / float(motion.circumference or 1.0)
-    dur = f'dur="{_seconds(motion.time) / FASTER:.2f}s" repeatCount="indefinite"'
-    cars = []
-    for car, role in enumerate(motion.roles):
-        angles = ";".join(f"{angle:.1f}" for angle in turns[:, car])
-        hues = ";".join(to_hex(COLOURS(v / top)) for v in shown.speed[:, car])
-        mark = f'<circle class="mark" cx="{RADIUS}" r="{0.8 * long:.1f}" fill="none" '
-        mark += 'stroke-width="2.5"/>'
-        cars.append(
-            f'<g>{mark * (role == AUTOMATED)}<rect class="car" x="{RADIUS - CAR / 2}" y="{-long / 2:.1f}" '
-            f'width="{CAR}" height="{long:.1f}" rx="3.5">'
-            f'<animate attributeName="fill" {dur} values="{hues}"/></rect>'
-            f'<animateTransform attributeName="transform" type="rotate" {dur} '
-            f'values="{angles}"/></g>'
-        )
+    turn = 360.0 / float(motion.circumference or 1.0)  # of a metre [degrees]
+    angles = -turn * (shown.position - 0.5 * motion.length)
+    long = math.radians(turn) * RADIUS * motion.length
+    cars = [
+        _car(role == AUTOMATED, angles[:, car], shown.speed[:, car] / top, long, _time_of(motion))
+        for car, role in enumerate(motion.roles)
+    ]
     last = motion.speed[motion.time > motion.time[-1] - 60.0]
     return (
         f'<g transform="translate({WIDE * (place + 0.5)} 192)">'
@@ -90,22 +74,38 @@ def _panel(name: str, motion: Motion, place: int, top: float) -> str:
     )
 
 
-def _seconds(time: np.ndarray) -> float:
-    return float(time[-1] - time[0])
+def _car(marked: bool, angles: Series, shares: Series, long: float, time: str) -> str:
+    """Return a car that turns by the angles [degrees], coloured by shares of the top speed."""
+    hues = ";".join(to_hex(COLOURS(share)) for share in shares)
+    mark = (
+        f'<circle class="mark" cx="{RADIUS}" r="{0.8 * long:.1f}" fill="none" stroke-width="2.5"/>'
+    )
+    return (
+        f'<g>{mark * marked}<rect class="car" x="{RADIUS - CAR / 2}" y="{-long / 2:.1f}" '
+        f'width="{CAR}" height="{long:.1f}" rx="3.5">'
+        f'<animate attributeName="fill" {time} values="{hues}"/></rect>'
+        f'<animateTransform attributeName="transform" type="rotate" {time} '
+        f'values="{";".join(f"{angle:.1f}" for angle in angles)}"/></g>'
+    )
 
 
-def _time(time: np.ndarray, wide: int) -> str:
+def _time_of(motion: Motion) -> str:
+    duration = (motion.time[-1] - motion.time[0]) / FASTER
+    return f'dur="{duration:.2f}s" repeatCount="indefinite"'
+
+
+def _bar(motion: Motion, wide: int) -> str:
     """Return a bar that grows with the time."""
+    first, last = float(motion.time[0]), float(motion.time[-1])
     room, low = wide - 80, HIGH - 34
-    minutes = range(math.ceil(time[0] / 60.0), math.floor(time[-1] / 60.0) + 1)
     ticks = [
-        f'<text class="soft" x="{40 + room * (60.0 * minute - time[0]) / _seconds(time):.0f}" '
+        f'<text class="soft" x="{40 + room * (60.0 * minute - first) / (last - first):.0f}" '
         f'y="{low + 20}">{minute} min</text>'
-        for minute in minutes
+        for minute in range(math.ceil(first / 60.0), math.floor(last / 60.0) + 1)
     ]
-    grows = f'values="0;{room}" dur="{_seconds(time) / FASTER:.2f}s" repeatCount="indefinite"'
     return (
         f'<path class="road" d="M40 {low + 2}h{room}" stroke-width="4"/>'
         f'<rect class="bar" x="40" y="{low}" height="4" width="0" rx="2">'
-        f'<animate attributeName="width" {grows}/></rect>' + "".join(ticks)
+        f'<animate attributeName="width" {_time_of(motion)} values="0;{room}"/></rect>'
+        + "".join(ticks)
     )
