@@ -110,7 +110,7 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
         "columns": module.columns,
         "scales": module.constants.tolist(),
         "max_acceleration": module.largest,
-        "filter": None if module.safety is None else _filter(module.safety),
+        "filter": None if module.safety is None else filter_data(module.safety),
         "memory": [{"source": name, "seconds": time} for name, time in kept],
     }
 
@@ -124,5 +124,6 @@ def _encoded(numbers: Tensor) -> str:
     return b64encode(numbers.detach().numpy().astype("<f4").tobytes()).decode()
 
 
-def _filter(safety: CBFFilter) -> dict[str, Any]:
+def filter_data(safety: CBFFilter) -> dict[str, Any]:
+    """Return the settings of a safety filter for the page."""
     return {**values(safety), "own": safety.limits.own, "slowest": SLOWEST}

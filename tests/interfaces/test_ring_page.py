@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDict
 
 from lcc_rl.config import load
+from lcc_rl.energy import CirclesFuel
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import load_inputs
 from lcc_rl.errors import LccError
@@ -23,7 +24,8 @@ from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import baseline_controller, by_people, driven_by, trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export
-from lcc_rl.interfaces.ring_page import TASK, ring_page
+from lcc_rl.interfaces.ring_page import TASK, filter_data, ring_page
+from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
 
@@ -51,6 +53,12 @@ for (let step = 0; step < STEPS; step++) {
 }
 document.title = JSON.stringify([ways, one.fuel]);
 </script>"""
+
+WIDER = {"shortest_time_gap": 1.2, "full_speed": 8.0, "braking_ahead": 3.5}
+ALL = """<script>document.title = JSON.stringify(STATES.map(([wanted, v, gap, ahead, a]) => {
+  const car = { v, gap, ahead: { v: ahead, a } };
+  return [...FILTERS.map(f => filtered(f, wanted, car)), fuelRate(v, a)];
+}))</script>"""
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +128,19 @@ def test_all_cars_of_the_page_drive_as_those_of_the_package(
     apart = (found - 1e-6 * torch.tensor(ways)).abs().max()
     assert apart < 1e-3
     assert fuel == pytest.approx(burnt, rel=1e-5)
+
+
+def test_filter_and_fuel_are_the_packages_in_any_state(browser) -> None:
+    chance = torch.Generator().manual_seed(0)
+    low, high = torch.tensor([[-3.0, 0, 0.5, 0, -3], [3, 20, 40, 20, 3]], dtype=torch.float64)
+    states = low + (high - low) * torch.rand(2000, 5, generator=chance, dtype=torch.float64)
+    states[::50, 1], states[::50, 4] = 0.0, 0.0  # some stand
+    filters = [CBFFilter(**settings).bind() for settings in ({}, WIDER)]
+    given = {"states": states.tolist(), "filters": [filter_data(f) for f in filters]}
+    found = torch.tensor(browser(ring_page(RING), ALL, **given), dtype=torch.float64)
+    wanted = [f.filtered(*states.unbind(-1)) for f in filters]
+    fuel = CirclesFuel(vehicle="Compact").fuel(states[:, 1], states[:, 4])
+    torch.testing.assert_close(found, torch.stack([*wanted, fuel], -1), rtol=1e-7, atol=1e-8)
 
 
 def test_the_page_of_the_documentation_is_made_today() -> None:
