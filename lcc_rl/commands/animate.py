@@ -3,7 +3,7 @@
 lcc-rl animate RUN                                  # the last strategy, into RUN/figures
 lcc-rl animate RUN --strategy "idm tuned" --episode 1 --out idm.gif
 lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
-lcc-rl animate RUN --strategy human --strategy "alcc=one car in 22 automated" --out ring.svg
+lcc-rl animate RUN --strategy human --strategy "alcc: one car automated" --out ring.svg
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def run(
 
     Args:
         folder: of an evaluation, a training or a main job.
-        strategies: who drives, each a name of the table, or ``"<name>=<words for the reader>"``;
+        strategies: who drives, each a name of the table, or ``"<name>: <words for the reader>"``;
             none for the last one of the table. An ``.svg`` shows several beside each other.
         episode: which of their sample episodes, from 0.
         out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
@@ -58,7 +58,7 @@ def run(
     if steps.empty:
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
     known = list(dict.fromkeys(map(str, steps["strategy"])))
-    named = [name.partition("=")[::2] for name in strategies or known[-1:]]
+    named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
     motions = {}
     for strategy, words in named:
         if strategy not in known:
@@ -106,7 +106,7 @@ def main(words: Sequence[str] | None = None) -> int:
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     parser.add_argument("run", type=Path, help="folder of an evaluation, training or main job")
-    words_of = "name, or name=words for the reader; by default the last one of the evaluation"
+    words_of = "name, or 'name: words for the reader'; by default the last of the evaluation"
     parser.add_argument("--strategy", action="append", default=[], help=words_of)
     parser.add_argument("--episode", type=int, default=0, help="which sample episode, from 0")
     parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(FORMS)}")

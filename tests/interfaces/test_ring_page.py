@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import slow_but
 from tensordict import TensorDict
 
 from lcc_rl.config import load
@@ -117,7 +118,7 @@ def double_precision() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
 
 
-@pytest.mark.parametrize(("policy", "driver", "start", "string"), CASES)
+@pytest.mark.parametrize(("policy", "driver", "start", "string"), slow_but(CASES[3:4], CASES))
 def test_all_cars_of_the_page_drive_as_those_of_the_package(
     policy, driver, start, string, browser
 ) -> None:
