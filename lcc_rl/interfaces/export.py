@@ -195,6 +195,7 @@ def _as_pt2(policy: str | Path, trust: Sequence[str]) -> bytes:
 
 
 def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
+    program, about = _program(policy, trust)
     try:
         import onnx
         import onnxscript  # noqa: F401 - what torch exports with
@@ -202,7 +203,6 @@ def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
         raise ConfigError(
             f"{error.name} is not installed; pip install 'lcc_rl[interfaces]', or write a .pt2"
         ) from error
-    program, about = _program(policy, trust)
     registry = logging.getLogger("torch.onnx._internal.exporter._registration")
     registry.setLevel(logging.ERROR)  # that torchvision, of no use here, is missing
     with warnings.catch_warnings():
