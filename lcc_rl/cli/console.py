@@ -24,10 +24,7 @@ TOOLS = {
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study, to one page"),
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
-    "export": (
-        "lcc_rl.interfaces.export",
-        "a trained policy as a program (ONNX, PyTorch) or a page",
-    ),
+    "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
 }
 COMMANDS = {**HYDRA, **TOOLS}
 
