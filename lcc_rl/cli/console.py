@@ -21,12 +21,12 @@ HYDRA = {
 }
 TOOLS = {
     "status": ("lcc_rl.cli.status", "what runs are running, waiting, finished, failed"),
-    "animate": ("lcc_rl.commands.animate", "an episode as a moving picture: page, GIF, MP4"),
+    "animate": ("lcc_rl.commands.animate", "episodes as a moving picture: page, SVG, GIF, MP4"),
     "maps": ("lcc_rl.commands.maps", "what policies do over gap and relative speed"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study, to one page"),
     "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
-    "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX or PyTorch program"),
+    "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
 }
 COMMANDS = {**HYDRA, **TOOLS}
 

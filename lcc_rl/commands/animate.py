@@ -1,8 +1,9 @@
-"""Animate a sample episode of an evaluation: lcc-rl animate outputs/evaluate/<run>.
+"""Animate sample episodes of an evaluation: lcc-rl animate outputs/evaluate/<run>.
 
 lcc-rl animate RUN                                  # the last strategy, into RUN/figures
 lcc-rl animate RUN --strategy "idm tuned" --episode 1 --out idm.gif
 lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
+lcc-rl animate RUN --strategy human --strategy "alcc: one car automated" --out ring.svg
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 from pydantic import Field
 
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
@@ -28,7 +30,7 @@ KEPT = "evaluation.sample_episodes=4"
 
 def run(
     folder: str | Path,
-    strategy: str | None = None,
+    strategies: Sequence[str] = (),
     episode: int = 0,
     out: str | Path | None = None,
     start: float = 0.0,
@@ -38,8 +40,9 @@ def run(
 
     Args:
         folder: of an evaluation, a training or a main job.
-        strategy: whose episode; None for the last one of the table.
-        episode: which of its sample episodes, from 0.
+        strategies: who drives, each a name of the table, or ``"<name>: <words for the reader>"``;
+            none for the last one of the table. An ``.svg`` shows several beside each other.
+        episode: which of their sample episodes, from 0.
         out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
             run's folder ``figures``.
         start: when the animation begins [s].
@@ -54,23 +57,31 @@ def run(
     """
     folder = with_steps(Path(folder))
     if out is not None:
-        check_ending(new_file(out, "--out"))
+        check_ending(new_file(out, "--out"), len(strategies))
     steps = read_parquet(folder / STEPS)
     if steps.empty:
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
+    motions = {}
     with reading(folder):
-        names = list(dict.fromkeys(map(str, steps["strategy"])))
-        strategy = names[-1] if strategy is None else strategy
-        if strategy not in names:
-            raise unknown_name("strategy", strategy, names)
-        found = sample_episodes(steps, strategy)
-        if not 0 <= episode < len(found):
-            raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
-        label, rows = list(found.items())[episode]
-        motion = _cut(motion_of(rows, stored_config(folder)["scenario"]), start, duration)
-    title = f"{in_words(strategy)}: {label}"
-    default = folder / "figures" / f"animation_{in_file(strategy)}_{episode}.html"
-    return animate(motion, title, out or default)
+        scenario = stored_config(folder)["scenario"]
+        known = list(dict.fromkeys(map(str, steps["strategy"])))
+        named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
+        for strategy, words in named:
+            if strategy not in known:
+                raise unknown_name("strategy", strategy, known)
+            label, rows = _episode(steps, strategy, episode)
+            motion = _cut(motion_of(rows, scenario), start, duration)
+            motions[words or f"{in_words(strategy)}: {label}"] = motion
+    default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
+    return animate(motions, out or default)
+
+
+def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.DataFrame]:
+    """Return name and rows of a sample episode."""
+    found = list(sample_episodes(steps, strategy).items())
+    if not 0 <= episode < len(found):
+        raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
+    return found[episode]
 
 
 def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
@@ -100,7 +111,8 @@ def main(words: Sequence[str] | None = None) -> int:
     """Animate what is named on the command line; print the file's name."""
     parser = Arguments(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an evaluation, training or main job")
-    parser.add_argument("--strategy", help="by default the last one of the evaluation")
+    words_of = "name, or 'name: words for the reader'; by default the last of the evaluation"
+    parser.add_argument("--strategy", action="append", default=[], help=words_of)
     number = typed(NonNegative)
     parser.add_argument(
         "--episode",

@@ -1,9 +1,9 @@
-"""Animations of one sample episode: a page that needs no network, a GIF or an MP4."""
+"""Animations of sample episodes: a page that needs no network, an SVG, a GIF or an MP4."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,12 @@ from PIL import Image  # comes with matplotlib
 
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.figures.drawing import INK, new_figure, style
+from lcc_rl.figures.ring_picture import ring_picture
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.motion import Motion, Series
 
-FORMS = (".html", ".gif", ".mp4")
+FORMS = (".html", ".svg", ".gif", ".mp4")
 COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}
 NAMES = ("human driver", "controlled car")  # a human may drive it, too, as a baseline
 LARGEST = 50_000  # moments of vehicles in a page, each a speed and a gap
@@ -30,29 +31,32 @@ RATE, LONGEST = 10, 150  # frames per second, and at most
 DPI = 80
 
 
-def animate(motion: Motion, title: str, path: str | Path) -> Path:
-    """Write an animation; the ending, ``.html``, ``.gif`` or ``.mp4``, chooses the form.
+def animate(motions: Mapping[str, Motion], path: str | Path) -> Path:
+    """Write an animation; the ending chooses the form.
 
-    A page plays in any browser, with a slider. A long episode plays faster in a GIF or MP4, whose
-    title says how much.
+    A page (``.html``) plays in any browser, with a slider; a ``.gif`` or ``.mp4`` plays a long
+    episode faster and says so. They show one episode. An ``.svg`` shows rings side by side.
 
     Args:
-        motion: of one episode, at two moments or more.
-        title: what it is, for the reader.
+        motions: episodes of two moments or more, by what they are for the reader.
         path: the file; one that exists is replaced.
 
     Returns:
         The path.
 
     Raises:
-        ConfigError: if the ending is another one, or ffmpeg is needed and missing.
+        ConfigError: if the ending is another one, the form does not show these episodes, or ffmpeg
+            is needed and missing.
         ResultsError: if the file cannot be written.
     """
     path = Path(path)
-    check_ending(path)
+    check_ending(path, len(motions))
+    (title, motion), *_ = motions.items()
     with atomic_path(path) as temporary:
         if path.suffix == ".html":
             temporary.write_text(page(motion, title), encoding="utf-8")
+        elif path.suffix == ".svg":
+            temporary.write_text(ring_picture(motions), encoding="utf-8")
         elif path.suffix == ".gif":
             _write_gif(motion, title, temporary)
         else:
@@ -60,10 +64,12 @@ def animate(motion: Motion, title: str, path: str | Path) -> Path:
     return path
 
 
-def check_ending(path: Path) -> None:
+def check_ending(path: Path, episodes: int = 1) -> None:
     """Check that an animation can be written in the form that its file's ending means."""
     if path.suffix not in FORMS:
         raise unknown_name("ending of an animation", path.suffix, FORMS)
+    if episodes > 1 and path.suffix != ".svg":
+        raise ConfigError(f"{path.suffix} shows one strategy; --out ring.svg shows several")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise ConfigError("an .mp4 needs ffmpeg, which is not installed; write a .html or .gif")
 

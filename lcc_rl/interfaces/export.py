@@ -1,6 +1,6 @@
-"""Export of trained policies as ONNX or PyTorch's ``.pt2``.
+"""Export of trained policies as ONNX, PyTorch's ``.pt2`` or a page in which they drive.
 
-An exported policy takes the measurements of one vehicle in SI units and returns its acceleration;
+An exported program takes the measurements of one vehicle in SI units and returns its acceleration;
 it contains the scales of the observation, the network and the safety filter, if there is one.
 """
 
@@ -134,15 +134,17 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
 
 
 def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> Path:
-    """Write a trained policy, with its safety filter, as ONNX or PyTorch's exported program.
+    """Write a trained policy, with its safety filter, for use elsewhere.
 
-    The input ``state`` is ``[batch, inputs]`` in SI units, the output ``acceleration``
-    ``[batch, 1]`` [m/s²]; names, units and meanings of the inputs are in the file's metadata under
-    ``lcc_rl`` as JSON.
+    The ending chooses the form. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) take
+    ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²];
+    names, units and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A
+    page (``.html``) shows the ring road with the policy in any browser, see
+    :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
     Args:
         policy: a run folder, a policy file, or ``pretrained/<name>``.
-        path: the file to write; its ending, ``.onnx`` or ``.pt2``, chooses the form.
+        path: the file to write.
         trust: modules outside this package that the policy may name.
 
     Returns:
@@ -159,6 +161,14 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
     path = new_file(path, "name")
     if path.suffix not in FORMS:
         raise unknown_name("ending", path.suffix, FORMS)
+    content = FORMS[path.suffix](policy, trust)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return path
+
+
+def _program(policy: str | Path, trust: Sequence[str]) -> tuple[Any, str]:
+    """Return the exported program, and what is to know about it as JSON."""
     module = exported_policy(policy, trust)
     inputs = [item._asdict() for item in module.inputs()]
     about: dict[str, Any] = {"policy": str(policy), "lcc_rl": __version__, "inputs": inputs}
@@ -166,19 +176,24 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
     example = torch.ones(2, len(module.names))
     batch = {"state": {0: torch.export.Dim("batch", min=1)}}
     program = torch.export.export(module, (example,), dynamic_shapes=batch)
-    with atomic_path(path) as temporary:
-        text = json.dumps(about, ensure_ascii=False)
-        temporary.write_bytes(FORMS[path.suffix](program, text))
-    return path
+    return program, json.dumps(about, ensure_ascii=False)
 
 
-def _as_pt2(program: Any, about: str) -> bytes:
+def _as_page(policy: str | Path, trust: Sequence[str]) -> bytes:
+    from lcc_rl.interfaces.ring_page import ring_page  # it reads policies by this module
+
+    return ring_page(policy, trust).encode()
+
+
+def _as_pt2(policy: str | Path, trust: Sequence[str]) -> bytes:
+    program, about = _program(policy, trust)
     buffer = BytesIO()
     torch.export.save(program, buffer, extra_files={"lcc_rl": about})
     return buffer.getvalue()
 
 
-def _as_onnx(program: Any, about: str) -> bytes:
+def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
+    program, about = _program(policy, trust)
     try:
         import onnx
         import onnxscript  # noqa: F401 - what torch exports with
@@ -205,17 +220,20 @@ def _as_onnx(program: Any, about: str) -> bytes:
     return content
 
 
-FORMS = {".onnx": _as_onnx, ".pt2": _as_pt2}
+FORMS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".html": _as_page}
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Export the policy named on the command line."""
-    parser = Arguments(description="Export a policy for other software.")
+    parser = Arguments(description="Export a policy for use elsewhere.")
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
-    parser.add_argument("path", help="file to write, .onnx or .pt2")
+    parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options = parser.parse_args(words)
     path = export(options.policy, options.path, options.trust)
+    if path.suffix == ".html":
+        print(f"{path}: the ring road in the browser, with {options.policy}")
+        return 0
     for item in exported_policy(options.policy, options.trust).inputs():
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: from these, in this order, the acceleration [m/s²]")

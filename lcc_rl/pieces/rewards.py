@@ -153,7 +153,7 @@ class CollisionPenalty(RewardTerm):
         hit = gap <= 0.0
         if self.behind:
             hit = hit | (self.sections.sum((gaps <= 0.0).to(gap.dtype), *indices) > 0.0)
-        return -hit.to(torch.float32)
+        return -hit.to(gap.dtype)
 
 
 class VelocityReward(RewardTerm):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from lcc_rl.commands import animate as command
-from lcc_rl.errors import ResultsError
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.figures.animation import COLOURS, LARGEST, animate, page
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes, visited
@@ -22,6 +23,7 @@ from lcc_rl.results.motion import Motion, motion_of, sample_episodes, visited
 OPEN = {"string": "automated human", "road": "open", "circumference": None, "vehicle_length": 5.0}
 RING = {**OPEN, "road": "ring", "circumference": 40.0}
 TIME = 0.5 * np.arange(1, 5)
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 def rows(**more) -> pd.DataFrame:
@@ -110,7 +112,7 @@ def test_a_page_holds_the_motion_of_all_vehicles_and_needs_nothing_else(ring) ->
 
 @pytest.mark.parametrize("ring", [False, True])
 def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
-    with Image.open(animate(drifting(2, ring), "drifting", tmp_path / "x.gif")) as image:
+    with Image.open(animate({"drifting": drifting(2, ring)}, tmp_path / "x.gif")) as image:
         assert image.n_frames == 11
         shown = []
         for frame in (0, 10):
@@ -121,6 +123,21 @@ def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
     for role in ("automated", "human", *([] if ring else ["leader"])):
         near = np.abs(shown[0] - 255 * np.array(to_rgb(COLOURS[role]))).max(-1) < 24
         assert near.sum() > 30, role
+
+
+def test_an_svg_turns_each_car_by_its_way_and_shows_rings_side_by_side(tmp_path) -> None:
+    moved = drifting(3, ring=True, seconds=6.0)
+    path = animate({"a < b": moved, "c": moved}, tmp_path / "ring.svg")
+    root = ElementTree.parse(path).getroot()
+    turns = [x.get("values") for x in root.iter(f"{SVG}animateTransform")]
+    assert len(turns) == 6
+    middle = moved.position[::15] - 0.5 * moved.length  # a key frame every 1.5 s
+    found = np.array([text.split(";") for text in turns[:3]], float).T
+    assert found == pytest.approx(-360.0 / 500.0 * middle, abs=0.051)
+    assert len(list(root.iter(f"{SVG}circle"))) == 2 + 2  # two roads, two marks
+    for wrong, ending in (({"a": drifting()}, "svg"), ({"a": moved, "b": moved}, "gif")):
+        with pytest.raises(ConfigError, match=ending):
+            animate(wrong, tmp_path / f"x.{ending}")
 
 
 @pytest.fixture

@@ -1,0 +1,129 @@
+"""The ring road of ``task=ring-22`` as a page in which a policy drives, in any browser.
+
+The page needs no server and no other file. It computes the equations of this package with the
+settings of the task, the weights of the policy and the package's random numbers: a seed means the
+same drive in both.
+"""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.energy.fuel import STANDSTILL, STILL, CirclesFuel
+from lcc_rl.envs.factory import build_env
+from lcc_rl.envs.inputs import build_energy, load_inputs
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import ConfigError
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN
+from lcc_rl.functional.random import stream_id
+from lcc_rl.interfaces.driver import Driver
+from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces.cbf import SLOWEST
+from lcc_rl.pieces.controllers import stream_name
+from lcc_rl.pieces.drivers import DriverModel
+from lcc_rl.settings import values
+
+TASK = ("variant=alcc", "task=ring-22")
+RULES = ("follower_stopper", "pi_saturation")
+# What the page computes.
+LAYERS, VIEWS = (nn.Linear, nn.ReLU, nn.Tanh), ("self", "ahead", "behind", "memory")
+
+
+def ring_page(policy: str | Path, trust: Sequence[str] = ()) -> str:
+    """Return the page, all data inside.
+
+    Args:
+        policy: a run folder, a policy file, or ``pretrained/<name>``.
+        trust: modules outside this package that the policy may name.
+
+    Raises:
+        LccError: if the policy cannot be read, or the page cannot compute it.
+    """
+    text = json.dumps(page_data(policy, trust), ensure_ascii=False, separators=(",", ":"))
+    template = files("lcc_rl.assets").joinpath("ring.html").read_text(encoding="utf-8")
+    # Within a script no tag may begin.
+    return template.replace("DATA", text.replace("<", "\\u003c"), 1)
+
+
+def page_data(policy: str | Path, trust: Sequence[str] = ()) -> dict[str, Any]:
+    """Return all numbers of the page; arguments as of :func:`ring_page`."""
+    cfg = load("evaluate", TASK)
+    scenario, energy = cfg.scenario, build_energy(cfg).models[0]
+    assert isinstance(energy, CirclesFuel)
+    rules = {name: Driver(name, scenario.time_step).pieces[0] for name in RULES}
+    return {
+        "policy": str(policy),
+        "time_step": scenario.time_step,
+        "circumference": scenario.circumference,
+        "length": scenario.vehicle_length,
+        "initial_speed": scenario.initial_speed,
+        "count": len(scenario.vehicles),
+        "human": _human(cfg),
+        "streams": {
+            role: {kind: stream_id(f"{stream_name(role)}.{kind}") for kind in ("noise", "wiener")}
+            for role in (HUMAN, AUTOMATED)
+        },
+        "rules": {name: {**values(rule), "samples": rule.samples} for name, rule in rules.items()},
+        "network": _network(policy, scenario.time_step, trust),
+        "vehicle": energy.vehicle,
+        "fuel": {**energy.own, "standstill": STANDSTILL, "still": STILL},
+    }
+
+
+def _human(cfg: StudyConfig) -> dict[str, float]:
+    """Return what drives the human drivers."""
+    inputs = load_inputs(cfg)
+    pieces = pieces_of(build_env(cfg, inputs.evaluation, inputs.population))
+    (human,) = (piece for piece in pieces if isinstance(piece, DriverModel))
+    own = {"desired_speed": human.desired_speeds, "time_gap": human.time_gaps}
+    noise = {name: getattr(human, name) for name in ("noise", "wiener", "spread")}
+    return {**{name: float(x) for name, x in own.items()}, **vars(human.drivers), **noise}
+
+
+def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict[str, Any]:
+    """Return weights, scales and memory of a policy, and its safety filter."""
+    driver = Driver(policy, time_step, trust)
+    if driver.module is None:
+        raise ConfigError(f"{policy}: a rule; a page needs a policy")
+    module, memory = driver.module, driver.pieces
+    layers = [x for x in module.network.modules() if not list(x.children())]
+    kept = [(name, time) for x in memory for name in x.sources for time in x.seconds]
+    seen = [*module.names, *(name for name, _ in kept)]
+    strange = [type(x).__name__ for x in layers if not isinstance(x, LAYERS)]
+    strange += [name for name in seen if name.partition(".")[0] not in VIEWS]
+    strange += ["stacked memory"] if any(x.stacked for x in memory) else []
+    strange += ["late filter"] if module.safety is not None and module.safety.late else []
+    if strange:
+        raise ConfigError(f"{policy}: the page cannot compute its {', '.join(strange)}")
+    return {
+        "layers": [_layer(layer) for layer in layers],
+        "names": module.names,
+        "columns": module.columns,
+        "scales": module.constants.tolist(),
+        "max_acceleration": module.largest,
+        "filter": None if module.safety is None else filter_data(module.safety),
+        "memory": [{"source": name, "seconds": time} for name, time in kept],
+    }
+
+
+def _layer(layer: nn.Module) -> dict[str, str]:
+    numbers = {name: _encoded(weights) for name, weights in layer.named_parameters()}
+    return {"kind": type(layer).__name__, **numbers}
+
+
+def _encoded(numbers: Tensor) -> str:
+    return b64encode(numbers.detach().numpy().astype("<f4").tobytes()).decode()
+
+
+def filter_data(safety: CBFFilter) -> dict[str, Any]:
+    """Return the settings of a safety filter for the page."""
+    return {**values(safety), "own": safety.limits.own, "slowest": SLOWEST}

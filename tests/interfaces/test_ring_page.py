@@ -1,0 +1,154 @@
+"""The page of the ring road: its JavaScript, run in Chromium, drives as the package does."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import slow_but
+from tensordict import TensorDict
+
+from lcc_rl.config import load
+from lcc_rl.energy import CirclesFuel
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import load_inputs
+from lcc_rl.errors import LccError
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.evaluation.strategies import baseline_controller, by_people, driven_by, trained
+from lcc_rl.functional.pattern import parse_string
+from lcc_rl.interfaces.export import export
+from lcc_rl.interfaces.ring_page import TASK, filter_data, ring_page
+from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces.base import SEED
+from lcc_rl.results.policies import load_policy
+
+ROOT = Path(__file__).parents[2]
+STEPS, EPISODE = 600, 976413892
+LOUDER = 10.0  # times the task's noise: in a minute a wave grows
+RING, FOLLOW = "pretrained/ring-22", "pretrained/i80-follow"  # with memory; with all of the filter
+ALONE, PAIR = "automated human*21", "automated human*9 automated human*9"
+# Whose page, who drives, from which step on, in which string.
+CASES = [
+    (RING, "human", 0, ALONE),
+    (RING, "follower_stopper", 200, ALONE),
+    (RING, "pi_saturation", 200, ALONE),
+    (RING, "network", 0, ALONE),
+    (FOLLOW, "network", 0, PAIR),
+]
+DRIVE = """<script>
+d.human.spread *= LOUDER;
+const roles = ROLES, marked = new Set(roles.keys().filter(place => roles[place] === "automated"));
+const one = new Ring(roles.length, marked, START ? "human" : DRIVER, EPISODE), ways = [];
+for (let step = 0; step < STEPS; step++) {
+  if (step === START) one.driver = DRIVER;
+  one.advance();
+  ways.push(one.cars.map(car => Math.round(1e6 * car.x)));
+}
+document.title = JSON.stringify([ways, one.fuel]);
+</script>"""
+
+WIDER = {"shortest_time_gap": 1.2, "full_speed": 8.0, "braking_ahead": 3.5}
+ALL = """<script>document.title = JSON.stringify(STATES.map(([wanted, v, gap, ahead, a]) => {
+  const car = { v, gap, ahead: { v: ahead, a } };
+  return [...FILTERS.map(f => filtered(f, wanted, car)), fuelRate(v, a)];
+}))</script>"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """Run a script on a page; what it makes the page's title comes back."""
+    name = next(filter(shutil.which, ("chromium", "chromium-browser", "google-chrome")), None)
+    if name is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    folder = tmp_path_factory.mktemp("chromium")
+    flags = "headless no-sandbox disable-gpu disable-quic no-first-run disable-sync dump-dom"
+    flags += " disable-background-networking disable-component-update"
+    words = [name, *(f"--{flag}" for flag in flags.split()), f"--user-data-dir={folder}/profile"]
+
+    def run(page: str, script: str, **given: Any) -> Any:
+        for key, value in given.items():
+            script = re.sub(rf"\b{key.upper()}\b", json.dumps(value), script)
+        path = folder / "page.html"
+        path.write_text(page.replace("</body>", f"{script}</body>"), encoding="utf-8")
+        done = subprocess.run([*words, path.as_uri()], capture_output=True, text=True, timeout=120)
+        return json.loads(re.search("<title>(.*?)</title>", done.stdout)[1])
+
+    return run
+
+
+def driven(policy: str, driver: str, start: int, string: str) -> tuple[torch.Tensor, float]:
+    """Positions of all cars after each step of the package [m], and the fuel of all [g]."""
+    settings = [f"scenario.horizon={STEPS}", f"scenario.string={string}"]
+    cfg, actor = load("evaluate", [*TASK, *settings]), None
+    human, inputs = cfg.scenario.controllers["human"], load_inputs(cfg)
+    human["wiener"] *= LOUDER
+    if driver == "network":
+        weights, own = load_policy(policy)
+        own.scenario.name = cfg.scenario.name  # one was trained on an open road
+        strategy = trained(cfg, policy, (weights, own), inputs.population)
+        cfg, actor = strategy.cfg, strategy.policy
+        cfg.scenario.filters = own.scenario.filters
+    else:
+        after = human if driver == "human" else baseline_controller(driver)
+        both = {"before": human, "after": after, "from_s": 0.1 * start}
+        cfg = by_people(driven_by(cfg, {"_target_": "lcc_rl.pieces.Handover", **both}))
+    env = build_env(cfg, inputs.evaluation, inputs.population, (1,), nominal=True)
+    given = TensorDict({SEED: torch.tensor([[EPISODE]])}, batch_size=[1])
+    kept = [("vehicles", name) for name in ("speed", "gap", "power")]
+    speed, gap, power = (x.flatten(1) for x in play(env, actor, given, kept)[0].values())
+    front = (0.05 * (speed[1:, :1] + speed[:-1, :1])).cumsum(0)
+    behind = torch.nn.functional.pad(gap[:, 1:] + 5.0, (1, 0)).cumsum(-1)
+    return front - behind, 0.1 * float(power.sum()) / 42.36e3  # the heat of a gram [J]
+
+
+@contextmanager
+def double_precision() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize(("policy", "driver", "start", "string"), slow_but(CASES[3:4], CASES))
+def test_all_cars_of_the_page_drive_as_those_of_the_package(
+    policy, driver, start, string, browser
+) -> None:
+    case = {"louder": LOUDER, "roles": parse_string(string).roles, "driver": driver, "start": start}
+    ways, fuel = browser(ring_page(policy), DRIVE, **case, steps=STEPS, episode=EPISODE)
+    with double_precision():
+        found, burnt = driven(policy, driver, start, string)
+    apart = (found - 1e-6 * torch.tensor(ways)).abs().max()
+    assert apart < 1e-3
+    assert fuel == pytest.approx(burnt, rel=1e-5)
+
+
+def test_filter_and_fuel_are_the_packages_in_any_state(browser) -> None:
+    chance = torch.Generator().manual_seed(0)
+    low, high = torch.tensor([[-3.0, 0, 0.5, 0, -3], [3, 20, 40, 20, 3]], dtype=torch.float64)
+    states = low + (high - low) * torch.rand(2000, 5, generator=chance, dtype=torch.float64)
+    states[::50, 1], states[::50, 4] = 0.0, 0.0  # some stand
+    filters = [CBFFilter(**settings).bind() for settings in ({}, WIDER)]
+    given = {"states": states.tolist(), "filters": [filter_data(f) for f in filters]}
+    found = torch.tensor(browser(ring_page(RING), ALL, **given), dtype=torch.float64)
+    wanted = [f.filtered(*states.unbind(-1)) for f in filters]
+    fuel = CirclesFuel(vehicle="Compact").fuel(states[:, 1], states[:, 4])
+    torch.testing.assert_close(found, torch.stack([*wanted, fuel], -1), rtol=1e-7, atol=1e-8)
+
+
+def test_the_page_of_the_documentation_is_made_today() -> None:
+    assert (ROOT / "docs" / "ring.html").read_text(encoding="utf-8") == ring_page(RING)
+
+
+@pytest.mark.parametrize("policy", ["pretrained/ddpg", "idm_acc"])
+def test_what_the_page_cannot_compute_is_one_clear_error(policy, tmp_path) -> None:
+    with pytest.raises(LccError, match=policy):
+        export(policy, tmp_path / "ring.html")
