@@ -134,7 +134,7 @@ class Recorder(TorchDispatchMode):
         formula = COMPARISONS.get(name) or ARITHMETIC[name]
         if f"{{{len(values) - 1}}}" not in formula:
             raise Untranslatable(f"{name} of {len(values)} arguments")
-        return self._stated(formula, [self._numbers(x, dtype) for x in values])
+        return self._stated(formula, [self.numbers(x, dtype) for x in values])
 
     def _stated(self, formula: str, parts: Sequence[Tensor]) -> Tensor:
         """Record a formula for every entry of variables; return the variables of the results."""
@@ -143,7 +143,7 @@ class Recorder(TorchDispatchMode):
         found = [self.variable(formula, row) for row in rows]
         return torch.tensor(found, dtype=torch.int64).reshape(parts[0].shape)
 
-    def _numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
+    def numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
         """Return the variables of a value as numbers of a type."""
         if (kind := TYPES.get(dtype)) is None:
             raise Untranslatable(f"numbers of {dtype}")
@@ -162,7 +162,7 @@ class Recorder(TorchDispatchMode):
         def moved(value: Any) -> Any:
             if isinstance(value, (list, tuple)):
                 return [moved(part) for part in value]
-            return self._numbers(value, dtype) if isinstance(value, Tensor) else value
+            return self.numbers(value, dtype) if isinstance(value, Tensor) else value
 
         found = func(*moved(args), **kwargs)
         parts = (found,) if isinstance(found, Tensor) else found
@@ -173,7 +173,7 @@ class Recorder(TorchDispatchMode):
         self, name: str, result: Tensor, value: Tensor, dims: Any = None, *keep: Any, **more: Any
     ) -> Tensor:
         dims = [dims] if isinstance(dims, int) else dims or list(range(value.ndim))
-        variables = self._numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
+        variables = self.numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
         parts = variables.flatten(0, len(dims) - 1).unbind(0)
         formula = ARITHMETIC[FOLDS[name]]
         return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
@@ -182,14 +182,14 @@ class Recorder(TorchDispatchMode):
         return self._each("bitwise_xor", result.dtype, value, -1)
 
     def _where(self, result: Tensor, condition: Tensor, *values: Any) -> Tensor:
-        parts = [self._numbers(x, result.dtype) for x in values]
-        return self._stated("pick({0}, {1}, {2})", [self._numbers(condition, torch.bool), *parts])
+        parts = [self.numbers(x, result.dtype) for x in values]
+        return self._stated("pick({0}, {1}, {2})", [self.numbers(condition, torch.bool), *parts])
 
     def _clamp(self, result: Tensor, value: Tensor, low: Any = None, high: Any = None) -> Tensor:
-        variables = self._numbers(value, result.dtype)
+        variables = self.numbers(value, result.dtype)
         for bound, order in ((low, "<"), (high, ">")):
             if bound is not None:
-                parts = [variables, self._numbers(bound, result.dtype)]
+                parts = [variables, self.numbers(bound, result.dtype)]
                 variables = self._stated(f"pick({{0}} {order} {{1}}, {{1}}, {{0}})", parts)
         return variables
 
@@ -206,10 +206,10 @@ class Recorder(TorchDispatchMode):
         if any(place is None for place in places):
             raise Untranslatable("an index that is not of the first dimensions")
         inner = table.shape[len(places) :]
-        outer = torch.broadcast_tensors(*(self._numbers(x, torch.int64) for x in places))
+        outer = torch.broadcast_tensors(*(self.numbers(x, torch.int64) for x in places))
         parts = [x.reshape(*x.shape, *[1] * len(inner)) for x in outer]
         for axis, size in enumerate(inner):
-            each = self._numbers(torch.arange(size), torch.int64)
+            each = self.numbers(torch.arange(size), torch.int64)
             parts.append(each.reshape(size, *[1] * (len(inner) - 1 - axis)))
         where = ", ".join(f"{{{i}}}" for i in range(len(parts)))
         return self._stated(f"read({self._table(table)}, ({where},))", parts)
@@ -221,7 +221,7 @@ class Recorder(TorchDispatchMode):
             raise Untranslatable("a search in what is not one constant list")
         side = "right" if right else "left"
         formula = f"i64(np.searchsorted({self._table(table)}, {{0}}, '{side}'))"
-        return self._stated(formula, [self._numbers(value, table.dtype)])
+        return self._stated(formula, [self.numbers(value, table.dtype)])
 
     def _table(self, table: Tensor) -> str:
         """Return the name of a table, by which a statement reads it."""

@@ -120,7 +120,7 @@ def translated(
         recorder.add(example, torch.tensor(variables).reshape(1, -1))
     with torch.no_grad(), recorder:
         results = function(*examples)
-    outputs = [recorder._numbers(x, x.dtype).flatten().tolist() for x in results]
+    outputs = [recorder.numbers(x, x.dtype).flatten().tolist() for x in results]
     needed = {variable for output in outputs for variable in output}
     for variable in reversed(range(len(recorder.statements))):
         if variable in needed:

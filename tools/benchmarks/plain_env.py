@@ -98,15 +98,15 @@ class PlainEnv(gymnasium.Env[Any, Any]):
         ahead = self.record[self.place + self.count]
         gap += 0.5 * dt * ((leader - cav) + (ahead - cav_reached))
         behind += 0.5 * dt * ((cav - speed) + (cav_reached - reached))
-        terms = self.rewards(ahead, cav_reached, gap, behind)
-        terms["cav_energy"] = -self.plain.cav_price * power(cav, (cav_reached - cav) / dt)
-        terms["hdv_energy"] = -self.plain.hdv_price * power(speed, predicted)
+        reward = self.reward(ahead, cav_reached, gap, behind)
+        reward -= self.plain.cav_price * power(cav, (cav_reached - cav) / dt)
+        reward -= self.plain.hdv_price * power(speed, predicted)
         self.motion = (ahead, cav_reached, gap, reached, behind)
         ends = (gap <= 0.0 or behind <= 0.0, self.count >= self.plain.horizon)
-        return self.observe(), sum(terms.values()), *ends, {"reward_terms": terms}
+        return self.observe(), reward, *ends, {}
 
-    def rewards(self, ahead: float, cav: float, gap: float, behind: float) -> dict[str, float]:
-        """Return the terms of the reward that depend on the motion reached."""
+    def reward(self, ahead: float, cav: float, gap: float, behind: float) -> float:
+        """Return the reward but for energies; it depends on the motion reached alone."""
         safety, efficiency, plain = self.plain.safety, self.plain.efficiency, self.plain
         room, ttc = max(gap - safety.margin, TOUCH) if gap > 0.0 else gap, safety.threshold
         if room <= 0.0:
@@ -114,11 +114,9 @@ class PlainEnv(gymnasium.Env[Any, Any]):
         elif cav > ahead:
             ttc = min(max(room / (cav - ahead), safety.floor), safety.threshold)
         late = gap / max(cav, 1.0) >= efficiency.threshold
-        return {
-            "safety": safety.weight * math.log(ttc / safety.threshold),
-            "efficiency": -efficiency.weight * late,
-            "collision": -plain.penalty * (gap <= 0.0 or behind <= 0.0),
-        }
+        reward: float = safety.weight * math.log(ttc / safety.threshold)
+        hit = gap <= 0.0 or behind <= 0.0
+        return reward - efficiency.weight * late - plain.penalty * hit
 
     def idm(self, speed: float, gap: float, rate: float, free: float, time_gap: float) -> Numbers:
         """Return the acceleration, s*/s, 1/s, and whether the time gap matters."""
