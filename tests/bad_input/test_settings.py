@@ -138,7 +138,7 @@ def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
         evaluation.run(cfg, tmp_path)
 
 
-@pytest.mark.parametrize("more", [b"", gzip.compress(b"")])  # its size is that of all members
+@pytest.mark.parametrize("more", [b"", gzip.compress(b"")], ids=["one", "two members"])
 def test_a_table_larger_than_memory(tmp_path, monkeypatch, more) -> None:
     path = tmp_path / "big.csv.gz"
     path.write_bytes(gzip.compress(long_table(rows=200).to_csv(index=False).encode()) + more)
