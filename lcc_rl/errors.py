@@ -44,7 +44,7 @@ class Diverged(LccError):
 # Far beyond every quantity of traffic and learning; its square is a number in single precision.
 LARGEST = 1e9
 # Far beyond what fits into memory, which is said with what is needed; and seeds.
-LARGEST_SIZE, LAST_SEED = 10**15, 2**31 - 1
+LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch takes no more bits of a seed
 
 
 def require(condition: bool, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Kill small sweeps, evaluations and pipelines at random moments and check their files each time.
+"""Kill small commands of every kind at random moments and check their files each time.
 
     python tools/kill_test.py --kills 200
 
@@ -29,7 +29,7 @@ import pandas as pd
 import torch
 from matplotlib.image import imread
 
-from lcc_rl.cli import evaluate, pipeline, train
+from lcc_rl.cli import calibrate, console, evaluate, pipeline, train
 from lcc_rl.commands.pipeline import COMMAND
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
@@ -42,7 +42,7 @@ from lcc_rl.results.runs import read_settings
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.states import LOCK, RESULTS, read_progress
 
-SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 WAITED = os.WEXITED | os.WNOHANG | os.WNOWAIT
 PATIENCE = 120.0  # for a process to react to a signal, or to leave its folder [s]
 UNTIMED = "timing.parquet"  # seconds, which differ
@@ -226,10 +226,15 @@ def jobs(folder: Path) -> dict[str, Job]:
     one = [*small, "policy=pretrained", "compare=[pretrained/reference]"]
     whole = [*small, *agent, "calibration.local_genetic.generations=2", "jobs=1"]
     whole += ["training.checkpoint_every=1"]
+    fitted = ["data.platoons=4", "data.recordings=2", "calibration.local_genetic.generations=2"]
+    study = ["reproduce", "alcc", "--recipe=smoke", "--seeds=1", "--parts=main", *fitted]
+    study += ["training.episodes=48", "scenario.horizon=40"]
     found = {
-        "sweeps": Job(train.main, sweep, "hydra.sweep.dir", 0.5, folder / "sweep"),
-        "evaluations": Job(evaluate.main, one, "hydra.run.dir", 0.25, folder / "evaluation"),
-        "pipelines": Job(pipeline.main, whole, "hydra.run.dir", 0.25, folder / "pipeline"),
+        "sweeps": Job(train.main, sweep, "hydra.sweep.dir", 0.4, folder / "sweep"),
+        "evaluations": Job(evaluate.main, one, "hydra.run.dir", 0.2, folder / "evaluation"),
+        "pipelines": Job(pipeline.main, whole, "hydra.run.dir", 0.2, folder / "pipeline"),
+        "calibrations": Job(calibrate.main, fitted, "hydra.run.dir", 0.1, folder / "calibration"),
+        "studies": Job(console.main, study, "--out", 0.1, folder / "study"),
     }
     for job in found.values():
         job.root.mkdir()

@@ -16,9 +16,9 @@ from lcc_rl.runs.output import unbroken_output
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
     """Make a function a command: the one place for streams, signals and exit codes.
 
-    Wrong input (this package's errors, Hydra's, OSError) is one line on stderr and exit code 2,
-    an interrupt is exit code 130; any other error shows its traceback, exit code 1. Commands may
-    be nested.
+    Wrong input (this package's errors, Hydra's, OSError) and too little memory are one line on
+    stderr and exit code 2, an interrupt is exit code 130; any other error shows its traceback,
+    exit code 1. Commands may be nested.
     """
 
     @wraps(function)
@@ -32,9 +32,9 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
             cause = input_error(error)
             if isinstance(cause, Interrupted):
                 stop(str(cause), INTERRUPTED)
-            if cause is None and not (isinstance(error, OSError) or of_hydra(error)):
+            if cause is None and not (isinstance(error, (OSError, MemoryError)) or of_hydra(error)):
                 raise
-            stop(f"error: {cause or error}", BAD_INPUT)
+            stop(f"error: {cause or str(error) or type(error).__name__}", BAD_INPUT)
 
     return guarded
 

@@ -213,6 +213,7 @@ def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
 def _end_with_parent() -> None:
     """End this process once its parent was killed; it would wait for work forever."""
     logging.getLogger().setLevel(logging.INFO)
+    logging.raiseExceptions = False  # a log that cannot be written ends no training
     parent = multiprocessing.parent_process()
 
     def wait_for_end() -> None:

@@ -14,10 +14,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import settings
 from lcc_rl.envs.step import tick
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
-
-MOST_SEED = 2**32 - 1  # torch's generators take no more bits of it
 
 
 def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
@@ -96,8 +94,8 @@ class Clock(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         seed = 0 if seed is None else seed
         whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-        if not (whole and 0 <= seed <= MOST_SEED):
-            raise ConfigError(f"seed must be a whole number from 0 to {MOST_SEED}, got {seed!r}")
+        if not (whole and 0 <= seed <= LAST_SEED):
+            raise ConfigError(f"seed must be a whole number from 0 to {LAST_SEED}, got {seed!r}")
         self.generator.manual_seed(seed)
 
     def draw_seeds(self) -> torch.Tensor:
@@ -111,7 +109,7 @@ class Clock(EnvBase):
         if seeds is None:
             seeds = self.draw_seeds()
         else:
-            require_option(SEED, seeds, MOST_SEED + 1)
+            require_option(SEED, seeds, LAST_SEED + 1)
         return self._moment(seeds, torch.zeros_like(seeds))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -35,10 +35,12 @@ def check_folder(cfg: BaseConfig, folder: Path) -> None:
     Raises:
         ResultsError: naming what is there and the settings that differ.
     """
+    stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
+    if stored and not {"seed", "data"} <= stored.keys():
+        raise ResultsError(f"{folder} holds a {CONFIG} of something else; choose another folder")
     kept = [name for name in KEPT if (folder / name).exists()]
     if not kept:
         return
-    stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
     keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")

@@ -111,6 +111,7 @@ class SweepCallback(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Exit with one line before Hydra writes into the folder of another process's run."""
+        type(self).target, type(self).made = None, []
         try:
             type(self).target = folder = Path(config.hydra.run.dir)
             type(self).made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]

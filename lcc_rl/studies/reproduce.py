@@ -25,6 +25,7 @@ from lcc_rl.config import check_overrides
 from lcc_rl.config.schemas import FORMATS
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.runs.arguments import Arguments
+from lcc_rl.runs.states import claim
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import report as hcfs_report
@@ -49,14 +50,16 @@ def reproduce_alcc(arguments: Namespace, command: str) -> int:
         **common(arguments, usual),
         ablations=tuple(arguments.ablations) or None,
     )
-    outcomes = alcc.run(study, arguments.parts, command)
-    return concluded(outcomes, study.folder, "alcc", arguments.formats)
+    with claim(study.folder):
+        outcomes = alcc.run(study, arguments.parts, command)
+        return concluded(outcomes, study.folder, "alcc", arguments.formats)
 
 
 def reproduce_hcfs(arguments: Namespace, command: str) -> int:
     """Run the HCFS study and write its page; 1 if a training failed."""
     study = hcfs.Study(**common(arguments, "paper_hcfs"))
-    return concluded(hcfs.run(study, command), study.folder, "hcfs", arguments.formats)
+    with claim(study.folder):
+        return concluded(hcfs.run(study, command), study.folder, "hcfs", arguments.formats)
 
 
 def common(arguments: Namespace, recipe: str | None) -> dict[str, Any]:

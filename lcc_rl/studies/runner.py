@@ -24,6 +24,7 @@ from lcc_rl.io.settings import read_json
 from lcc_rl.results.runs import CONFIG, EPISODES, differing, flatten, load_config
 from lcc_rl.runs.interrupts import interruptible
 from lcc_rl.runs.progress import clock
+from lcc_rl.runs.states import is_claimed
 from lcc_rl.settings import MOST_PARALLEL
 
 log = logging.getLogger("lcc_rl")
@@ -175,6 +176,12 @@ def _start(runs: Sequence[Run], jobs: int) -> list[Outcome]:
 
 
 def _one(run: Run, children: set[subprocess.Popen[str]], stopping: threading.Event) -> Outcome:
+    if is_claimed(run.folder):  # by a training whose study was killed
+        log.info("%s: waits for the process that works on it", run.folder)
+    while is_claimed(run.folder) and not stopping.wait(1.0):
+        pass
+    if run.finished:
+        return Outcome(run, FINISHED)
     if stopping.is_set():
         return Outcome(run, FAILED, "not started")
     run.folder.mkdir(parents=True, exist_ok=True)

@@ -147,6 +147,13 @@ def test_a_finished_run_is_not_written_over(run, tmp_path, entry) -> None:
     assert content(run) == before
 
 
+def test_nor_is_a_folder_of_something_else(tmp_path) -> None:
+    (tmp_path / "config.yaml").write_text("site_name: mine\n")
+    assert "config.yaml of something else" in refused(
+        ["evaluate", *RULE, "hydra.run.dir=."], tmp_path
+    )
+
+
 @pytest.mark.parametrize("kept", ["checkpoint.pt", "command.txt"])
 def test_nor_is_a_stopped_training_or_a_stopped_pipeline(run, tmp_path, kept) -> None:
     (run / "episodes.parquet").rename(run / kept)
