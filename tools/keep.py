@@ -1,7 +1,7 @@
 """Keep the small tables behind a page: python tools/keep.py <what> <folder>… --out <path>
 
 lengths: the held-out windows of HCFS studies whose trainings differ in length, one file.
-sources: runs of platoons behind several sources of leaders, a folder each, named after it.
+sources: the windows of platoons behind several sources of leaders, one file.
 means: the means of one evaluation per window and per driver, two files in a folder.
 alcc: those of an ALCC study's main part, its learning curves, an episode and its drivers.
 """
@@ -22,6 +22,7 @@ from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.means import TRAINED, Means
 from lcc_rl.results.runs import EPISODES, STEPS
+from lcc_rl.results.savings import SOURCE
 from lcc_rl.studies.alcc.report import CURVES, MAIN
 from lcc_rl.studies.alcc.study import DRIVERS
 from lcc_rl.studies.hcfs.study import TRAINING
@@ -48,17 +49,15 @@ def lengths(studies: Sequence[Path], path: Path) -> None:
 
 
 def sources(evaluations: Sequence[Path], path: Path) -> None:
-    """Keep what CACC, DDPG and the hybrid, by its choices, did in the windows of every source."""
-    parts = []
-    for folder in evaluations:
-        rows = results.load(folder)
-        hybrid = (rows["strategy"] == "hcfs") & (rows["deployed.choice"] != "better")
-        names = rows["strategy"].mask(hybrid, "hcfs " + rows["deployed.choice"])
-        rows = rows.assign(strategy=names)[(rows["case"] == WINDOWS) & names.isin(STABLE)]
-        # CACC and DDPG drove beside every choice.
-        kept = per_run(rows.drop_duplicates([*RUN, "follower"]))
-        parts.append(rounded(kept[[*RUN, *MEASURES]]).assign(source=folder.name))
-    write_parquet(pd.concat(parts, ignore_index=True), path)
+    """Keep what CACC, DDPG and the hybrid, by its choices, did behind every source of leaders."""
+    rows = pd.concat([results.load(folder) for folder in evaluations], ignore_index=True)
+    hybrid = (rows["strategy"] == "hcfs") & (rows["deployed.choice"] != "better")
+    names = rows["strategy"].mask(hybrid, "hcfs " + rows["deployed.choice"])
+    rows = rows.assign(strategy=names)[(rows["case"] == WINDOWS) & names.isin(STABLE)]
+    # Rules and DDPG drove beside every choice.
+    rows = rows.drop_duplicates([SOURCE, *RUN, "follower"])
+    parts = [per_run(part).assign(source=name) for name, part in rows.groupby(SOURCE, sort=False)]
+    write_parquet(rounded(pd.concat(parts)[[SOURCE, *RUN, *MEASURES]]), path)
 
 
 def means(evaluations: Sequence[Path], target: Path) -> None:

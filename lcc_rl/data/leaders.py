@@ -35,7 +35,7 @@ WHOLE = "full length"  # a case that is a whole record, before the record's name
 Nodes = Mapping[str, Mapping[str, Any] | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """Evaluation run of a platoon behind a given stretch of a record.
 

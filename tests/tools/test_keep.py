@@ -47,11 +47,10 @@ def test_runs_behind_other_leaders_are_named_by_the_choice(tmp_path) -> None:
         rows = rows.assign(profile="a", run_id=0, min_gap_m=4.0, learned_share=0.0)
         rows = rows.assign(energy_kj_per_km=600.0 + rows["reward"])
         both = pd.concat([rows.assign(follower=1), rows.assign(follower=2, min_gap_m=3.0)])
-        write_parquet(both, tmp_path / "cycles" / choice / "episodes.parquet")
-        settings = f"deployed: {{choice: {choice}}}"
-        (tmp_path / "cycles" / choice / "config.yaml").write_text(settings)
+        write_parquet(both.assign(source="cycles"), tmp_path / choice / "episodes.parquet")
+        (tmp_path / choice / "config.yaml").write_text(f"deployed: {{choice: {choice}}}")
     path = tmp_path / "sources.parquet"
-    assert keep.main(["sources", str(tmp_path / "cycles"), "--out", str(path)]) == 0
+    assert keep.main(["sources", str(tmp_path), "--out", str(path)]) == 0
     kept = pd.read_parquet(path).set_index("strategy")
     sums = {"cacc tuned": -16.0, "ddpg": -12.0, "hcfs": -8.0, "hcfs first": -4.0}
     assert kept["reward"].to_dict() == sums

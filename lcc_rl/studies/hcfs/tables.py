@@ -48,7 +48,16 @@ LARGEST = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
 # What is kept of runs behind other sources of leaders, and of which strategies.
 MEASURES = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
 MEASURES += ["energy_kj_per_km"]
-STABLE = ("cacc tuned", LEARNED, "hcfs", "hcfs between", "hcfs first")
+STABLE = ("cacc tuned", "deadbeat", LEARNED, "hcfs", "hcfs between", "hcfs first")
+LEADERS = {  # sources of leaders, for readers
+    "traffic": "I-80",
+    "cycles": "cycles at half speed",
+    "fast_cycles": "cycles",
+    "openacc_3": "OpenACC 3",
+    "openacc_10": "OpenACC 10",
+    "i24": "I-24",
+    "everyday": "everyday drives",
+}
 
 
 def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -220,7 +229,7 @@ def sources(runs: pd.DataFrame) -> pd.DataFrame:
             own = group[group["strategy"] == name]
             saved = intervals.saving(energy, spent[STABLE[0]])
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
-            row = {"leaders": source, "strategy": NAMES[name]}
+            row = {"leaders": LEADERS.get(str(source), source), "strategy": NAMES[name]}
             row |= intervals.crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
             row |= {"gap error_m": own["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
