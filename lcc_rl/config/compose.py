@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +19,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config.nodes import TARGET, find_target, forget_places, settings_of, with_defaults
+from lcc_rl.config.nodes import (
+    TARGET,
+    find_target,
+    forget_places,
+    settings_of,
+    takes_action,
+    with_defaults,
+)
 from lcc_rl.config.schemas import KINDS, as_plain, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
@@ -28,7 +35,7 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 CONF = "lcc_rl.conf"
 # Settings that do not change any row of a result.
 NOT_IDENTITY = (
-    *("resume", "jobs", "sweep", "objective", "logger", "trust", "figure_formats"),
+    *("resume", "jobs", "sweep", "objective", "logger", "trust", "figure_formats", "table"),
     "training.keep_every",
 )
 # Launchers and sweepers that come with other packages: which extra brings them.
@@ -122,6 +129,13 @@ def _is_setting(key: str) -> bool:
     return key.partition(".")[0] in _top_level() and key not in _groups()
 
 
+def choices(group: str) -> list[str]:
+    """Return the names of a group's files, those of ``--config-dir`` among them."""
+    if GlobalHydra.instance().is_initialized():
+        return list(GlobalHydra.instance().config_loader().get_group_options(group))
+    return sorted(path.stem for path in Path(str(files(CONF))).joinpath(group).glob("*.yaml"))
+
+
 @cache
 def _groups() -> frozenset[str]:
     folder = Path(str(files(CONF)))
@@ -149,11 +163,19 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         content: Any = OmegaConf.to_container(whole, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
-    if isinstance(content.get("agent"), dict) and TARGET not in content["agent"]:
-        content["agent"] = None  # a recipe's settings of an agent, without one
+    if not _learns(content):
+        content["agent"] = None
     leave_out_foreign(content, overrides)
     check_used(content, overrides, sweep)
     return parse_config(content, KINDS[entry])
+
+
+def _learns(content: Mapping[str, Any]) -> bool:
+    """Whether there is an agent, and a controller that carries out its actions."""
+    agent, driver = content.get("agent"), content.get("scenario", {}).get("controllers", {})
+    if not isinstance(agent, dict) or TARGET not in agent:  # a recipe's settings of an agent
+        return False
+    return AUTOMATED not in driver or takes_action(driver[AUTOMATED])
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull, QhullError
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import INK, in_words, legend_above, new_figure, unbox
+from lcc_rl.figures.drawing import INK, legend_above, new_figure, unbox
 from lcc_rl.figures.platoon import PARENTS, WHO_DRIVES
+from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import motion_of, sample_episodes, visited
 
 NEAR = 1.0  # of a map's speed: what an outline shows [m/s]
