@@ -27,7 +27,7 @@ from lcc_rl.config.nodes import (
     takes_action,
     with_defaults,
 )
-from lcc_rl.config.schemas import KINDS, as_plain, parse_config
+from lcc_rl.config.schemas import KINDS, SECTIONS, as_plain, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
@@ -167,7 +167,14 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         content["agent"] = None
     leave_out_foreign(content, overrides)
     check_used(content, overrides, sweep)
-    return parse_config(content, KINDS[entry])
+    try:
+        return parse_config(content, KINDS[entry])
+    except ConfigError as error:  # of a class that has no such setting; another choice may
+        found = re.match(r"unknown setting of (\w+) \(", str(error))
+        others = choices(found.group(1)) if found else []
+        if not others:
+            raise
+        raise ConfigError(f"{error} Other choices: {found.group(1)}={'|'.join(others)}") from error
 
 
 def _learns(content: Mapping[str, Any]) -> bool:
@@ -216,9 +223,13 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
             return ConfigError(f"{group}/{name} is not installed: {how_to_install(EXTRAS[name])}")
-        return unknown_name(f"choice of {group}" if group else "option", name, error.options or ())
+        known = error.options or ()
+        own = f" (of your own: {group}/{name}.yaml needs --config-dir <its folder>)"
+        return unknown_name(f"choice of {group}{own}" if group else "option", name, known)
     if isinstance(error, OverrideParseException):
-        key, _, value = str(error.override).lstrip("+").partition("=")
+        key, equals, value = str(error.override).lstrip("+").partition("=")
+        if not equals:
+            return ConfigError(f"{key}: settings are written key=value; -h shows the help")
         return ConfigError(
             f"{key}={value}: cannot be read as a setting. Brackets must be closed, and text "
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\""
@@ -227,11 +238,21 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
     if found is not None:
-        return unknown_name("option", found.group(1), _top_level() | _groups())
+        return _unknown_option(found.group(1))
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     words = [*overrides, *text.partition("See https://")[0].split()]
     return ConfigError(" ".join(words))
+
+
+def _unknown_option(name: str) -> ConfigError:
+    """Return the error for an option that does not exist; many belong into a section."""
+    root = name.partition(".")[0]
+    places = {key: section for section, kind in SECTIONS.items() for key in settings_of(kind) or ()}
+    places |= dict.fromkeys((HUMAN, AUTOMATED), "scenario.controllers")
+    if root in places:
+        return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
+    return unknown_name("option", name, _top_level() | _groups())
 
 
 def config_hash(content: Any) -> str:

@@ -120,7 +120,11 @@ def _node(who: Any) -> Any:
     if who.endswith(YAML):
         return parse_yaml(read_text(Path(who)), who)
     if DOTTED.fullmatch(who) is None:
-        raise unknown_name("strategy", who, [*rules(), *OTHERS])
-    if inspect.isclass(find_target(who, "compare")):
+        raise unknown_name(
+            "strategy (controller/<name>.yaml of your own needs --config-dir)",
+            who,
+            [*rules(), *OTHERS],
+        )
+    if inspect.isclass(find_target(who, f"compare={who}")):
         return {TARGET: who}
     return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": who}
