@@ -171,10 +171,10 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         return parse_config(content, KINDS[entry])
     except ConfigError as error:  # of a class that has no such setting; another choice may
         found = re.match(r"unknown setting of (\w+) \(", str(error))
-        others = choices(found.group(1)) if found else []
-        if not others:
+        group = found.group(1) if found else ""
+        if not group or not choices(group):
             raise
-        raise ConfigError(f"{error} Other choices: {found.group(1)}={'|'.join(others)}") from error
+        raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from error
 
 
 def _learns(content: Mapping[str, Any]) -> bool:
