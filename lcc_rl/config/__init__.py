@@ -11,6 +11,7 @@ from lcc_rl.config.compose import (
     identity,
     is_sweep,
     load,
+    own_file,
     parsed,
 )
 from lcc_rl.config.words import check_overrides, key_of, root_key
@@ -28,6 +29,7 @@ __all__ = [
     "is_sweep",
     "key_of",
     "load",
+    "own_file",
     "parsed",
     "root_key",
 ]

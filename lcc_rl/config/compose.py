@@ -224,8 +224,10 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
             return ConfigError(f"{group}/{name} is not installed: {how_to_install(EXTRAS[name])}")
         known = error.options or ()
-        own = f" (of your own: {group}/{name}.yaml needs --config-dir <its folder>)"
-        return unknown_name(f"choice of {group}{own}" if group else "option", name, known)
+        if not group:
+            return unknown_name("option", name, known)
+        error = unknown_name(f"choice of {group}", name, known)
+        return ConfigError(f"{error} {own_file(group, name)}")
     if isinstance(error, OverrideParseException):
         key, equals, value = str(error.override).lstrip("+").partition("=")
         if not equals:
@@ -253,6 +255,11 @@ def _unknown_option(name: str) -> ConfigError:
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     return unknown_name("option", name, _top_level() | _groups())
+
+
+def own_file(group: str, name: str) -> str:
+    """Return what makes a file of the user's own a choice."""
+    return f"A file of your own, {group}/{name}.yaml, needs --config-dir <its folder>."
 
 
 def config_hash(content: Any) -> str:

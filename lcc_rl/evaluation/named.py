@@ -11,7 +11,7 @@ from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 
-from lcc_rl.config import choices, load
+from lcc_rl.config import choices, load, own_file
 from lcc_rl.config.nodes import TARGET, build, find_target, short_name
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.errors import ConfigError, require, unknown_name
@@ -120,11 +120,8 @@ def _node(who: Any) -> Any:
     if who.endswith(YAML):
         return parse_yaml(read_text(Path(who)), who)
     if DOTTED.fullmatch(who) is None:
-        raise unknown_name(
-            "strategy (controller/<name>.yaml of your own needs --config-dir)",
-            who,
-            [*rules(), *OTHERS],
-        )
+        error = unknown_name("strategy", who, [*rules(), *OTHERS])
+        raise ConfigError(f"{error} {own_file('controller', who)}")
     if inspect.isclass(find_target(who, f"compare={who}")):
         return {TARGET: who}
     return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": who}
