@@ -27,6 +27,7 @@ from lcc_rl.evaluation.strategies import (
     Strategy,
     applies,
     baselines,
+    beside_filtered,
     check_distinct,
     named_apart,
     no_policy,
@@ -204,6 +205,8 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
         strategies.append(dataclasses.replace(one, name=name) if named else one)
     if own:
         strategies += studied(cfg, policy, inputs.population)
+    if cfg.evaluation.rows == "episodes":
+        strategies = beside_filtered(cfg, strategies) + strategies
     for strategy in (s for s in strategies if s.policy is not None):
         cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)

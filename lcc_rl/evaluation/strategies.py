@@ -39,6 +39,7 @@ log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
+ALONE, RULE_FILTERED = "constant_filtered", "idm_acc_filtered"
 RECORDED_START = "lcc_rl.pieces.RecordedStart"
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
@@ -123,6 +124,19 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
     if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)
     return Strategy(name, without_filter(driven_by(cfg, controller)))
+
+
+def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Build what a filtered policy is to be seen beside: the filter alone, and a rule behind it."""
+    found = [one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy]
+    if not any(found):
+        return []
+    names = {one.name for one in strategies}
+    own = cfg.scenario.filters.get(AUTOMATED) is not None
+    wanted = [] if own and names.intersection(TUNED) else [RULE_FILTERED]
+    cfg = deepcopy(cfg)
+    cfg.scenario.filters[AUTOMATED] = next(filter(None, found))
+    return [baseline(cfg, name) for name in [ALONE, *wanted] if name not in names]
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:

@@ -21,6 +21,7 @@ WHO = {
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
     "constant_filtered": "safety filter alone",
+    "idm_acc_filtered": "tuned IDM, filtered",
     "acc tuned": "ACC, tuned on I-80",
     "idm tuned": "IDM, tuned on I-80",
     "rule": "IDM, tuned on these data",
