@@ -16,6 +16,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET, path_of
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.results.headline import headline
 from lcc_rl.results.tables import summary
 from lcc_rl.settings import values
 
@@ -37,6 +38,11 @@ class Run:
     def table(self) -> pd.DataFrame:
         """A row per strategy: energies, savings with intervals, safety."""
         return summary(self.rows)
+
+    @cached_property
+    def headline(self) -> pd.DataFrame:
+        """The table that commands print: energy per km, saved, distance, safety."""
+        return headline(self.table)
 
     @cached_property
     def training(self) -> pd.DataFrame:
@@ -117,6 +123,8 @@ def _setting(who: Any) -> Any:
         return str(who.folder)
     if isinstance(who, Controller):
         return {TARGET: path_of(type(who)), **values(who)}
+    if isinstance(who, Mapping):
+        return dict(who)
     return path_of(who) if callable(who) else str(who)
 
 

@@ -15,7 +15,7 @@ from lcc_rl.errors import LccError
 from lcc_rl.evaluation.named import controller_of
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
-from lcc_rl.pieces import Controller, Law
+from lcc_rl.pieces import ConstantAcceleration, Controller, Law
 from lcc_rl.settings import Positive
 
 
@@ -55,10 +55,11 @@ def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, mo
 
 
 def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None:
-    both = {"near": Steady(gain=3.0), "near_filtered": Steady(gain=3.0)}
+    full = ConstantAcceleration(acceleration=3.0)
+    both = {"full": full, "full_filtered": full}
     words = [*SMALL, "+filter=cbf"]
     found = energies(lcc_rl.compare(both, overrides=words, folder=tmp_path / "a").rows)
-    assert found["near"] != found["near_filtered"]
+    assert found["full"] != found["full_filtered"]
     with pytest.raises(LccError, match=r"add \+filter=cbf"):
         lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
 
@@ -80,11 +81,14 @@ def test_an_own_controller_has_its_row_on_every_variant_and_task(words, tmp_path
 
 
 def test_a_variant_and_a_controller_of_a_folder_stand_in_the_table(tmp_path) -> None:
-    for group, text in {
-        "controller": f"_target_: {PATH}\ngain: 0.3\n",
-        "variant": "# @package _global_\ndefaults: [idm]\nvariant: own_variant\n"
-        f"scenario: {{controllers: {{automated: {{gain: 0.3, _target_: {PATH}}}}}}}\n",
-    }.items():
+    node = f"{{_target_: {PATH}, gain: 0.3}}"
+    place = "override /controller@scenario.controllers.automated: null"
+    variant = f"""# @package _global_
+defaults: [idm, {place}]
+variant: own_variant
+scenario: {{controllers: {{automated: {node}}}}}
+"""
+    for group, text in {"controller": node, "variant": variant}.items():
         (tmp_path / "conf" / group).mkdir(parents=True)
         (tmp_path / "conf" / group / f"own_{group}.yaml").write_text(text)
     words = ["--config-dir", "conf", *SMALL, "hydra.run.dir=run"]
