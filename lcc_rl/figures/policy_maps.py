@@ -88,7 +88,7 @@ def _panels(rows: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, float, pd
     for line, name in zip(axes, names, strict=True):
         for axis, speed in zip(line, speeds, strict=True):
             own = (rows["strategy"] == name) & (rows["speed_mps"] == speed)
-            axis.set_title(f"{in_words(name)} at {speed:g} m/s", fontsize=10, loc="right")
+            axis.set_title(f"{in_words(name)}: {speed:g} m/s", fontsize=10, loc="right")
             unbox(axis)
             panels.append((axis, name, float(speed), rows[own]))
         line[0].set_ylabel("gap [m]")

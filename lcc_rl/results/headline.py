@@ -27,8 +27,7 @@ WHO = {
     "rule": "IDM, tuned on these data",
     "reference": "network, for itself",
     NETWORK: "network, for both",
-    "own_energy": "network, itself twice",
-    "direct": "nobody: no car there",
+    "direct": "no automated car",
 }
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
 RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
