@@ -163,7 +163,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         content: Any = OmegaConf.to_container(whole, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
-    if not _learns(content):
+    if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
     check_used(content, overrides, sweep)

@@ -74,7 +74,7 @@ def _of_agent(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         reason = f"variant {content['variant']} learns nothing"
         if is_node(driver) and not takes_action(driver):
             kind = short_name(driver[TARGET])
-            reason = f"{kind} drives the automated vehicles and takes no action of a policy"
+            reason += f": {kind} drives the automated vehicles and takes no action of a policy"
         for key in ("agent", "training"):
             yield key, reason
         return
