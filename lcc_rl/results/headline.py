@@ -17,7 +17,7 @@ from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
 
 HUMAN, NETWORK = "human", "alcc"
 WHO = {
-    "idm": "one human driver (IDM)",
+    "idm": "one driver (IDM)",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
     "constant_filtered": "safety filter alone",

@@ -130,7 +130,7 @@ def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tm
     figure = run_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
     right = figure.axes[1]
     assert [x.get_text() for x in right.get_yticklabels()] == [
-        "one human driver (IDM)",
+        "one driver (IDM)",
         "own energy",
         "network, for itself",
     ]
