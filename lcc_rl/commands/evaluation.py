@@ -340,4 +340,5 @@ def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         else:
             table = headline.headline(summary(rows, source))
             show(headline.as_rich(table, title, headline.caption_of(table)))
-    log.info(headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step))
+    if words := headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step):
+        log.info(words)
