@@ -14,7 +14,7 @@ export OMP_NUM_THREADS ?= 1
 .PHONY: run test test-all extras coverage lint size docs clean
 
 run: $(STAMP)
-	$(BIN)/python -m lcc_rl.cli.pipeline experiment=main $(ARGS)
+	$(BIN)/python -m lcc_rl.cli.pipeline $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
+from lcc_rl.config.nodes import TARGET, path_of
 from lcc_rl.io.files import Rows, read_parquet
+from lcc_rl.pieces.controllers import Controller
+from lcc_rl.results.headline import headline
 from lcc_rl.results.tables import summary
+from lcc_rl.settings import values
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,11 @@ class Run:
     def table(self) -> pd.DataFrame:
         """A row per strategy: energies, savings with intervals, safety."""
         return summary(self.rows)
+
+    @cached_property
+    def headline(self) -> pd.DataFrame:
+        """The table that commands print: energy per km, saved, distance, safety."""
+        return headline(self.table)
 
     @cached_property
     def training(self) -> pd.DataFrame:
@@ -72,7 +82,7 @@ def learn(
 
 
 def compare(
-    strategies: Sequence[str | Path | Run],
+    strategies: Sequence[Any] | Mapping[str, Any],
     variant: str = "alcc",
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
@@ -80,7 +90,10 @@ def compare(
     """Evaluate policies and controllers on the same held-out windows, beside the baselines.
 
     Args:
-        strategies: runs, run folders, policy files, ``"pretrained/alcc"`` or controllers' names.
+        strategies: runs, run folders, policy files, ``"pretrained/alcc"``; controllers as names,
+            objects, classes, plain functions of named entries (:class:`lcc_rl.pieces.Law`) or yaml
+            files; or these by the names of their rows. A name that ends in ``_filtered`` means
+            behind the safety filter.
         variant: whose scenario and data they meet.
         overrides: further settings, ``["evaluation.drivers=12"]``.
         folder: where the files go; by default a new one below ``outputs/evaluate``.
@@ -93,11 +106,26 @@ def compare(
 
     Examples:
         >>> found = compare([run, "pretrained/alcc_limits", "idm_acc"])  # doctest: +SKIP
+        >>> found = compare({"slow": PID(gain=0.1), "fast": PID(gain=0.4)})  # doctest: +SKIP
     """
     target = _folder("evaluate", variant, folder)
     cfg = load("evaluate", [f"variant={variant}", *overrides])
-    cfg.compare = [str(s.folder if isinstance(s, Run) else s) for s in strategies]
+    if isinstance(strategies, Mapping):
+        cfg.compare = {name: _setting(who) for name, who in strategies.items()}
+    else:
+        cfg.compare = [_setting(who) for who in strategies]
     return Run(target, evaluation.run(cfg, target, own=False, quiet=True))
+
+
+def _setting(who: Any) -> Any:
+    """Return what a configuration calls a policy or a controller."""
+    if isinstance(who, Run):
+        return str(who.folder)
+    if isinstance(who, Controller):
+        return {TARGET: path_of(type(who)), **values(who)}
+    if isinstance(who, Mapping):
+        return dict(who)
+    return path_of(who) if callable(who) else str(who)
 
 
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:

@@ -58,10 +58,11 @@ def test_help_names_the_version_and_every_command(tmp_path) -> None:
     ("words", "unused", "printed"),
     [
         (
-            ["lcc_rl.cli.train", "--help"],
+            ["lcc_rl.cli.train", "--help-all"],
             HEAVY | TABLES,
             "calibration: both, energy, global, local",
         ),
+        (["lcc_rl.cli.train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
         (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
         (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
     ],

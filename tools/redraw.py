@@ -25,11 +25,12 @@ from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.data.leaders import stretch
 from lcc_rl.figures.calibration import twins_figure
-from lcc_rl.figures.drawing import in_words, legend_above, new_figure, save, style
+from lcc_rl.figures.drawing import legend_above, new_figure, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
+from lcc_rl.results.headline import in_words
 from lcc_rl.studies.reproduce import REPORTS
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")

@@ -12,7 +12,7 @@ from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.replay import Trainer
 from lcc_rl.agents.tuned import SearchLoop, Tuned
 from lcc_rl.config import identity
-from lcc_rl.config.nodes import TARGET, build, short_name
+from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
@@ -59,15 +59,9 @@ def make_trainer(
     """Build the training loop of an agent with its environment.
 
     Raises:
-        ConfigError: naming the option at fault, or if no vehicle takes the agent's action.
+        ConfigError: naming the option at fault.
     """
     env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
-    if not list(env.full_action_spec.keys(True, True)):
-        kind = short_name(cfg.scenario.controllers[AUTOMATED].get(TARGET))
-        raise ConfigError(
-            f"scenario.controllers.automated ({kind}) takes no action of a policy, so nothing can "
-            "be learned; use agent=none, or leave the controller out"
-        )
     loops: dict[type, Any] = {Analytic: GradientTrainer, Tuned: SearchLoop}
     loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))

@@ -20,6 +20,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from lcc_rl.cli.guard import main_guard
+from lcc_rl.cli.help import FULL_HELP, HELP
+from lcc_rl.cli.help import text as help_text
 from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed, root_key
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
@@ -70,6 +72,10 @@ def entry_point(
 
         @wraps(function)
         def main() -> None:
+            if HELP.intersection(sys.argv):
+                words = [word for word in sys.argv[1:] if word[:1] != "-" and "=" in word]
+                print(help_text(config_name, words))
+                return
             gc.disable()  # while modules are loaded, a fifth of whose time it would take
             try:
                 if SWEEP.intersection(sys.argv):
@@ -98,7 +104,8 @@ def start(command: Callable[[], Any]) -> None:
 
 def run_sorted(command: Callable[[], Any]) -> None:
     """Run a Hydra command whose flags may stand anywhere among the settings."""
-    with patch.object(sys, "argv", [sys.argv[0], *flags_first(sys.argv[1:])]):
+    words = ["--help" if word == FULL_HELP else word for word in sys.argv[1:]]
+    with patch.object(sys, "argv", [sys.argv[0], *flags_first(words)]):
         sweep(command)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.cli.entry import entry_point, resumed_folder
+from lcc_rl.config import root_key
 from lcc_rl.config.schemas import PipelineConfig
 from lcc_rl.runs.output import headlines
 
@@ -15,8 +16,10 @@ def main(cfg: PipelineConfig) -> None:
     from lcc_rl.commands.pipeline import run  # loads torch
 
     folder = resumed_folder(cfg, ("resume", "trust"))
-    with headlines():
-        run(cfg, folder, list(HydraConfig.get().overrides.task))
+    typed, chosen = HydraConfig.get().overrides.task, HydraConfig.get().runtime.choices
+    own = [] if any(root_key(item) == "experiment" for item in typed) else ["experiment"]
+    with headlines():  # the parts are composed of what was typed, and of the default
+        run(cfg, folder, [*(f"{key}={chosen[key]}" for key in own), *typed])
 
 
 if __name__ == "__main__":

@@ -21,7 +21,8 @@ from lcc_rl.envs.inputs import (
 from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader, plan_of
-from lcc_rl.evaluation.strategies import DIRECT, applies, baseline_controller, deployed
+from lcc_rl.evaluation.named import DIRECT, controller_of
+from lcc_rl.evaluation.strategies import applies, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
@@ -121,15 +122,15 @@ def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -
     return {what: count * steps * moment.bytes()}
 
 
-def check_installed(cfg: StudyConfig, compared: Sequence[str] = ()) -> None:
+def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
     """Refuse controllers whose package is not installed, before data are read.
 
     Args:
         cfg: configuration of a study, of which the baselines are checked, too.
-        compared: names of further controllers.
+        compared: further controllers, see :func:`lcc_rl.evaluation.named.controller_of`.
     """
-    names = {*cfg.evaluation.baselines, *compared} - {DIRECT}
-    others = [baseline_controller(name) for name in sorted(names) if applies(cfg, name)]
+    own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
+    others = [controller_of(who) for who in (*own, *compared) if who != DIRECT]
     for key, _, target in settings_at([cfg.scenario.controllers, *others]):
         if key.endswith(f".{TARGET}"):
             getattr(find_target(str(target), key), "check_installed", lambda: None)()
@@ -147,11 +148,8 @@ def check_variant(cfg: StudyConfig) -> None:
         own = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a variant of the user's own, known to this command line only
         return
-    if learns(cfg) and not learns(own):
-        rules = "'compare=[idm,acc,…]' without variant=…" if cfg.task else "a learned variant"
-        raise ConfigError(
-            f"variant={cfg.variant} learns nothing: remove agent=…, or choose {rules}"
-        )
+    if learns(cfg) and not learns(own):  # it has no automated vehicle, and the task has
+        raise ConfigError(f"variant={cfg.variant} learns nothing: use compare=[{cfg.variant}]")
     if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "

@@ -37,10 +37,11 @@ from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, tra
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.io.files import write_parquet
+from lcc_rl.results.headline import as_rich, caption_of, headline, show
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import EPISODES
 from lcc_rl.results.savings import savings
-from lcc_rl.results.tables import as_rich, summary
+from lcc_rl.results.tables import summary
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -167,7 +168,8 @@ def main(arguments: list[str]) -> int:
     check_overrides(overrides, GIVEN, "the controller is that of --policy, as it was trained")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     episodes = plan(options, overrides)
-    Console().print(as_rich(summary(episodes), "the whole profile known"))
+    table = headline(summary(episodes))
+    show(as_rich(table, "the whole profile known", caption_of(table)))
     if options.regard:
         Console().print(regard(episodes), highlight=False)
     return 0

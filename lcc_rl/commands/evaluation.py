@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -16,31 +18,30 @@ from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy
-from lcc_rl.errors import ConfigError, Interrupted, require, unknown_name
+from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
+from lcc_rl.evaluation.named import DIRECT, RECORDED, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import (
     POLICY,
-    RECORDED,
     Strategy,
     applies,
     baselines,
+    beside_filtered,
     check_distinct,
     named_apart,
     no_policy,
-    rules,
     studied,
     trained,
 )
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
+from lcc_rl.results import headline, scores, string_tables
+from lcc_rl.results.headline import show
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
-from lcc_rl.results.scores import Task, scores
-from lcc_rl.results.scores import as_rich as scores_as_rich
-from lcc_rl.results.string_tables import as_rich as vehicles_as_rich
-from lcc_rl.results.string_tables import case_table
-from lcc_rl.results.tables import as_rich, leader_too_fast, show, summary
+from lcc_rl.results.scores import Task
+from lcc_rl.results.tables import leader_too_fast, summary
 from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -96,7 +97,9 @@ def complete(cfg: EvaluateConfig, folder: Path) -> None:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
-        made, paths = table.stat().st_mtime, map(Path, filter(None, (cfg.policy, *cfg.compare)))
+        named = cfg.compare.values() if isinstance(cfg.compare, Mapping) else cfg.compare
+        made, names = table.stat().st_mtime, (cfg.policy, *named)
+        paths = [Path(name) for name in names if isinstance(name, str)]
         files = [path / POLICY if path.is_dir() else path for path in paths]
         if all(path.stat().st_mtime <= made for path in files if path.exists()):
             log.info("%s: finished before", folder.name)
@@ -138,17 +141,40 @@ def task_of(cfg: StudyConfig) -> Task | None:
 
 
 def only_named(cfg: EvaluateConfig) -> bool:
-    """Whether a task compares those that are named only: nobody's policy is its own variant's."""
-    return task_of(cfg) is not None and bool(cfg.compare) and cfg.policy is None and learns(cfg)
+    """Whether only those are compared that are named: nobody's policy is its own variant's."""
+    return bool(cfg.compare) and cfg.policy is None and learns(cfg)
 
 
-def check_named(names: Sequence[str]) -> None:
-    """Check that whom ``compare`` names exists: a controller, a baseline, a folder or a policy."""
-    for name in names:
-        plain_name = Path(name).name == name and not Path(name).suffix
-        if plain_name and name not in rules() and name != PRETRAINED and not Path(name).exists():
-            known = [*rules(), PRETRAINED, "<run folder>", "<policy.pt>"]
-            raise unknown_name("strategy (compare)", name, known)
+def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return whom ``compare`` names: controllers by their names in tables, and policies.
+
+    Policies have the name that was given, or the place of their file.
+
+    Raises:
+        ConfigError: if two have one name, or a controller is unknown or has nobody to drive.
+    """
+    named = cfg.compare
+    if not isinstance(named, Mapping):
+        labels = [who if is_policy(who) else label_of(who) for who in named]
+        for label, count in Counter(labels).items():
+            require(
+                count == 1,
+                f"compare names two {label}: give each a name, 'compare={{first: …, second: …}}'",
+            )
+        named = dict(zip(labels, named, strict=True))
+    task = task_of(cfg)
+    policies = {label: str(who) for label, who in named.items() if is_policy(who)}
+    rivals = {label: who for label, who in named.items() if label not in policies}
+    for label, who in rivals.items():
+        if who != DIRECT:
+            controller_of(who)
+        require(applies(cfg, label), f"compare={label}: it has no vehicle to drive in this string")
+    if task is not None:  # its own pretrained policy
+        policies = {
+            label: f"{PRETRAINED}/{task.name}" if who == PRETRAINED else who
+            for label, who in policies.items()
+        }
+    return rivals, policies
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
@@ -161,20 +187,11 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     own = not only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
     trust, policy = tuple(cfg.trust), None
-    check_named(cfg.compare)
+    rivals, paths = compared(cfg)
     if cfg.policy is not None and learns(cfg):
         policy = load_policy(cfg.policy, cfg.variant, trust)
-    rivals = [name for name in cfg.compare if name in rules() and not Path(name).exists()]
-    for name in rivals:
-        require(applies(cfg, name), f"compare={name}: it has no vehicle to drive in this string")
-    check_installed(cfg, rivals)
-    task = task_of(cfg)
-    paths = [
-        f"{PRETRAINED}/{task.name}" if task is not None and path == PRETRAINED else path
-        for path in cfg.compare
-        if path not in rivals
-    ]
-    compared = {path: load_policy(path, cfg.variant, trust) for path in paths}
+    check_installed(cfg, list(rivals.values()))
+    policies = {name: load_policy(path, cfg.variant, trust) for name, path in paths.items()}
     if own and learns(cfg) and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
@@ -182,9 +199,14 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
         log.info(line)
     check_evaluation(cfg, inputs)
     strategies = [one for one in baselines(cfg, rivals) if _is_played(one, inputs, rivals)]
-    strategies += [trained(cfg, path, compared[path], inputs.population) for path in paths]
+    for name, path in paths.items():
+        one = trained(cfg, path, policies[name], inputs.population)
+        named = isinstance(cfg.compare, Mapping)
+        strategies.append(dataclasses.replace(one, name=name) if named else one)
     if own:
         strategies += studied(cfg, policy, inputs.population)
+    if cfg.evaluation.rows == "episodes":
+        strategies = beside_filtered(cfg, strategies) + strategies
     for strategy in (s for s in strategies if s.policy is not None):
         cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)
@@ -192,7 +214,7 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     return strategies, inputs
 
 
-def _is_played(strategy: Strategy, inputs: Inputs, rivals: Sequence[str]) -> bool:
+def _is_played(strategy: Strategy, inputs: Inputs, rivals: Collection[str]) -> bool:
     """Whether a baseline can be played: a recorded follower only where one was recorded."""
     if strategy.name != RECORDED or inputs.evaluation.followers is not None:
         return True
@@ -292,12 +314,14 @@ def _play_missing(
 
 
 def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
-    """Print the summary of an evaluation, or the scores of its task."""
+    """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
+    full = cfg.table == "all"
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
+        draw = string_tables.in_full if full else string_tables.as_rich
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
-                show(vehicles_as_rich(case_table(part, case), f"{of}{case}"))
+                show(draw(string_tables.case_table(part, case), f"{of}{case}"))
         return
     plan, task = episodes.plan_of(cfg, inputs), task_of(cfg)
     drivers = f"{len(plan.chosen)} drivers"
@@ -309,7 +333,12 @@ def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
-            table = scores(part, task, build_energy(cfg))
-            show(scores_as_rich(table, task, f"task {task.name}: {title}"))
+            table = scores.scores(part, task, build_energy(cfg))
+            show((scores.in_full if full else scores.as_rich)(table, task, f"{task.name}: {title}"))
+        elif full:
+            show(headline.in_full(summary(rows, source), title))
         else:
-            show(as_rich(summary(rows, source), title))
+            table = headline.headline(summary(rows, source))
+            show(headline.as_rich(table, title, headline.caption_of(table)))
+    if words := headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step):
+        log.info(words)

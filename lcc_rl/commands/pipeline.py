@@ -34,13 +34,13 @@ from lcc_rl.envs.inputs import build_source, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
-from lcc_rl.figures.main_page import as_rich, caption_of, verdict, write_page
+from lcc_rl.figures.main_page import held_to, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
+from lcc_rl.results.headline import as_rich, caption_of, headline, show, verdict
 from lcc_rl.results.runs import check_folder, load_config, save_config
-from lcc_rl.results.tables import show
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -150,11 +150,12 @@ def _run(
         save(curve, place, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
         write_figures(folder / FINAL)
-        caption = caption_of(trainings.values())
-        page, table = write_page(folder, [command], caption)
+        limit = held_to(trainings.values())
+        page, found = write_page(folder, [command], limit)
+        table = headline(found)
         title = "A leader, the car, and a human driver behind it: held-out windows"
-        show(as_rich(table, title, caption))
-        tell(verdict(table))
+        show(as_rich(table, title, caption_of(table, limit)))
+        tell(verdict(found))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

@@ -99,8 +99,8 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     if not learns(cfg) or cfg.policy is not None:
         save_config(cfg, folder)
     if not learns(cfg):
-        log.info("variant %s learns nothing: evaluating it", cfg.variant)
         strategy = rule(cfg)
+        log.info("%s learns nothing: evaluating it", strategy.name)
     elif cfg.policy is not None:
         strategy = _given(cfg, inputs, folder)
     else:

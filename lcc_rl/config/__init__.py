@@ -4,12 +4,14 @@ from lcc_rl.config.compose import (
     HYDRA_ERRORS,
     NOT_IDENTITY,
     as_meant,
+    choices,
     composed,
     config_hash,
     explained,
     identity,
     is_sweep,
     load,
+    own_file,
     parsed,
 )
 from lcc_rl.config.words import check_overrides, key_of, root_key
@@ -19,6 +21,7 @@ __all__ = [
     "NOT_IDENTITY",
     "as_meant",
     "check_overrides",
+    "choices",
     "composed",
     "config_hash",
     "explained",
@@ -26,6 +29,7 @@ __all__ = [
     "is_sweep",
     "key_of",
     "load",
+    "own_file",
     "parsed",
     "root_key",
 ]

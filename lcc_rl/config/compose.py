@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,8 +19,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from lcc_rl.config.nodes import TARGET, find_target, forget_places, settings_of, with_defaults
-from lcc_rl.config.schemas import KINDS, as_plain, parse_config
+from lcc_rl.config.nodes import (
+    TARGET,
+    find_target,
+    forget_places,
+    settings_of,
+    takes_action,
+    with_defaults,
+)
+from lcc_rl.config.schemas import KINDS, SECTIONS, as_plain, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
@@ -28,7 +35,7 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 CONF = "lcc_rl.conf"
 # Settings that do not change any row of a result.
 NOT_IDENTITY = (
-    *("resume", "jobs", "sweep", "objective", "logger", "trust", "figure_formats"),
+    *("resume", "jobs", "sweep", "objective", "logger", "trust", "figure_formats", "table"),
     "training.keep_every",
 )
 # Launchers and sweepers that come with other packages: which extra brings them.
@@ -122,6 +129,13 @@ def _is_setting(key: str) -> bool:
     return key.partition(".")[0] in _top_level() and key not in _groups()
 
 
+def choices(group: str) -> list[str]:
+    """Return the names of a group's files, those of ``--config-dir`` among them."""
+    if GlobalHydra.instance().is_initialized():
+        return list(GlobalHydra.instance().config_loader().get_group_options(group))
+    return sorted(path.stem for path in Path(str(files(CONF))).joinpath(group).glob("*.yaml"))
+
+
 @cache
 def _groups() -> frozenset[str]:
     folder = Path(str(files(CONF)))
@@ -149,11 +163,26 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         content: Any = OmegaConf.to_container(whole, resolve=True)
     except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
         raise ConfigError(" ".join(str(error).split())) from error
-    if isinstance(content.get("agent"), dict) and TARGET not in content["agent"]:
-        content["agent"] = None  # a recipe's settings of an agent, without one
+    if "agent" in content and not _learns(content):
+        content["agent"] = None
     leave_out_foreign(content, overrides)
     check_used(content, overrides, sweep)
-    return parse_config(content, KINDS[entry])
+    try:
+        return parse_config(content, KINDS[entry])
+    except ConfigError as error:  # of a class that has no such setting; another choice may
+        found = re.match(r"unknown setting of (\w+) \(", str(error))
+        group = found.group(1) if found else ""
+        if not group or not choices(group):
+            raise
+        raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from error
+
+
+def _learns(content: Mapping[str, Any]) -> bool:
+    """Whether there is an agent, and a controller that carries out its actions."""
+    agent, driver = content.get("agent"), content.get("scenario", {}).get("controllers", {})
+    if not isinstance(agent, dict) or TARGET not in agent:  # a recipe's settings of an agent
+        return False
+    return AUTOMATED not in driver or takes_action(driver[AUTOMATED])
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -194,9 +223,15 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
             return ConfigError(f"{group}/{name} is not installed: {how_to_install(EXTRAS[name])}")
-        return unknown_name(f"choice of {group}" if group else "option", name, error.options or ())
+        known = error.options or ()
+        if not group:
+            return unknown_name("option", name, known)
+        error = unknown_name(f"choice of {group}", name, known)
+        return ConfigError(f"{error} {own_file(group, name)}")
     if isinstance(error, OverrideParseException):
-        key, _, value = str(error.override).lstrip("+").partition("=")
+        key, equals, value = str(error.override).lstrip("+").partition("=")
+        if not equals:
+            return ConfigError(f"{key}: settings are written key=value; -h shows the help")
         return ConfigError(
             f"{key}={value}: cannot be read as a setting. Brackets must be closed, and text "
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\""
@@ -205,11 +240,26 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
     if found is not None:
-        return unknown_name("option", found.group(1), _top_level() | _groups())
+        return _unknown_option(found.group(1))
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     words = [*overrides, *text.partition("See https://")[0].split()]
     return ConfigError(" ".join(words))
+
+
+def _unknown_option(name: str) -> ConfigError:
+    """Return the error for an option that does not exist; many belong into a section."""
+    root = name.partition(".")[0]
+    places = {key: section for section, kind in SECTIONS.items() for key in settings_of(kind) or ()}
+    places |= dict.fromkeys((HUMAN, AUTOMATED), "scenario.controllers")
+    if root in places:
+        return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
+    return unknown_name("option", name, _top_level() | _groups())
+
+
+def own_file(group: str, name: str) -> str:
+    """Return what makes a file of the user's own a choice."""
+    return f"A file of your own, {group}/{name}.yaml, needs --config-dir <its folder>."
 
 
 def config_hash(content: Any) -> str:

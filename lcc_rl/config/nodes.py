@@ -25,13 +25,31 @@ def short_name(target: object) -> str:
     return str(target).rpartition(".")[2].lower()
 
 
+def path_of(kind: Any) -> str:
+    """Return the ``_target_`` that names a class or function.
+
+    Raises:
+        ConfigError: if a module does not hold it by its name.
+    """
+    path = f"{kind.__module__}.{kind.__qualname__}"
+    if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
+        raise ConfigError(
+            f"{path} cannot be named in a configuration: define it at the top of a module, of a "
+            "script or of a notebook"
+        )
+    return path
+
+
 def find_target(target: str, where: str) -> Any:
     """Return the class or function that a ``_target_`` names."""
     module, _, name = target.rpartition(".")
     try:
         found = getattr(import_module(module), name)
     except Exception as error:  # a module of the user's own may raise anything
-        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}") from error
+        hint = ""
+        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
+            hint = "; if it is a file of your own, export PYTHONPATH=<its folder>"
+        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error
     if not callable(found):
         raise ConfigError(f"{where}.{TARGET}: {target!r} is no class or function")
     return found
@@ -154,6 +172,13 @@ def _fits(made: Any, needed: type | Sequence[str]) -> bool:
     if isinstance(needed, type):
         return isinstance(made, needed)
     return all(hasattr(made, name) for name in needed)
+
+
+def takes_action(node: Any) -> bool:
+    """Whether a controller, or one inside it, carries out the action of a policy."""
+    nodes = [node, *(inner for _, _, inner in settings_at(node))]
+    kinds = [find_target(str(one[TARGET]), "controller") for one in nodes if is_node(one)]
+    return any(name.endswith(".action") for kind in kinds for name in getattr(kind, "reads", ()))
 
 
 def check_numbers(value: Any, where: str) -> None:

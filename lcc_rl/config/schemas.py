@@ -162,6 +162,7 @@ class StudyConfig(BaseConfig):
     resume: str | None = None
     sweep: str | None = None
     policy: str | None = None
+    table: Literal["short", "all"] = "short"  # what is printed: six columns, or every measure
 
 
 class TrainConfig(StudyConfig):
@@ -174,7 +175,8 @@ class TrainConfig(StudyConfig):
 class EvaluateConfig(StudyConfig):
     """``lcc-rl evaluate``."""
 
-    compare: list[str] = dataclasses.field(default_factory=list)
+    # Policies and controllers, see lcc_rl.evaluation.named; or these by the names of their rows.
+    compare: list[Any] | dict[str, Any] = dataclasses.field(default_factory=list)
 
 
 class PipelineConfig(TrainConfig):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from lcc_rl.config.nodes import TARGET, is_node
+from lcc_rl.config.nodes import TARGET, is_node, short_name, takes_action
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
 
@@ -70,8 +70,13 @@ def _of_agent(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield settings of learning without effect, and why."""
     agent: Any = content.get("agent")
     if not is_node(agent):
+        driver = content["scenario"]["controllers"].get(AUTOMATED)
+        reason = f"variant {content['variant']} learns nothing"
+        if is_node(driver) and not takes_action(driver):
+            kind = short_name(driver[TARGET])
+            reason += f": {kind} drives the automated vehicles and takes no action of a policy"
         for key in ("agent", "training"):
-            yield key, f"variant {content['variant']} learns nothing"
+            yield key, reason
         return
     if agent.get("policy") in ("idm", "acc"):
         yield "agent.hidden", f"agent.policy={agent['policy']} has no layers"

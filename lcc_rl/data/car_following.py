@@ -165,7 +165,8 @@ def _pairs(
         raise DataError(
             f"no vehicle follows another in the same lane and frame: of {len(lane):,} samples "
             f"{int(follows.sum()):,} name a preceding vehicle, and none of those is seen; "
-            "expected a Preceding column that names vehicles in the file"
+            "expected a Preceding column that names vehicles in the file; a table of pairs, a "
+            "follower and its leader in each row, is read by data=episodes"
         )
     return follower, ahead[follower]
 

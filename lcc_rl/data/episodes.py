@@ -315,6 +315,7 @@ def _typed(values: dict[str, NDArray], source: str) -> pd.DataFrame:
     if wrong.any():
         row = int(np.argmax(wrong))
         words = f"is {steps[row - 1]:+g} s after the row before; expected a constant step"
-        raise _at(source, row, "time_s", f"{words} ({step:g} s here)")
+        remedy = f"({step:g} s here): begin another episode there, with a number of its own"
+        raise _at(source, row, "time_s", f"{words} {remedy}")
     frame = pd.DataFrame({name: values[name] for name in COLUMNS})
     return frame.astype({**SCHEMA, "recording": str})

@@ -222,7 +222,8 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
         if len(time) > 1 and not np.allclose(np.diff(time), time_step, atol=0.1 * time_step):
             raise DataError(
                 f"episode {number}: samples are {np.median(np.diff(time)):g} s apart (or not "
-                f"evenly spaced); expected {time_step:g} s"
+                f"evenly spaced), but scenario.time_step={time_step:g}: leaders are played at the "
+                "rate at which they were recorded, so leave it at that"
             )
         recording, leader = str(episode["recording"].iloc[0]), int(episode["leader_id"].iloc[0])
         records.append(torch.tensor(episode["leader_speed_mps"].to_numpy(np.float32)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,17 +57,29 @@ class ReadReport:
 
     def lines(self) -> list[str]:
         """The report as plain lines."""
-        recordings = ", ".join(f"{name} ({rows:,} rows)" for name, rows in self.recordings.items())
+        recordings = [f"{name} ({rows:,} rows)" for name, rows in self.recordings.items()]
         return [
-            f"read {self.rows_read:,} rows from {', '.join(self.files)}; kept {self.rows_kept:,}",
+            f"read {self.rows_read:,} rows from {listed(self.files)}; kept {self.rows_kept:,}",
             *(f"dropped {count:,} rows: {reason}" for reason, count in self.dropped.items()),
-            f"{len(self.recordings)} recording(s): {recordings}",
+            f"{len(self.recordings)} recording(s): {listed(recordings)}",
             f"{self.vehicles:,} vehicles; missing frames cut their trajectories "
             f"{self.segments - self.vehicles:,} times, into {self.segments:,} segments",
             f"space headways: {self.headways_given:,} given, {self.headways_derived:,} derived "
             f"from positions, {self.headways_unknown:,} unknown (preceding vehicle not seen)",
             *self.notes,
         ]
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """Return names in words, the first and the last of many.
+
+    Examples:
+        >>> listed(["a", "b", "c", "d", "e"])
+        'a, b … e'
+    """
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[: most - 1])} … {names[-1]}"
 
 
 @dataclass

@@ -110,7 +110,7 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
     if scenario.road == RING:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
-        return Inputs(nobody, nobody, population)
+        return Inputs(nobody, nobody, population, (described(population, cfg),))
     wanted = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
     leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, wanted)
     windows, training = leaders.windows, leaders.training
@@ -124,7 +124,7 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
         training,
         windows.spread(cfg.evaluation.profiles),
         population,
-        (*leaders.report, described(population), *shortfalls(cfg, available)),
+        (*leaders.report, described(population, cfg), *shortfalls(cfg, available)),
         leaders.cases,
         leaders.full_length,
     )
@@ -140,10 +140,15 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
     return TrajectoryLeaders(source=loaded, split=split, least_variation=0.0)
 
 
-def described(population: Population) -> str:
-    """Return a line on who drives."""
+def described(population: Population, cfg: StudyConfig) -> str:
+    """Return a line on who drives, and behind whom."""
     speed, gap = population.desired_speed, population.time_gap
-    line = f"{len(gap)} human drivers: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
+    shipped = "as set" if "desired_speed" in cfg.drivers else "fitted to NGSIM I-80"
+    leaders = cfg.leader if cfg.leader is not None and "source" not in cfg.leader else cfg.data
+    whose = leaders.get("path") or "synthetic or shipped traffic"
+    behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
+    who = f"{len(gap)} human drivers ({cfg.drivers.get('path') or shipped})"
+    line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or not (reaction.delay or reaction.noise):
         return line

@@ -26,6 +26,9 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
         ConfigError: naming what differs.
     """
     path = f"policy={cfg.policy}"
+    wanted = (own.task or {}).get("name")
+    if wanted is not None and wanted != (cfg.task or {}).get("name"):
+        raise ConfigError(f"{path} was trained for a task: add task={wanted}")
     hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
         raise ConfigError(f"{path} was trained as variant {own.variant}, not {cfg.variant}")
@@ -93,5 +96,6 @@ def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str)
     if one is not None and other is not None and one.shape[1] != other.shape[1]:
         raise ConfigError(
             f"policy={path} was trained with {one.shape[1]} observed entries; in this "
-            f"scenario.string an automated vehicle has {other.shape[1]}"
+            f"scenario.string an automated vehicle has {other.shape[1]}: train one for it, with "
+            "the same scenario.string and observation"
         )

@@ -12,8 +12,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,36 +20,27 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET, short_name
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
+from lcc_rl.evaluation.named import (
+    DIRECT,
+    PEOPLE,
+    RECORDED,
+    TUNED,
+    controller_of,
+    label_of,
+)
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.results.headline import FILTERED
 
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
-# Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
-TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
-FILTERED = "_filtered"
-GAINS = ("path", "paper_like", "tuned")
-# File in conf/controller of each baseline, and the settings that differ from it.
-BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
-    "idm": ("idm", {}),
-    **{name: (file, {}) for name, file in TUNED.items()},
-    **{f"cacc {gains}": ("cacc", {}) for gains in GAINS},
-    # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
-    "mpc_far": ("mpc", {"longest_gap": -4.0}),
-    "deadbeat": ("deadbeat", {}),
-    "deadbeat oracle": ("deadbeat", {"lookahead": "oracle"}),
-}
-DIRECT = "direct"  # a string without automated vehicles
-RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the leader
+ALONE, RULE_FILTERED = "constant_filtered", "idm_acc_filtered"
 RECORDED_START = "lcc_rl.pieces.RecordedStart"
-PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
-# Controllers that need a policy's action, or the communication of a platoon.
-NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 
@@ -92,10 +81,10 @@ def driven_by(cfg: StudyConfig, controller: Any) -> StudyConfig:
     return cfg
 
 
-def baselines(cfg: StudyConfig, further: Sequence[str] = ()) -> list[Strategy]:
-    """Build the baselines that an evaluation names, and further ones."""
-    names = [*cfg.evaluation.baselines, *further]
-    return [baseline(cfg, name) for name in dict.fromkeys(names) if applies(cfg, name)]
+def baselines(cfg: StudyConfig, further: Mapping[str, Any] | None = None) -> list[Strategy]:
+    """Build the baselines that an evaluation names, and further controllers by their names."""
+    named = dict.fromkeys(cfg.evaluation.baselines) | dict(further or {})
+    return [baseline(cfg, name, who) for name, who in named.items() if applies(cfg, name)]
 
 
 def applies(cfg: StudyConfig, name: str) -> bool:
@@ -108,67 +97,46 @@ def applies(cfg: StudyConfig, name: str) -> bool:
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
-def baseline(cfg: StudyConfig, name: str) -> Strategy:
-    """Build a baseline in the scenario under study, with the settings of the variant under study.
+def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
+    """Build a controller in the scenario under study, with the settings of the variant under study.
+
+    Args:
+        cfg: the configuration under study.
+        name: its name in tables; it drives behind the safety filter if that ends in ``_filtered``.
+        who: what :func:`lcc_rl.evaluation.named.controller_of` takes; by default the name.
 
     Raises:
-        ConfigError: if the name is unknown, or needs the safety filter and there is none.
+        ConfigError: if the controller is unknown, or needs the safety filter and there is none.
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
     if name == PEOPLE:
         return Strategy(name, by_people(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
     if name == RECORDED:
-        cfg = by_people(driven_by(cfg, baseline_controller(name)))
+        cfg = by_people(driven_by(cfg, controller_of(name)))
         cfg.scenario.start[AUTOMATED] = {TARGET: RECORDED_START}
         return Strategy(name, cfg)
     behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
     require(behind or not named, f"{name} drives behind the safety filter: add +filter=cbf")
-    controller = baseline_controller(name, suffix := FILTERED * (behind and name in TUNED))
-    if named or suffix:
+    controller = controller_of(who or name, behind)
+    if named or (behind and name in TUNED):
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
-@cache
-def rules() -> tuple[str, ...]:
-    """Return the names of all baselines and of the files of conf/controller."""
-    found = sorted(_files() - set(NEEDY))
-    return tuple(dict.fromkeys([DIRECT, PEOPLE, *BASELINES, *found]))
-
-
-def _files() -> set[str]:
-    shipped = Path(str(files("lcc_rl.conf"))) / "controller"
-    return {path.stem for path in shipped.glob("*.yaml")}
-
-
-@cache
-def _controllers(gains: str) -> dict[str, Any]:
-    """Return the nodes of the files of conf/controller, composed at once."""
-    names = _files() - {"action", "human", "hcfs"}
-    nodes = [f"+controller@scenario.controllers.{name}={name}" for name in sorted(names)]
-    cfg = load("evaluate", ["variant=idm", f"+gains={gains}", *nodes])
-    return dict(cfg.scenario.controllers)
-
-
-@cache
-def baseline_controller(name: str, suffix: str = "") -> Any:
-    """Return the node of a baseline's controller.
-
-    Args:
-        name: name of the baseline.
-        suffix: ``"_filtered"`` for the constants of a tuned one behind the safety filter.
-
-    Raises:
-        ConfigError: if the name is unknown.
-    """
-    if name not in rules():
-        raise unknown_name("baseline", name, rules())
-    file, settings = BASELINES.get(name, (name, {}))
-    gains = name.removeprefix("cacc ") if file == "cacc" else GAINS[-1]
-    return {**_controllers(gains)[file + suffix], **settings}
+def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Build what a filtered policy is to be seen beside: the filter alone, and a rule behind it."""
+    found = [one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy]
+    if not any(found):
+        return []
+    names = {one.name for one in strategies}
+    own = cfg.scenario.filters.get(AUTOMATED) is not None
+    wanted = [] if own and names.intersection(TUNED) else [RULE_FILTERED]
+    cfg = deepcopy(cfg)
+    cfg.scenario.filters[AUTOMATED] = next(filter(None, found))
+    return [baseline(cfg, name) for name in [ALONE, *wanted] if name not in names]
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:
@@ -204,7 +172,7 @@ def rule(cfg: StudyConfig) -> Strategy:
         own = _target(load("evaluate", [f"variant={cfg.variant}"]))
     except ConfigError:  # a variant of the user's own that only this command line knows
         own = _target(cfg)
-    name = cfg.variant if _target(cfg) == own else short_name(_target(cfg))
+    name = cfg.variant if _target(cfg) == own else label_of(cfg.scenario.controllers[AUTOMATED])
     return Strategy(name, deployed(cfg))
 
 

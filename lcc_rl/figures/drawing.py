@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.results.headline import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
 # Distinct without colour vision and in grey.
@@ -101,16 +102,6 @@ def whiskers(
     low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
     draw = axis.vlines if upright else axis.hlines
     draw(places, low, high, color=hue, lw=2.0, alpha=0.6)
-
-
-def in_words(name: str) -> str:
-    """Return a name as it is read aloud.
-
-    Examples:
-        >>> in_words("preview_10s"), in_words("cacc paper_like")
-        ('preview 10 s', 'cacc paper like')
-    """
-    return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
 
 
 def in_file(name: str) -> str:

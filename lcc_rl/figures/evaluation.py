@@ -17,17 +17,16 @@ from lcc_rl.figures.drawing import (
     INK,
     colour,
     in_file,
-    in_words,
     legend_above,
     new_figure,
     rows_of,
     save,
     style,
 )
-from lcc_rl.figures.main_page import WHO
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.headline import baseline_of, in_words
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.runs import stored_config
@@ -144,7 +143,7 @@ def _mean_energies(axis: Axes, cars: pd.DataFrame) -> None:
     columns = [f"{x}_{end}" for x in present for end in ("path_energy_kj", "distance_m")]
     means = cars.groupby("strategy", sort=False)[columns].mean()
     kilometres = means[[f"{x}_distance_m" for x in present]].sum(axis=1) / 1e3
-    baseline = next((name for name in ("human", "idm") if name in means.index), None)
+    baseline = baseline_of(means.index)
     totals, places = pd.Series(0.0, means.index), np.arange(len(means))
     for vehicle in present:
         name, hue = VEHICLES[vehicle]
@@ -156,10 +155,10 @@ def _mean_energies(axis: Axes, cars: pd.DataFrame) -> None:
         if baseline not in (None, label):
             saved = f" ({100 * (1.0 - total / totals[baseline]):+.1f} %)".replace("-", "−")
         axis.annotate(f" {total:.0f}{saved}", (total, place), va="center", fontsize=8)
-    rows_of(axis, [WHO.get(str(name), str(name)) for name in totals.index])
+    rows_of(axis, list(totals.index))
     axis.tick_params(axis="y", labelsize=9)
     axis.set_xlim(0.0, 1.4 * totals.max())
-    against = f"\nin brackets: saved against {baseline}" if baseline else ""
+    against = f"\nin brackets: saved against {in_words(baseline)}" if baseline else ""
     style(axis, f"path energy [kJ/km]{against}")
     legend_above(axis)
     title = (

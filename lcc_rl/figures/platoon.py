@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.figures.drawing import INK, in_words, legend_above, new_figure, style, unbox
+from lcc_rl.figures.drawing import INK, legend_above, new_figure, style, unbox
+from lcc_rl.results.headline import in_words
 
 SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
 HYBRIDS = ("hcfs", "hcfs oracle")

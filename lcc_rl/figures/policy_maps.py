@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull, QhullError
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import INK, in_words, legend_above, new_figure, unbox
+from lcc_rl.figures.drawing import INK, legend_above, new_figure, unbox
 from lcc_rl.figures.platoon import PARENTS, WHO_DRIVES
+from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import motion_of, sample_episodes, visited
 
 NEAR = 1.0  # of a map's speed: what an outline shows [m/s]
@@ -87,7 +88,7 @@ def _panels(rows: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, float, pd
     for line, name in zip(axes, names, strict=True):
         for axis, speed in zip(line, speeds, strict=True):
             own = (rows["strategy"] == name) & (rows["speed_mps"] == speed)
-            axis.set_title(f"{in_words(name)} at {speed:g} m/s", fontsize=10, loc="right")
+            axis.set_title(f"{in_words(name)}: {speed:g} m/s", fontsize=10, loc="right")
             unbox(axis)
             panels.append((axis, name, float(speed), rows[own]))
         line[0].set_ylabel("gap [m]")

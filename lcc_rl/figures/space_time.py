@@ -13,8 +13,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import in_words, new_figure
+from lcc_rl.figures.drawing import new_figure
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all

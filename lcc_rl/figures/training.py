@@ -6,7 +6,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.figures.drawing import INK, colour, in_words, legend_above, new_figure, style
+from lcc_rl.figures.drawing import INK, colour, legend_above, new_figure, style
+from lcc_rl.results.headline import in_words
 from lcc_rl.results.intervals import band
 
 WINDOW = 10  # iterations of the rolling mean

@@ -16,15 +16,15 @@ from torch import Tensor
 
 from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.evaluation.strategies import DIRECT, FILTERED, baseline_controller, rules
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.named import controller_of, is_policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World
-from lcc_rl.results.policies import PRETRAINED, load_policy
+from lcc_rl.results.policies import load_policy
 
 # Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
 STRING = VehicleString((AUTOMATED, HUMAN))
@@ -93,13 +93,11 @@ class Driver:
         self.name, self.time_step = str(name), time_step
         self.module: ExportedPolicy | None = None
         pieces: list[StepTransform] = []
-        if isinstance(name, Mapping) or name in known_rules():
-            node = name if isinstance(name, Mapping) else baseline_controller(str(name))
-            pieces.append(self._build(Controller, node, AUTOMATED))
-        elif Path(name).exists() or Path(name).parts[:1] == (PRETRAINED,):
-            pieces += self._policy(name, trust)
+        who = dict(name) if isinstance(name, Mapping) else str(name)
+        if is_policy(who):
+            pieces += self._policy(str(who), trust)
         else:
-            raise unknown_name("policy, file or rule", str(name), known_rules())
+            pieces.append(self._build(Controller, controller_of(who), AUTOMATED))
         self.pieces = pieces
         self.kept = [key for piece in pieces for key in (*piece.targets, *piece.constants)]
         self.kept = [key for key in self.kept if key != COMMAND]
@@ -181,12 +179,3 @@ def value(state: State, name: str) -> Tensor:
     """Return an input of an exported policy, ``[vehicles]``."""
     key, index = place(name)
     return state[key].flatten(1)[:, index]
-
-
-def known_rules() -> list[str]:
-    """Return the names of the rules that need neither messages nor the safety filter."""
-    return [
-        name
-        for name in rules()
-        if not name.startswith((DIRECT, "cacc", "deadbeat")) and not name.endswith(FILTERED)
-    ]

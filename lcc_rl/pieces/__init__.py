@@ -6,7 +6,7 @@ from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
 from lcc_rl.pieces.calibrated import CalibratedDrivers
 from lcc_rl.pieces.cbf import CBFFilter, Corrected
 from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
-from lcc_rl.pieces.controllers import Action, ConstantAcceleration, Controller
+from lcc_rl.pieces.controllers import Action, ConstantAcceleration, Controller, Law
 from lcc_rl.pieces.cruise import IDMACC, LinearACC
 from lcc_rl.pieces.drivers import FVDM, IDM, OVM, DriverModel, Gipps
 from lcc_rl.pieces.estimator import DriverEstimator
@@ -75,6 +75,7 @@ __all__ = [
     "Handover",
     "HeadwayStart",
     "JerkReward",
+    "Law",
     "LeaderPreview",
     "LinearACC",
     "MotorPower",

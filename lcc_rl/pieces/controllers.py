@@ -15,6 +15,7 @@ controller drives any role, and is a policy by :class:`lcc_rl.agents.ControllerP
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Protocol, Self
 
@@ -22,9 +23,11 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from lcc_rl.config.nodes import find_target
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces.base import StepTransform
+from lcc_rl.pieces.views import ACTION, AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Number, Positive
 
@@ -107,6 +110,8 @@ class Action(Controller):
 
     max_acceleration: Positive = 3.0  # acceleration of action 1, braking of action −1 [m/s²]
 
+    reads = (f"{AUTOMATED}.{ACTION}",)
+
     def setup(self, world: World) -> None:
         """Read the role's action."""
         self.drive(world, [f"{self.name}.action"])
@@ -126,3 +131,30 @@ class ConstantAcceleration(Controller):
     def command(self, speed: Tensor) -> Tensor:
         """Return the commands."""
         return torch.full_like(speed, self.acceleration)
+
+
+class Law(Controller):
+    """The acceleration that a plain function of named entries returns.
+
+    The function's parameters without a default name what it reads: ``gap`` is the vehicle's own
+    (``self.gap``), ``ahead_speed`` and ``behind_gap`` are of its neighbours.
+    """
+
+    law: str  # dotted path of the function, as in my_pieces.keep_distance
+
+    def setup(self, world: World) -> None:
+        """Find the function, and read what its parameters name."""
+        self.function = find_target(self.law, "law")
+        parameters = inspect.signature(self.function).parameters.values()
+        names = [one.name for one in parameters if one.default is one.empty]
+        self.drive(world, [_entry(name) for name in names])
+
+    def command(self, *entries: Tensor) -> Tensor:
+        """Return the commands."""
+        return self.function(*entries)
+
+
+def _entry(parameter: str) -> str:
+    """Return the entry that a parameter's name means: ``ahead_speed`` is ``ahead.speed``."""
+    space, _, entry = parameter.partition("_")
+    return f"{space}.{entry}" if space in (AHEAD, BEHIND) else f"{SELF}.{parameter}"

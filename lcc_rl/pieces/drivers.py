@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import Field, InstanceOf
+from pydantic import BeforeValidator, Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
@@ -198,6 +199,15 @@ class Drivers(Controller):
             start.set(as_key(key), value)
 
 
+def _made(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        raise ValueError(
+            "expected a node with _target_; a, b and s0 of all drivers are set by drivers=fixed "
+            "drivers.acceleration=… drivers.deceleration=… drivers.min_gap=…"
+        )
+    return value
+
+
 class DriverModel(Drivers):
     """Drivers of one model: those of the population, or one and the same in all vehicles.
 
@@ -210,7 +220,7 @@ class DriverModel(Drivers):
     desired_speed: Positive | None = None  # v0 of every vehicle; None: of the population [m/s]
     time_gap: Positive | None = None  # T of every vehicle, likewise [s]
     # Those besides v0 and T, the law's constants; None: of the population.
-    parameters: InstanceOf[DriverConstants] | None = None
+    parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
     def __post_init__(self) -> None:
         if (self.desired_speed is None) != (self.time_gap is None):

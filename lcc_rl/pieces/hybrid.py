@@ -25,6 +25,7 @@ from lcc_rl.functional.hcfs import (
     jerk_interval,
     safe_acceleration,
 )
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Key, Piece
 from lcc_rl.pieces.connected import (
     Communication,
@@ -75,6 +76,8 @@ class HCFS(Controller):
     spacing_weight: NonNegative = 0.0
     gap_scale: Positive = 1.0  # [m]
     spacing_time: NonNegative = 0.0  # e_x counts so long after the step [s]
+
+    reads = (f"{AUTOMATED}.action",)
 
     def __post_init__(self) -> None:
         if self.braking > self.max_acceleration:  # more than vehicles can brake is no safe cap

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -83,7 +84,10 @@ def load_policy(
         ResultsError: if it is missing, damaged or no policy.
     """
     path = Path(path)
-    if path.parts[:1] == (PRETRAINED,) and not path.exists():
+    first = path.parts[0] if path.parts else ""
+    if first != PRETRAINED and not path.exists() and get_close_matches(first, [PRETRAINED]):
+        raise ConfigError(f"policy={path}: no such file; did you mean {PRETRAINED!r}?")
+    if first == PRETRAINED and not path.exists():
         path = pretrained_path(path.name if len(path.parts) > 1 else variant)
     if path.is_dir():
         path = path / "policy.pt"

@@ -15,6 +15,7 @@ BASELINES = ("idm", "human", "idm tuned", "rule", "reference")
 # Whom networks are compared with; no figures of their own. All but the rule learn nothing.
 UNTRAINED = (
     *("direct", "idm", "human", "recorded", "constant_filtered", "idm tuned", "acc tuned"),
+    "idm_acc_filtered",
     "rule",
 )
 NOTHING = Estimate(np.nan)

@@ -10,6 +10,8 @@ from rich.table import Table
 
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.results.headline import COLUMNS, Shown, in_words
+from lcc_rl.results.headline import as_rich as drawn
 from lcc_rl.results.savings import NOTHING, savings
 from lcc_rl.results.tables import strategies_side_by_side
 from lcc_rl.results.units import check_unit, per_distance
@@ -24,13 +26,20 @@ PER_DISTANCE = {
 PLAIN = ("final_speed_spread_mps", "speed_std_mps", "string_ratio")
 SCORE, DISTANCE = "score", "distance_m"
 MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", "flow_vph", "string_ratio")
+# Columns that may have a limit, and what tables call them.
+HEADINGS = {
+    "max_gap_m": "gap\n≤ {:g}\n[m]",
+    "max_time_gap_s": "time\ngap\n≤ {:g} s",
+    "min_gap_m": "gap\n≥ {:g}\n[m]",
+    "min_time_gap_s": "time\ngap\n≥ {:g} s",
+    "min_ttc_s": "TTC\n≥ {:g} s",
+    "share_leader_faster": "leader\nfaster\n≤ {:g}",
+    "share_time_gap_long": "long\ngaps\n≤ {:g}",
+    "share_time_gap_long_moving": "long\ngaps\n≤ {:g}",
+    "share_ttc_unsafe": "TTC\n< 4 s\n≤ {:g}",
+    "share_ttc_unpromised": "TTC\nbare\n≤ {:g}",
+}
 LARGEST, LEAST, SHARE = "max_", "min_", "share_"
-# Columns that may have a limit.
-LIMITED = (
-    *("max_gap_m", "max_time_gap_s", "min_gap_m", "min_time_gap_s", "min_ttc_s"),
-    *("share_leader_faster", "share_time_gap_long", "share_time_gap_long_moving"),
-    *("share_ttc_unsafe", "share_ttc_unpromised"),
-)
 
 
 class Task(Settings):
@@ -50,8 +59,8 @@ class Task(Settings):
         if self.score not in (*PER_DISTANCE, *PLAIN):
             raise unknown_name("score (task.score)", self.score, (*PER_DISTANCE, *PLAIN))
         for column in self.limits:
-            if column not in LIMITED:
-                raise unknown_name("column of task.limits", column, LIMITED)
+            if column not in HEADINGS:
+                raise unknown_name("column of task.limits", column, HEADINGS)
 
     def among(self, strategies: Iterable[str]) -> Task:
         """Return the task for an evaluation of these strategies.
@@ -141,8 +150,36 @@ def _keeps(column: str, value: float, bound: float) -> bool:
     return not (value < bound if column.startswith(LEAST) else value > bound)
 
 
+def columns(task: Task, table: pd.DataFrame) -> list[Shown]:
+    """Return the columns of scores on the terminal: those of every table, and the limits."""
+    flows = "flow_vph" in table and table["flow_vph"].notna().any()
+    way = Shown("flow_vph", "flow\n[1/h]") if flows else Shown("distance_pct", "dis-\ntance\n[%]")
+    limits = [Shown(name, HEADINGS[name].format(bound)) for name, bound in task.limits.items()]
+    return [
+        COLUMNS[0],
+        Shown("score", task.label.replace(" ", "\n")),
+        Shown("saving_pct", "saved\n[%]"),
+        way,
+        *limits,
+        Shown("collisions", "colli-\nsions"),
+        Shown("kept", "kept"),
+    ]
+
+
 def as_rich(table: pd.DataFrame, task: Task, title: str) -> Table:
-    """Return scores as a table for the terminal, a column per strategy."""
+    """Return scores as a table for the terminal, a row per strategy."""
+    percent = {f"saving_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
+    words = [in_words(str(name)) for name in table["strategy"]]
+    shown = table.assign(who=words, distance_pct=-100.0 * table["distance_lost"], **percent)
+    caption = (
+        f"saved: against {in_words(task.against)}, with the 95 % interval over windows and "
+        "training seeds; kept: all limits, without a collision; table=all shows every measure."
+    )
+    return drawn(shown, title, caption, columns(task, shown))
+
+
+def in_full(table: pd.DataFrame, task: Task, title: str) -> Table:
+    """Return all that scores hold as a table for the terminal, a column per strategy."""
     limits = sorted(task.limits, key=lambda column: column.startswith(SHARE))
     rows = (
         (task.label, "score", "{:.2f}"),

@@ -8,6 +8,8 @@ from rich.table import Table
 
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import intervals
+from lcc_rl.results.headline import Shown, in_words
+from lcc_rl.results.headline import as_rich as drawn
 from lcc_rl.results.tables import strategies_side_by_side
 
 COUNTS = ("switches", "clamps", "cap_interventions")
@@ -83,7 +85,24 @@ ROWS = (
 )
 
 
+COLUMNS = (
+    Shown("who", "driven by"),
+    Shown("speed_error_sum_mps", "Σ|e_v|\n[m/s]"),
+    Shown("jerk_sum_mps3", "Σ|jerk|\n[m/s³]"),
+    Shown("reward", "Σ reward"),
+    Shown("min_gap_m", "least\ngap [m]"),
+    Shown("string_ratio", "string\nratio"),
+    Shown("collisions", "colli-\nsions"),
+)
+CAPTION = "sums over followers and frames, means over runs"
+
+
 def as_rich(table: pd.DataFrame, title: str) -> Table:
-    """Return a case's table for the terminal, a column per strategy."""
-    caption = "sums over followers and frames, means over runs"
-    return strategies_side_by_side(table, ROWS, title, caption)
+    """Return a case's table for the terminal, a row per strategy."""
+    shown = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
+    return drawn(shown, title, f"{CAPTION}; table=all shows every measure.", COLUMNS)
+
+
+def in_full(table: pd.DataFrame, title: str) -> Table:
+    """Return all that a case's table holds, a column per strategy."""
+    return strategies_side_by_side(table, ROWS, title, CAPTION)

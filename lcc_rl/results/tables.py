@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -17,7 +16,6 @@ from lcc_rl.results.totals import Totals, frames
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 PER_KM = "path_energy_kj_per_km"  # of both cars; who falls back gains nothing by it
 FASTER = "share_leader_faster"
-WIDEST = 10_000  # characters
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
 CAR_COLUMNS = (
@@ -154,16 +152,6 @@ def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
     ]
 
 
-def as_rich(table: pd.DataFrame, title: str) -> Table:
-    """Return a summary as a table for the terminal, a column per strategy."""
-    caption = (
-        "energies: mean per episode; direct: no controlled car; path energy: without what the "
-        "motion stores; intervals: over held-out windows (drives, if five or more) and training "
-        "seeds; pairs: of a window and a driver"
-    )
-    return strategies_side_by_side(table, ROWS, title, caption)
-
-
 def strategies_side_by_side(
     table: pd.DataFrame, rows: Iterable[tuple[str, str, str]], title: str, caption: str
 ) -> Table:
@@ -186,12 +174,3 @@ def strategies_side_by_side(
             cells = (form.format(x) if k else "–" for x, k in zip(table[key], known, strict=True))
             drawn.add_row(escape(label), *cells)
     return drawn
-
-
-def show(table: Table) -> None:
-    """Print a table, as wide as the terminal or, without one, as its content."""
-    console = Console()
-    if not console.is_terminal:
-        wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width
-        console = Console(width=max(wide, console.width))
-    console.print(table)

@@ -17,6 +17,14 @@ logging.addLevelName(HEADLINE, "NOTE")
 log = logging.getLogger("lcc_rl")
 
 
+class ShortFormatter(logging.Formatter):
+    """The time and the message; the level only of warnings and errors."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return f"{record.levelname} {text}" if record.levelno >= logging.WARNING else text
+
+
 def tell(text: str) -> None:
     """Log a line that :func:`headlines` lets through to the terminal."""
     log.log(HEADLINE, text)

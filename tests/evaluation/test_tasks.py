@@ -10,6 +10,7 @@ from lcc_rl.commands import evaluation
 from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
+from lcc_rl.results.headline import in_words
 
 TASKS = sorted(path.stem for path in Path("conf/task").glob("*.yaml"))
 QUICK = ("i80-follow", "i24-mixed", "ring-22")
@@ -29,8 +30,9 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     rows = evaluation.run(cfg, tmp_path)
     assert set(rows["strategy"]) == {*cfg.evaluation.baselines, "pi_saturation"}
     printed = capsys.readouterr().out
-    assert f"task {name}" in printed
-    assert f"saved against {task_of(cfg).against}" in printed
+    assert f"{name}: " in printed
+    assert f"saved: against {in_words(task_of(cfg).against)}" in " ".join(printed.split())
+    assert max(map(len, printed.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(

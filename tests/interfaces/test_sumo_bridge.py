@@ -18,8 +18,9 @@ from lcc_rl.data.profiles import from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.evaluation.strategies import baseline_controller, with_weights
+from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.interfaces.sumo import Bridge
 from lcc_rl.results.policies import load_policy
 
@@ -51,7 +52,7 @@ def own_motion(driver: str) -> tuple[Tensor, Tensor]:
         policy = with_weights(own, weights, own.seed, driver, bootstrap()).policy
         cfg.observation = own.observation
     else:
-        cfg.scenario.controllers["automated"] = baseline_controller(driver)
+        cfg.scenario.controllers["automated"] = controller_of(driver)
         cfg.scenario.filters = {}
     profiles = from_records([leader_speed()], ["wave"], ["wave"], STEP)
     env = build_env(cfg, profiles, bootstrap(), 1, nominal=True)

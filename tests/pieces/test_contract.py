@@ -67,6 +67,7 @@ from lcc_rl.pieces import (
     Handover,
     HeadwayStart,
     JerkReward,
+    Law,
     LeaderPreview,
     LinearACC,
     MotorPower,
@@ -113,6 +114,7 @@ ROLES = (
     "handover",
     "saturating",
     "constant",
+    "lawful",
     "plain",
     "slow",
     "following",
@@ -149,6 +151,10 @@ def leading() -> dict[str, Piece]:
     }
 
 
+def steady(gap, speed, ahead_speed):
+    return (0.1 * (gap - 2.0 - speed) + 0.5 * (ahead_speed - speed)).clamp(-3.0, 3.0)
+
+
 def driver(kind: type[DriverModel], delay: int) -> DriverModel:
     return kind(wiener=0.1, delay=delay, parameters=kind.law.constants())
 
@@ -176,6 +182,7 @@ def controllers() -> dict[str, tuple[str, Piece]]:
         "Handover": ("handover", Handover(before=human, after=stopper, from_s=0.5)),
         "IDMACC": ("following", IDMACC()),
         "LinearACC": ("cruising", LinearACC()),
+        "Law": ("lawful", Law(law=f"{__name__}.steady")),
         "ConstantAcceleration": ("constant", ConstantAcceleration(acceleration=0.3)),
         "HCFS": ("hybrid", HCFS(rule=cacc, spacing_weight=0.02, spacing_time=1.0)),
         "CBFFilter": ("automated", CBFFilter()),

@@ -130,9 +130,9 @@ def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tm
     figure = run_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
     right = figure.axes[1]
     assert [x.get_text() for x in right.get_yticklabels()] == [
-        "one human driver (IDM)",
+        "one driver (IDM)",
         "own energy",
-        "network for its own car",
+        "network, for itself",
     ]
     image = pixels(figure, tmp_path / "x.png")
     assert all(count(image, run_figures.VEHICLES[name][1]) > 500 for name in ("cav", "hdv"))
@@ -254,7 +254,8 @@ def grid() -> pd.DataFrame:
 def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
     figure = accelerations(grid(), pd.DataFrame(columns=steps().columns), {"scenario": {}})
     titles = [axis.get_title(loc="right") for axis in figure.axes[:4]]
-    assert titles == ["alcc at 2 m/s", "alcc at 6 m/s", "idm tuned at 2 m/s", "idm tuned at 6 m/s"]
+    names = ("network, for both", "IDM, tuned on I-80")
+    assert titles == [f"{name}: {speed} m/s" for name in names for speed in (2, 6)]
     image = pixels(figure, tmp_path / "map.png")
     for axis in figure.axes[:4]:
         box = axis.get_window_extent()

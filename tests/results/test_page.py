@@ -14,10 +14,10 @@ from rich.console import Console
 from study_frames import episodes
 
 from lcc_rl.figures.drawing import new_figure
-from lcc_rl.figures.main_page import as_rich, headline, verdict
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.cells import as_markdown, heading
+from lcc_rl.results.headline import as_rich, caption_of, headline, in_words, verdict
 from lcc_rl.results.tables import summary
 
 TABLE = pd.DataFrame(
@@ -96,27 +96,44 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     np.testing.assert_allclose(table["energy_kj_per_km"], per_km)
     saved = 1.0 - per_km["alcc"] / per_km["reference"]
     assert cars.loc["alcc", "km_saving_vs_reference"] == pytest.approx(saved)
-    assert verdict(table) == ""  # nobody to compare with
-    table["saved_against_human_pct"] = [np.nan, 1.0, 1.0]
-    table["saved_against_human_pct_low"] = table["saved_against_human_pct_high"] = 1.0
-    console = Console(width=120)
+    assert verdict(found) == ""  # nobody to compare with
+    assert table.attrs["against"] == "idm"
+    own = cars.loc["alcc", "km_saving_vs_idm"]
+    assert table["saved_pct"].tolist()[1] == pytest.approx(100.0 * own)
+    assert table["distance_pct"].tolist() == pytest.approx([0.0, -100.0 / 30.0, 0.0])
+
+
+def test_every_table_of_strategies_fits_80_columns() -> None:
+    table = headline(summary(episodes(profiles=8).replace({"strategy": {"idm": "human"}})))
+    table["saved_pct"], table["saved_pct_low"], table["saved_pct_high"] = -9.3, -10.8, -8.1
+    console = Console(width=200)
     with console.capture() as shown:
-        console.print(as_rich(table, "title [x]"))
-    assert "title [x]" in shown.get()
-    assert "–" in shown.get()
+        console.print(as_rich(table, "title [x]", caption_of(table)))
+    lines = shown.get().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    assert "title [x]" in lines[0]
+    assert "−9.3 (−10.8 … −8.1)" in shown.get()
+    assert "saved: against simulated drivers" in " ".join(shown.get().split())
     assert "nan" not in shown.get()
+
+
+def test_names_are_words_in_tables_and_figures() -> None:
+    words = {
+        "alcc": "network, for both",
+        "alcc analytic": "network, for both (analytic)",
+        "idm tuned": "IDM, tuned on I-80",
+        "my_pid_filtered": "my pid, filtered",
+    }
+    assert {name: in_words(name) for name in words} == words
 
 
 def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})
     frame["total_path_energy_kj"] += np.random.default_rng(0).normal(size=len(frame))
-    table = headline(summary(frame))
-    own, rule = (table.set_index("strategy").loc[x] for x in ("alcc", "rule"))
-    saved = 100.0 * (1.0 - own["energy_kj_per_km"] / rule["energy_kj_per_km"])
-    assert own["saved_against_rule_pct"] == pytest.approx(saved)
-    words = verdict(table)
-    assert words.startswith(f"The network for both cars needs {saved:.1f} % less energy per km ")
-    assert "than the IDM tuned on these data (" in words
-    assert "for 0.40 % of the time against 0.40 %" in words
-    assert "uncertainty" not in words
-    assert "uncertainty" in verdict(table.assign(saved_against_rule_pct_low=-1.0))
+    found = summary(frame)
+    own, rule = (found.set_index("strategy").loc[x] for x in ("alcc", "rule"))
+    saved = 100.0 * (1.0 - own["path_energy_kj_per_km"] / rule["path_energy_kj_per_km"])
+    words = verdict(found)
+    assert words.startswith(f"With the network, for both, energy per km is {saved:.1f} % (")
+    assert "less than with IDM, tuned on these data; long time gaps: 0.40 % of" in words
+    assert "within the uncertainty" in verdict(found.assign(km_saving_vs_rule_low=-1.0))

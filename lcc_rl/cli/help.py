@@ -1,0 +1,112 @@
+"""The written help of the commands that take settings; its options are read from conf/."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from lcc_rl.cli.console import HYDRA
+from lcc_rl.config import as_meant, choices
+from lcc_rl.config.compose import CONF
+from lcc_rl.version import __version__
+
+HELP, FULL_HELP = {"-h", "--help"}, "--help-all"
+NAMES = {"pipeline": "run"}  # of commands that are not called as their configuration
+EXAMPLES = {
+    "pipeline": (
+        ("lcc-rl run", "on recordings in the package: minutes"),
+        ("lcc-rl run data=ngsim data.path=tracks.csv", "on your trajectories"),
+        ("lcc-rl run experiment=smoke", "seconds: does everything run?"),
+    ),
+    "train": (
+        ("lcc-rl train variant=alcc experiment=limits", "a minute"),
+        ("lcc-rl train task=ring-22 scenario.horizon=3000", "a task with limits"),
+        ("lcc-rl train -m variant=alcc,reference 'seed=range(8)'", "a sweep; it resumes"),
+    ),
+    "evaluate": (
+        ("lcc-rl evaluate policy=outputs/train/<run>", "beside the baselines"),
+        ("lcc-rl evaluate 'compare=[my_pieces.PID,mpc,pretrained/alcc]'", "rivals"),
+        ("lcc-rl evaluate task=ring-22 'compare=[pretrained,pid.yaml]'", "a task"),
+    ),
+    "calibrate": (
+        ("lcc-rl calibrate", "on synthetic traffic"),
+        ("lcc-rl calibrate data=ngsim data.path=tracks.csv", "on yours"),
+        ("lcc-rl train drivers=calibrated drivers.path=drivers.parquet", "then"),
+    ),
+}
+TRAFFIC = ("data", "data.path", "drivers", "scenario.string", "scenario.horizon")
+OPTIONS = {
+    "pipeline": (
+        *("experiment", "agent", *TRAFFIC[:2], "calibration", "variants", "scenario.string"),
+        *("evaluation.drivers", "seed", "jobs", "figure_formats", "resume"),
+    ),
+    "train": (
+        *("variant", "task", "experiment", "agent", *TRAFFIC),
+        *("training.episodes", "seed", "resume"),
+    ),
+    "evaluate": (
+        *("variant", "task", "policy", "compare", "filter", *TRAFFIC),
+        *("evaluation.drivers", "table"),
+    ),
+    "calibrate": ("calibration", *TRAFFIC[:2], "seed", "threads", "figure_formats"),
+}
+WIDTH, NAME, DEFAULT = 80, 21, 16
+
+
+def text(entry: str, overrides: Sequence[str] = ()) -> str:
+    """Return the help of a command.
+
+    Args:
+        entry: ``"train"``, ``"evaluate"``, ``"calibrate"`` or ``"pipeline"``.
+        overrides: settings that were typed, whose effect the defaults show.
+    """
+    name = NAMES.get(entry, entry)
+    with initialize_config_module(CONF, version_base="1.3"):
+        cfg = compose(entry, overrides=as_meant(overrides), return_hydra_config=True)
+    wide = max(len(command) for command, _ in EXAMPLES[entry])
+    lines = [f"lcc-rl {name}: {HYDRA[name][1]}  (lcc-rl {__version__})", ""]
+    lines += [f"  {command:<{wide}}  # {what}" for command, what in EXAMPLES[entry]]
+    lines += ["", f"{'option=…':<{NAME}}{'default':<{DEFAULT}}choices or meaning"]
+    for key in OPTIONS[entry]:
+        lines += _option(entry, key, cfg)
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"All settings with their values: lcc-rl {name} --cfg job; all groups: --help-all;",
+            "pages: docs/settings.md. -m makes a sweep: every combination of a=1,2 b=3,4.",
+        ]
+    )
+
+
+def _option(entry: str, key: str, cfg: Any) -> Iterator[str]:
+    """Yield the lines of an option: its name, its default, and its choices or its meaning."""
+    chosen = cfg.hydra.runtime.choices
+    if names := choices(key):
+        value, what = chosen.get(key) or "–", ", ".join(names)
+        key = key if key in chosen else f"+{key}"
+    else:
+        found = OmegaConf.select(cfg, key)
+        value = "–" if found is None else str(found)
+        what = meaning(entry, key)
+    first, *rest = wrap(what, WIDTH - NAME - DEFAULT) or [""]
+    yield f"{key:<{NAME - 1}} {value:<{DEFAULT - 1}} {first}".rstrip()
+    yield from (" " * (NAME + DEFAULT) + line for line in rest)
+
+
+def meaning(entry: str, key: str) -> str:
+    """Return the comment of a setting in the first file of conf/ that has one."""
+    folder, (root, _, last) = Path(str(files(CONF))), key.rpartition(".")
+    places = [folder / f"{entry}.yaml", folder / "study.yaml"]
+    if root:
+        places = sorted((folder / root).glob("*.yaml"))
+    line = re.compile(rf"^\s*(?:# )?{re.escape(last)}: [^#\n]*#\s*(.*)$", re.MULTILINE)
+    found = (line.search(place.read_text()) for place in places)
+    return next((match.group(1) for match in found if match), "")

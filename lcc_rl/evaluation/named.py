@@ -1,0 +1,140 @@
+"""Controllers by name: baselines, files, classes and functions as nodes of a configuration."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from hydra.core.global_hydra import GlobalHydra
+
+from lcc_rl.config import choices, load, own_file
+from lcc_rl.config.nodes import TARGET, build, find_target, short_name
+from lcc_rl.config.schemas import AUTO
+from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.io.settings import parse_yaml, read_text
+from lcc_rl.pieces.controllers import Controller, Law
+from lcc_rl.results.headline import FILTERED
+from lcc_rl.results.policies import PRETRAINED
+
+PLACE = f"controller@{AUTO}"
+# Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
+TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
+# Settings that make the controller of each baseline.
+BASELINES = {
+    "idm": ("variant=idm",),
+    **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
+    **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
+    # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
+    "mpc_far": ("variant=idm", f"{AUTO}.longest_gap=-4.0", f"{PLACE}=mpc"),
+    "deadbeat": ("variant=deadbeat",),
+    "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
+}
+DIRECT = "direct"  # a string without automated vehicles
+RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the leader
+PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
+# Controllers that need a policy's action, or the communication of a platoon.
+NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
+YAML = (".yaml", ".yml")
+DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
+OTHERS = ("<module.Class>", "<controller.yaml>", PRETRAINED, "<run folder>", "<policy.pt>")
+
+
+def rules() -> tuple[str, ...]:
+    """Return the names of all baselines and of the files of ``controller`` in conf/ and beside."""
+    found = [name for name in choices("controller") if name not in NEEDY]
+    return tuple(dict.fromkeys([DIRECT, PEOPLE, *BASELINES, *found]))
+
+
+def is_policy(who: Any) -> bool:
+    """Whether a name is that of a trained policy's file or folder."""
+    if not isinstance(who, str) or who.endswith(YAML):
+        return False
+    path = Path(who)
+    return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"
+
+
+def controller_of(who: Any, behind: bool = False) -> Any:
+    """Return the node of a controller.
+
+    Args:
+        who: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
+            dotted path of a class or of a function of named entries; a yaml file that holds a
+            node; or a node.
+        behind: whether it drives behind the safety filter, for which tuned ones have constants of
+            their own.
+
+    Raises:
+        ConfigError: if there is no such controller, or it cannot be built.
+    """
+    if isinstance(who, str):
+        plain = who.removesuffix(FILTERED)
+        who = who if _words(who, behind) else plain
+        words = _words(who, behind)
+        if words:
+            return _loaded(words, id(GlobalHydra.instance().hydra))
+    node, where = _node(who), f"compare={who}"
+    require(isinstance(node, Mapping) and TARGET in node, f"{where}: expected {TARGET}: module.X")
+    build(node, where, Controller)
+    return dict(node)
+
+
+def label_of(who: Any) -> str:
+    """Return what tables call a controller: its name, or that of its file, class or function."""
+    if isinstance(who, Mapping):
+        return short_name(who.get("law") or who.get(TARGET))
+    if who in rules() or who in choices("variant"):
+        return str(who)
+    return Path(who).stem if who.endswith(YAML) else short_name(who)
+
+
+def _words(who: str, behind: bool) -> tuple[str, ...]:
+    """Return the settings that make a controller which has a name; none if it has none."""
+    if who in BASELINES:
+        *first, last = BASELINES[who]
+        return (*first, last + FILTERED * (behind and who in TUNED))
+    if who in choices("controller"):
+        return ("variant=idm", f"{PLACE}={who}")
+    return (f"variant={who}",) if who in choices("variant") else ()
+
+
+@cache
+def _shipped(_hydra: int) -> dict[str, Any]:
+    """Compose the controllers of the package, all at once: an evaluation has several of them."""
+    folder = Path(str(files("lcc_rl.conf"))) / "controller"
+    names = sorted({path.stem for path in folder.glob("*.yaml")} - {"action", "human", "hcfs"})
+    nodes = [f"+controller@scenario.controllers.{name}={name}" for name in names]
+    return dict(load("evaluate", ["variant=idm", "+gains=tuned", *nodes]).scenario.controllers)
+
+
+@cache
+def _loaded(words: tuple[str, ...], _hydra: int) -> Any:
+    """Compose a controller, once for every command of a process."""
+    *first, last = words
+    if first == ["variant=idm"] and (node := _shipped(_hydra).get(last.removeprefix(f"{PLACE}="))):
+        return node
+    cfg = load("evaluate", words)
+    if cfg.agent is not None:
+        raise ConfigError(
+            f"variant {cfg.variant} is learned: compare its run folder or policy.pt, which "
+            f"lcc-rl train variant={cfg.variant} makes"
+        )
+    return cfg.scenario.controllers[AUTOMATED]
+
+
+def _node(who: Any) -> Any:
+    if isinstance(who, Mapping):
+        return who
+    if who.endswith(YAML):
+        return parse_yaml(read_text(Path(who)), who)
+    if DOTTED.fullmatch(who) is None:
+        error = unknown_name("strategy", who, [*rules(), *OTHERS])
+        raise ConfigError(f"{error} {own_file('controller', who)}")
+    if inspect.isclass(find_target(who, f"compare={who}")):
+        return {TARGET: who}
+    return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": who}

@@ -1,0 +1,204 @@
+"""The table that every command prints: a row per strategy, the columns that a reader asks first."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from lcc_rl.results.cells import MISSING, column_cells
+from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
+
+HUMAN, NETWORK = "human", "alcc"
+WHO = {
+    "idm": "one driver (IDM)",
+    HUMAN: "simulated drivers",
+    "recorded": "the recorded drivers",
+    "constant_filtered": "safety filter alone",
+    "idm_acc_filtered": "tuned IDM, filtered",
+    "acc tuned": "ACC, tuned on I-80",
+    "idm tuned": "IDM, tuned on I-80",
+    "rule": "IDM, tuned on these data",
+    "reference": "network, for itself",
+    NETWORK: "network, for both",
+    "direct": "no automated car",
+}
+AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
+RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
+FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
+FEW, WIDEST = 5, 10_000  # windows; characters
+CAPTION = (
+    "energy of both cars, without what their motion stores; {}shares of the time: "
+    "time-to-collision < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
+)
+COMPARED = "saved: against {}, with the 95 % interval over windows; distance against theirs; "
+
+
+class Shown(NamedTuple):
+    """A column of a table on the terminal; one with an interval shows sign and interval."""
+
+    key: str
+    heading: str
+
+
+COLUMNS = (
+    Shown("who", "driven by"),
+    Shown("energy_kj_per_km", "energy\n[kJ/km]"),
+    Shown("saved_pct", "saved\n[%]"),
+    Shown("distance_pct", "dis-\ntance\n[%]"),
+    Shown("unsafe_ttc_pct", "TTC\n< 4 s\n[%]"),
+    Shown("long_time_gap_pct", "long\ngap\n[%]"),
+    Shown("collisions", "colli-\nsions"),
+)
+
+
+def in_words(name: str) -> str:
+    """Return a strategy's name, or another one, as it stands in tables, figures and pages.
+
+    Examples:
+        >>> in_words("alcc"), in_words("alcc ddpg"), in_words("preview_10s")
+        ('network, for both', 'network, for both (ddpg)', 'preview 10 s')
+    """
+    if name.endswith(FILTERED) and name not in WHO:
+        return f"{in_words(name.removesuffix(FILTERED))}, filtered"
+    first, _, rest = name.partition(" ")
+    if name in WHO or first in WHO:
+        return WHO.get(name) or f"{WHO[first]} ({rest})"
+    return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
+
+
+def baseline_of(strategies: Iterable[object]) -> str | None:
+    """Return the strategy that tables and figures compare with; None without one."""
+    known = set(strategies)
+    return next((name for name in AGAINST if name in known), None)
+
+
+def headline(found: pd.DataFrame) -> pd.DataFrame:
+    """Shorten a summary to what a reader asks first.
+
+    Args:
+        found: of :func:`lcc_rl.results.tables.summary`.
+
+    Returns:
+        A row per strategy with a controlled car, those that draw most first: path energy per km
+        [kJ/km], the share saved [%] against :func:`baseline_of` with its interval, the distance
+        [%] against it, the shares of the time [%] with an unsafe time-to-collision and a long time
+        gap, and collisions. ``attrs["against"]`` names the baseline.
+    """
+    cars = found[found[PATH].notna()].sort_values(PER_KM, ascending=False, kind="stable")
+    against = baseline_of(cars["strategy"])
+    table = pd.DataFrame({"strategy": cars["strategy"]})
+    table["who"] = [in_words(str(name)) for name in cars["strategy"]]
+    table["energy_kj_per_km"] = cars[PER_KM]
+    if against is not None:
+        for end in ("", "_low", "_high"):
+            table[f"saved_pct{end}"] = 100.0 * cars[f"km_saving_vs_{against}{end}"]
+        whole = cars.loc[cars["strategy"] == against, "distance_m"].iloc[0]
+        table["distance_pct"] = 100.0 * (cars["distance_m"] / whole - 1.0)
+    table["unsafe_ttc_pct"] = (100.0 * cars["share_ttc_unsafe"]).round(2)
+    table["long_time_gap_pct"] = (100.0 * cars["share_time_gap_long_moving"]).round(2)
+    table["collisions"] = cars["collisions"]
+    table = table.reset_index(drop=True)
+    table.attrs["against"] = against
+    return table
+
+
+def verdict(found: pd.DataFrame) -> str:
+    """Return in a sentence what came out for the network, from a summary; empty without one."""
+    rows = found.set_index("strategy").to_dict("index")
+    other = next((name for name in (*RULES, HUMAN) if name in rows), None)
+    if NETWORK not in rows or other is None:
+        return ""
+    key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"
+    saved, low, high = (100.0 * rows[NETWORK][f"{key}{end}"] for end in ("", "_low", "_high"))
+    less = "less"
+    if saved < 0.0:
+        less, saved, low, high = "more", -saved, -high, -low
+    within = "" if low > 0.0 else ", within the uncertainty"
+    own, theirs = (100.0 * rows[name][long] for name in (NETWORK, other))
+    return (
+        f"With the {in_words(NETWORK)}, energy per km is {saved:.1f} % ({low:.1f} … {high:.1f}) "
+        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of the time "
+        f"against {theirs:.2f} %."
+    )
+
+
+def caption_of(table: pd.DataFrame, more: str = "") -> str:
+    """Return what stands below a headline, and what else there is to say."""
+    against = table.attrs.get("against")
+    saved = COMPARED.format(in_words(against)) if against else ""
+    return f"{CAPTION.format(saved)} {more}".strip()
+
+
+def few_windows(episodes: int, steps: float) -> str:
+    """Return what an evaluation of few windows means; empty for one of enough.
+
+    Args:
+        episodes: how many windows were evaluated.
+        steps: their duration [s].
+    """
+    if episodes >= FEW:
+        return ""
+    return (
+        f"{episodes} window(s) of {steps:g} s: these numbers show that everything runs, and mean "
+        "nothing else"
+    )
+
+
+def as_rich(
+    table: pd.DataFrame, title: str, caption: str, shown: Sequence[Shown] = COLUMNS
+) -> Table:
+    """Return a table for the terminal, a row per strategy, within 80 characters."""
+    drawn = Table(
+        title=escape(title),
+        caption=escape(caption),
+        box=box.SIMPLE_HEAD,
+        padding=0,
+        show_edge=False,
+    )
+    shown = [column for column in shown if column.key in table]
+    for place, column in enumerate(shown):
+        drawn.add_column(escape(column.heading), justify="right" if place else "left")
+    for row in zip(*(_cells(table, column.key) for column in shown), strict=True):
+        drawn.add_row(*map(escape, row))
+    return drawn
+
+
+def _cells(table: pd.DataFrame, name: str) -> list[str]:
+    """Return the cells of a column; savings have one decimal, sign and interval."""
+    if f"{name}_low" not in table:
+        return column_cells(table, name)
+    bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
+    return [_saved(*row) for row in bounds]
+
+
+def _saved(share: float, low: float, high: float) -> str:
+    if pd.isna(share):
+        return MISSING
+    within = "" if pd.isna(low) else f" ({low:.1f} … {high:.1f})"
+    return f"{share:+.1f}{within}".replace("-", "−")
+
+
+def in_full(found: pd.DataFrame, title: str) -> Table:
+    """Return a whole summary as a table for the terminal, a column per strategy."""
+    caption = (
+        "energies: mean per episode; path energy: without what the motion stores; intervals: over "
+        "held-out windows (drives, if five or more) and training seeds; pairs: of a window and a "
+        "driver"
+    )
+    return strategies_side_by_side(found, ROWS, title, caption)
+
+
+def show(table: Table) -> None:
+    """Print a table, as wide as the terminal or, without one, as its content."""
+    console = Console()
+    if not console.is_terminal:
+        wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width
+        console = Console(width=max(wide, console.width))
+    console.print(table)

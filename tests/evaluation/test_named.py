@@ -1,0 +1,132 @@
+"""Own controllers in a comparison: by name, class, function, file and object, on every task."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from commands import NO_AGENT, UNTRAINED, run_command, tiny
+
+import lcc_rl
+from lcc_rl.commands import evaluation
+from lcc_rl.config import load
+from lcc_rl.config.nodes import TARGET
+from lcc_rl.config.schemas import AUTO
+from lcc_rl.errors import LccError
+from lcc_rl.evaluation.named import controller_of
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.io.files import read_parquet
+from lcc_rl.pieces import ConstantAcceleration, Controller, Law
+from lcc_rl.settings import Positive
+
+
+class Steady(Controller):
+    """A cruise control with a constant time gap."""
+
+    gain: Positive = 0.2  # [1/s²]
+
+    reads = ("self.gap", "self.speed", "ahead.speed")
+
+    def command(self, gap, speed, ahead_speed):
+        return steady(gap, speed, ahead_speed, self.gain)
+
+
+def steady(gap, speed, ahead_speed, gain=0.2):
+    return (gain * (gap - 2.0 - 1.3 * speed) + 0.8 * (ahead_speed - speed)).clamp(-3.0, 3.0)
+
+
+PATH = f"{__name__}.Steady"
+SMALL = [*NO_AGENT, "evaluation.drivers=2"]
+ENERGY = "total_path_energy_kj"
+
+
+def energies(rows) -> dict[str, float]:
+    return rows.groupby("strategy", sort=False)[ENERGY].mean().to_dict()
+
+
+def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text(f"_target_: {PATH}\ngain: 0.2\n")
+    every = {"class": Steady, "path": PATH, "function": steady, "object": Steady(gain=0.2)}
+    every |= {"node": {TARGET: PATH}, "file": "mine.yaml", "slow": Steady(gain=0.1)}
+    found = energies(lcc_rl.compare(every, overrides=SMALL, folder=tmp_path / "a").rows)
+    assert list(found) == [*UNTRAINED, *every]
+    assert len({found[name] for name in every}) == 2  # and the slow one, which is another
+    assert found["slow"] != found["class"]
+
+
+def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None:
+    full = ConstantAcceleration(acceleration=3.0)
+    both = {"full": full, "full_filtered": full}
+    words = [*SMALL, "+filter=cbf"]
+    found = energies(lcc_rl.compare(both, overrides=words, folder=tmp_path / "a").rows)
+    assert found["full"] != found["full_filtered"]
+    with pytest.raises(LccError, match=r"add \+filter=cbf"):
+        lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["task=i24-follow5", f"compare=[{PATH}]"],
+        ["task=ring-22", f"compare=[{PATH}]", "evaluation.profiles=1"],
+        ["variant=cacc", f"compare=[{PATH}]"],
+        # Whom a task would let learn gives way to a controller that takes no action.
+        ["task=i24-follow5", f"{AUTO}={{_target_: {PATH}}}", "compare=[idm_acc]"],
+    ],
+)
+def test_an_own_controller_has_its_row_on_every_variant_and_task(words, tmp_path) -> None:
+    size = ["experiment=smoke", "scenario.horizon=20"]
+    rows = evaluation.run(load("evaluate", [*size, *words]), tmp_path, quiet=True)
+    assert "steady" in set(rows["strategy"])
+
+
+def test_a_variant_and_a_controller_of_a_folder_stand_in_the_table(tmp_path) -> None:
+    node = f"{{_target_: {PATH}, gain: 0.3}}"
+    place = "override /controller@scenario.controllers.automated: null"
+    variant = f"""# @package _global_
+defaults: [idm, {place}]
+variant: own_variant
+scenario: {{controllers: {{automated: {node}}}}}
+"""
+    for group, text in {"controller": node, "variant": variant}.items():
+        (tmp_path / "conf" / group).mkdir(parents=True)
+        (tmp_path / "conf" / group / f"own_{group}.yaml").write_text(text)
+    words = ["--config-dir", "conf", *SMALL, "hydra.run.dir=run"]
+    for typed in ("compare=[own_controller,own_variant]", "variant=own_variant"):
+        run_command("lcc_rl.cli.evaluate", *words, typed, cwd=tmp_path, check=True)
+        found = read_parquet(tmp_path / "run" / "episodes.parquet")
+        assert "own_variant" in set(found["strategy"])
+        (tmp_path / "run" / "episodes.parquet").unlink()
+        (tmp_path / "run" / "config.yaml").unlink()
+
+
+@pytest.mark.parametrize(
+    ("who", "words"),
+    [
+        ("nowhere.X", "export PYTHONPATH"),
+        (f"{__name__}.Nobody", "Nobody"),
+        ("idm_ac", "'idm_ac'.*'idm_acc'.*--config-dir"),
+        ("rule", "learned: .* lcc-rl train variant=rule"),
+        ("nowhere.yaml", "nowhere.yaml: no such file"),
+        ({"gain": 3}, "expected _target_"),
+        ({TARGET: PATH, "gian": 3}, "'gian'.*'gain'"),
+        ({TARGET: "lcc_rl.pieces.TimeGap"}, "expected Controller"),
+    ],
+)
+def test_who_cannot_drive_is_told_how(who, words) -> None:
+    with pytest.raises(LccError, match=words):
+        controller_of(who)
+
+
+def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
+    with pytest.raises(LccError, match="at the top of a module"):
+        lcc_rl.compare([lambda gap: gap], overrides=SMALL, folder=tmp_path)
+    with pytest.raises(LccError, match="two steady: give each a name"):
+        evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)
+
+
+def test_a_law_reads_what_its_parameters_name() -> None:
+    law = Law(law=f"{__name__}.steady").bind(name=AUTOMATED)
+    assert law.names == ("self.gap", "self.speed", "ahead.speed")
+    entries = [torch.full((3, 1, 1), value) for value in (20.0, 10.0, 12.0)]
+    assert torch.equal(law.command(*entries), steady(*entries))
