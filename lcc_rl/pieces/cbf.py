@@ -93,7 +93,7 @@ class CBFFilter(StepTransform):
         self.role, self.string, self.time_step = self.name, world.string, world.time_step
         actuation = world.actuators.get(self.role, Actuation())
         sensors = world.sensors.get(self.role, Sensors())
-        self.answers = self.robust or not {self.role} & {*world.actuators, *world.sensors}
+        self.answers = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
         self.response = actuation.response_in(world, self.role, self.max_acceleration)
@@ -166,8 +166,9 @@ class CBFFilter(StepTransform):
         self, wanted: Tensor, now: Motion, ahead_acceleration: Tensor, safe: Tensor
     ) -> Tensor:
         """Return the command nearest to what is wanted within all bounds, not clamped."""
-        speed, gap, ahead, free = now.speed, now.gap, now.ahead, now.gap - self.margin
-        closing, shortest = speed - ahead, self.time_to_collision
+        speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
+        free = gap - self.margin
+        shortest = self.time_to_collision
         command = wanted
         if self.time_gap is not None:
             allowed, slope = self._longest_gap(speed, self.time_gap)
