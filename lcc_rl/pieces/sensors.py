@@ -30,7 +30,8 @@ class Sensors(StepTransform):
     the place of ``self.gap``, ``self.speed``, ``self.relative_speed``, ``ahead.speed`` and
     ``ahead.acceleration``; limits, rewards and energy are those of the true state. The own
     acceleration is known, as are vehicles behind and what comes by radio. Errors are drawn evenly
-    within their bounds for each measurement, by the episode's seed.
+    within their bounds by the episode's seed: for each measurement, or every ``error_time``, and
+    linear in time between.
 
     Keeps ``(role, "sensors")``, ``[*batch, n, 1 + 5·(oldest + 1)]``: the age of the measurement in
     steps, then what :data:`SEEN` names, true, at present and in the steps before. Before the
@@ -40,6 +41,7 @@ class Sensors(StepTransform):
     gap_error: NonNegative = 0.0  # largest, of the gap [m]
     speed_error: NonNegative = 0.0  # largest, of the own speed [m/s]
     ahead_error: NonNegative = 0.0  # largest, of the speed of the vehicle ahead [m/s]
+    error_time: NonNegative = 0.0  # in which errors change, a number of steps; 0: a step [s]
     delay: NonNegative = 0.0  # age of a measurement that arrives, a number of steps [s]
     dropouts: Share = 0.0  # chance that a measurement does not arrive: the last one stays
     longest_dropout: NonNegative = 0.0  # in a row, a number of steps [s]
@@ -55,6 +57,7 @@ class Sensors(StepTransform):
         """Read the true state as the role sees it."""
         role, self.time_step = self.name, world.time_step
         self.sensing = self.sensing_in(world, role)
+        self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
         seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in SEEN), *drawn]
         writes = [(role, name) for name in (*SENSED.values(), SENSORS)]
@@ -94,9 +97,15 @@ class Sensors(StepTransform):
         columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
         gap, speed, ahead, acceleration, _ = frames.gather(-1, columns).split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
+        place = (step - number) / self.apart
+        first = place.floor()
+        drawn = [
+            [uniform(seed, first.long() + end, stream + self.index) for end in (0, 1)]
+            for stream in self.streams
+        ]
         gap_error, speed_error, ahead_error = (
-            bound * (2.0 * uniform(seed, step - number, stream + self.index) - 1.0)
-            for bound, stream in zip(bounds, self.streams, strict=True)
+            bound * (2.0 * torch.lerp(*ends, place - first) - 1.0)
+            for bound, ends in zip(bounds, drawn, strict=True)
         )
         speed = (speed + speed_error).clamp(min=0.0)
         ahead = (ahead + ahead_error).clamp(min=0.0)
