@@ -97,20 +97,21 @@ class Sensors(StepTransform):
         columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
         gap, speed, ahead, acceleration, _ = frames.gather(-1, columns).split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
-        place = (step - number) / self.apart
-        first = place.floor()
-        drawn = [
-            [uniform(seed, first.long() + end, stream + self.index) for end in (0, 1)]
-            for stream in self.streams
-        ]
         gap_error, speed_error, ahead_error = (
-            bound * (2.0 * torch.lerp(*ends, place - first) - 1.0)
-            for bound, ends in zip(bounds, drawn, strict=True)
+            bound * self._error(seed, step - number, stream)
+            for bound, stream in zip(bounds, self.streams, strict=True)
         )
         speed = (speed + speed_error).clamp(min=0.0)
         ahead = (ahead + ahead_error).clamp(min=0.0)
         kept = torch.cat([age, frames], -1)
         return gap + gap_error, speed, ahead - speed, ahead, acceleration, kept
+
+    def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
+        """Return the error of measurements of that step as a share of its bound, in [−1, 1]."""
+        place = step / self.apart
+        first = place.floor()
+        start, end = (uniform(seed, first.long() + k, stream + self.index) for k in (0, 1))
+        return 2.0 * torch.lerp(start, end, place - first) - 1.0
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         specs = super().written_specs(batch, device)
