@@ -116,18 +116,10 @@ def driven(road: Road) -> tuple[float, int, float]:
 
 @pytest.mark.parametrize("fault", slow_but(["errors", "all"], FAULTS))
 def test_the_promise_holds_with_faults(fault) -> None:
-    least, broken, nearest = driven(Road(fault, 1_000, 0))
+    least, broken, nearest = driven(Road(fault, 10_000, 0))
     assert broken == 0
     assert nearest > 0.0
-    assert least < 4.3  # full throttle reaches the limit
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
-def test_the_promise_holds_in_many_episodes(fault) -> None:
-    _, broken, nearest = driven(Road(fault, 10_000, 1))
-    assert broken == 0
-    assert nearest > 0.0
+    assert least < 4.1  # full throttle reaches the limit
 
 
 @pytest.mark.parametrize("fault", ["errors", "sensors 0.2 s late"])
