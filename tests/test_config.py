@@ -34,7 +34,6 @@ def options(group: str) -> list[str]:
     "words",
     [
         *([f"variant={name}"] for name in options("variant")),
-        *([f"variant={name}", "+faults=all"] for name in options("variant") if name != "direct"),
         *([f"task={name}", "+faults=all"] for name in options("task")),
         *(
             [f"variant={SCENARIO_OF.get(name, 'alcc')}", f"controller@{AUTO}={name}"]
