@@ -34,12 +34,13 @@ def options(group: str) -> list[str]:
     "words",
     [
         *([f"variant={name}"] for name in options("variant")),
+        *([f"task={name}", "+faults=all"] for name in options("task")),
         *(
             [f"variant={SCENARIO_OF.get(name, 'alcc')}", f"controller@{AUTO}={name}"]
             for name in options("controller")
         ),
     ],
-    ids=lambda words: words[-1],
+    ids=" ".join,
 )
 def test_every_variant_and_controller_drives(words) -> None:
     cfg = load("train", [*words, "scenario.horizon=20"])

@@ -55,7 +55,7 @@ def configurations() -> Iterator[StudyConfig]:
             cfg.scenario.controllers["automated"] = cfg.deployed
             yield cfg
     knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
-    cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf_actuation", *knowledge])
+    cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
         cfg.scenario.string = drawn_or_single

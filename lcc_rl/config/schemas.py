@@ -62,6 +62,7 @@ class ScenarioConfig(Settings):
     start: Nodes
     filters: Nodes
     actuators: Nodes = Field(default_factory=dict)
+    sensors: Nodes = Field(default_factory=dict)
     pieces: Nodes
 
     @property

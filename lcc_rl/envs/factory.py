@@ -25,12 +25,14 @@ from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.io.memory import require_memory, torch_device
 from lcc_rl.pieces import (
     Action,
+    Actuation,
     CBFFilter,
     Controller,
     Corrected,
     EnergyClasses,
     Piece,
     Places,
+    Sensors,
     StringMotion,
     TotalReward,
 )
@@ -96,7 +98,22 @@ def world_of(
         population,
         build_energy(cfg),
         nominal,
+        _by_role(scenario, "actuators", Actuation),
+        _by_role(scenario, "sensors", Sensors),
     )
+
+
+def _by_role(scenario: Any, group: str, kind: type[Piece]) -> dict[str, Any]:
+    """Build the settings of a group of pieces by role.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    nodes = {role: node for role, node in getattr(scenario, group).items() if node is not None}
+    for role in nodes:
+        if role not in scenario.vehicles.names:
+            raise ConfigError(f"scenario.{group}.{role}: no vehicle has that role")
+    return {role: build(node, f"scenario.{group}.{role}", kind) for role, node in nodes.items()}
 
 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
@@ -112,9 +129,9 @@ def build_pieces(
 ) -> list[Piece]:
     """Build the pieces of a configuration in the order in which they act.
 
-    The leader; the controllers of the roles that occur, and their filters; the motion of the
-    string; the further pieces of the scenario; and, where there are automated vehicles, what they
-    observe and are rewarded with. Arguments as of :func:`build_env`.
+    The leader; the controllers of the roles that occur, their filters and actuators; the motion of
+    the string; sensors; the further pieces of the scenario; and, where there are automated
+    vehicles, what they observe and are rewarded with. Arguments as of :func:`build_env`.
 
     Raises:
         ConfigError: naming the option at fault.
@@ -128,7 +145,12 @@ def build_pieces(
         if role not in scenario.controllers:
             raise unknown_name("role (energy.roles)", role, list(scenario.controllers))
     classes = [EnergyClasses().bind(world)] if len(energy.models) > 1 else []
-    pieces += [Places().bind(world), *classes, *drivers, _motion(scenario, world)]
+    actuators, sensors = (
+        [own.bind(world, role) for role, own in group.items()]
+        for group in (world.actuators, world.sensors)
+    )
+    pieces += [Places().bind(world), *classes, *drivers, *actuators]
+    pieces += [_motion(scenario, world), *sensors]
     pieces += _watchers(drivers, world)
     pieces += [_build(node, "scenario.pieces", world, name) for name, node in named.items()]
     check_spacing(pieces, profiles)
@@ -149,7 +171,7 @@ def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[P
         for piece in drivers
         if isinstance(piece, Action) and piece.role in filters
     ]
-    return [*(piece.watch() for piece in filters.values()), *changed]
+    return [*(piece.watch() for piece in filters.values() if piece.answers), *changed]
 
 
 def _build(node: Any, group: str, world: World, name: str) -> Any:
@@ -172,9 +194,9 @@ def _leader(scenario: Any, node: Any, world: World) -> list[Piece]:
 
 
 def _drivers(scenario: Any, world: World) -> list[Any]:
-    """Build the controllers of the roles that occur, their safety filters and actuators."""
+    """Build the controllers of the roles that occur, and their safety filters."""
     pieces, roles = [], world.string.names
-    for group, needed in (("controllers", True), ("filters", False), ("actuators", False)):
+    for group, needed in (("controllers", True), ("filters", False)):
         nodes = getattr(scenario, group)
         for role in roles:
             if nodes.get(role) is not None:
@@ -202,8 +224,7 @@ def _motion(scenario: Any, world: World) -> StringMotion:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
     names = ("circumference", "vehicle_length", "initial_speed")
     of_ring = {name: getattr(scenario, name) for name in names} if string.ring else {}
-    late = [role for role in string.names if scenario.actuators.get(role) is not None]
-    return parse(StringMotion, {"start": start, "late": late, **of_ring}, "scenario").bind(world)
+    return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 
 
 def make_env(

@@ -120,6 +120,7 @@ def safety_measures(
         "duration_s": alive.sum(0).squeeze(-2) * time_step,
     }
     if "promised" in series:
+        found["share_promised"] = average(series["promised"])
         found["share_ttc_unpromised"] = average(unsafe & (series["promised"] == 0.0))
     return found
 

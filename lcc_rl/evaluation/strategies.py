@@ -147,9 +147,10 @@ def without_filter(cfg: StudyConfig) -> StudyConfig:
 
 
 def by_people(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration without filter and actuators: a person's motion has them in it."""
+    """Return a configuration without filter, actuators and sensors: a person's motion has them."""
     cfg = without_filter(cfg)
-    cfg.scenario.actuators.pop(AUTOMATED, None)
+    for group in (cfg.scenario.actuators, cfg.scenario.sensors):
+        group.pop(AUTOMATED, None)
     return cfg
 
 

@@ -31,10 +31,10 @@ class Response:
     time_step: float
 
     @classmethod
-    def of(cls, delay: float, lag: float, braking: float, time_step: float) -> Response:
-        """Return the response to a delay and a lag, both in s; the delay is a number of steps."""
+    def of(cls, late: int, lag: float, braking: float, time_step: float) -> Response:
+        """Return the response with a delay in steps and a lag in s."""
         share = 1.0 if lag == 0.0 else 1.0 - math.exp(-time_step / lag)
-        return cls(round(delay / time_step), share, braking, time_step)
+        return cls(late, share, braking, time_step)
 
     @property
     def hold(self) -> float:
@@ -54,7 +54,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Motion:
-    """State of a vehicle and of the one ahead when the next command begins to act.
+    """State of a vehicle and of the one ahead at a moment.
 
     Args:
         speed, gap, ahead: of the vehicle [m/s], to and of the one ahead [m, m/s].
@@ -65,6 +65,13 @@ class Motion:
     gap: Tensor
     ahead: Tensor
     acceleration: Tensor
+
+    def after(self, own: Tensor, ahead: Tensor | float, time_step: float) -> Motion:
+        """Return the motion after a step with accelerations of both [m/s²]; none reverses."""
+        speed, _ = advance_speed(self.speed, own, time_step)
+        reached, _ = advance_speed(self.ahead, torch.as_tensor(ahead), time_step)
+        gap = advance_gap(self.gap, self.ahead, self.speed, reached, speed, time_step)
+        return Motion(speed, gap, reached, own)
 
 
 def predicted(
@@ -81,13 +88,8 @@ def predicted(
     Returns:
         The present motion, then one per step.
     """
-    found, step = [now], response.time_step
+    found = [now]
     for number in range(pending.shape[-1]):  # split would give an empty one of none
-        command = pending[..., number : number + 1]
-        last = found[-1]
-        own = response.next(last.acceleration, command)
-        speed, _ = advance_speed(last.speed, own, step)
-        ahead, _ = advance_speed(last.ahead, torch.as_tensor(ahead_acceleration), step)
-        gap = advance_gap(last.gap, last.ahead, last.speed, ahead, speed, step)
-        found.append(Motion(speed, gap, ahead, own))
+        own = response.next(found[-1].acceleration, pending[..., number : number + 1])
+        found.append(found[-1].after(own, ahead_acceleration, response.time_step))
     return found

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, Response
+from lcc_rl.functional.actuation import Motion, Response, predicted
 
 HALVINGS, NEARBY = 16, 1e-2  # of the range of accelerations; step of a slope [m/s²]
 
@@ -120,6 +120,24 @@ def least_room_late(motion: Motion, response: Response, braking: Braking) -> Ten
         braking: how hard both brake, and τ.
     """
     return least_room_held(motion, motion.acceleration, response.hold, braking)
+
+
+def least_room_to_come(
+    now: Motion, pending: Tensor, response: Response, braking: Braking
+) -> Tensor:
+    """Return the least room to come while commands under way act, then full braking.
+
+    The vehicle ahead brakes fully from now on.
+
+    Args:
+        now: the state, its gap less what counts as contact.
+        pending: commands given and not yet begun, the oldest first, ``[…, late]`` [m/s²].
+        response: how the vehicle obeys.
+        braking: how hard both brake, and τ.
+    """
+    path = predicted(now, pending, -braking.ahead, response)
+    rooms = [x.gap - braking.time_to_collision * (x.speed - x.ahead) for x in path]
+    return torch.stack([*rooms, least_room_late(path[-1], response, braking)]).amin(0)
 
 
 def safe_command(motion: Motion, response: Response, braking: Braking) -> Tensor:

@@ -26,6 +26,7 @@ from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.pieces import Action, CBFFilter, Observation
+from lcc_rl.pieces.cbf import STATE
 from lcc_rl.pieces.entries import ENTRIES
 from lcc_rl.results.policies import load_policy
 from lcc_rl.runs.arguments import Arguments
@@ -37,7 +38,6 @@ DERIVED = {
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
 PRESENT = "behind.present"
-FILTERED = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 
 
 class Input(NamedTuple):
@@ -68,7 +68,7 @@ class ExportedPolicy(nn.Module):
         self.register_buffer("constants", observation.constants.clone())
         seen = observation.columns()
         needed = [name for column in seen for name in column]
-        needed += FILTERED if safety is not None else ()
+        needed += STATE if safety is not None else ()
         flat = [base for name in needed for base in DERIVED.get(name, (name,))]
         self.names = list(dict.fromkeys(flat))
         self.columns = [[self._places(name) for name in column] for column in seen]
@@ -94,7 +94,7 @@ class ExportedPolicy(nn.Module):
         command = action.clamp(-1.0, 1.0) * self.largest
         if self.safety is None:
             return command
-        measured = (self._value(state, self._places(name)) for name in FILTERED)
+        measured = (self._value(state, self._places(name)) for name in STATE)
         filtered: Tensor = self.safety.filtered(command, *measured)
         return filtered
 
@@ -126,6 +126,11 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
     if not all(found.values()):
         raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
     safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
+    if safety is not None and safety.memories:
+        raise ConfigError(
+            f"{policy}: its filter remembers commands or measurements, an exported policy nothing; "
+            "only without delays, lag and drop-outs can it be exported"
+        )
     learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
     assert isinstance(learned, TensorDictModule)
     (observation,), (action,) = found.values()

@@ -30,6 +30,7 @@ from lcc_rl.pieces.rewards import (
     VelocityReward,
 )
 from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
+from lcc_rl.pieces.sensors import Sensors
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import Places, StringMotion
 from lcc_rl.pieces.surrogates import (
@@ -92,6 +93,7 @@ __all__ = [
     "RewardPiece",
     "RewardTerm",
     "SafetyReward",
+    "Sensors",
     "SmoothEfficiency",
     "SmoothRange",
     "SmoothSafety",

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import require
 from lcc_rl.functional.actuation import Response
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Key, StepTransform
@@ -36,11 +35,21 @@ class Actuation(StepTransform):
 
     def setup(self, world: World) -> None:
         """Read the commands of the role."""
-        self.response = response_of(self.delay, self.lag, self.braking or HARDEST, world, self.name)
+        self.response = self.response_in(world, self.name, HARDEST)
         state = (self.name, ACTUATION)
         wanted = f"next.command.{self.name}"
         writes = [(OBEYED, self.name), state]
         self.see(world, [wanted, ".".join(state)], writes, self.name)
+
+    def response_in(self, world: World, role: str, hardest: float) -> Response:
+        """Return how the role's vehicles obey commands that brake no harder than that [m/s²].
+
+        Raises:
+            ConfigError: if the delay is no number of steps.
+        """
+        late = world.steps(self.delay, f"scenario.actuators.{role}.delay")
+        braking = min(self.braking or hardest, hardest)
+        return Response.of(late, self.lag, braking, world.time_step)
 
     def compute(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
         """Return the accelerations, and what is kept."""
@@ -54,18 +63,3 @@ class Actuation(StepTransform):
         shape = (*batch, self.event_shape[0], 1 + self.response.late)
         specs[self.targets[1]] = Unbounded(shape=shape, device=device)
         return specs
-
-
-def response_of(delay: float, lag: float, braking: float, world: World, role: str) -> Response:
-    """Return the response of a role.
-
-    Raises:
-        ConfigError: if the delay is no number of steps.
-    """
-    steps = delay / world.time_step
-    require(
-        abs(steps - round(steps)) < 1e-6,
-        f"the delay of {role} must be a multiple of the time step, {world.time_step:g} s, got "
-        f"{delay:g} s",
-    )
-    return Response.of(delay, lag, braking, world.time_step)

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from pydantic import InstanceOf
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, Response, predicted
+from lcc_rl.functional.actuation import Motion, predicted
 from lcc_rl.functional.braking import (
     Braking,
     least_room,
-    least_room_late,
+    least_room_to_come,
     safe_acceleration,
     safe_command,
 )
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.actuation import ACTUATION, response_of
+from lcc_rl.functional.sensing import brought_up
+from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import StepTransform
+from lcc_rl.pieces.sensors import ACCELERATION, AHEAD_ACCELERATION, SENSORS, Sensors, frames_of
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
+STATE = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
 
 
@@ -51,18 +57,19 @@ class CBFFilter(StepTransform):
     and falls with the square of the speed below: the vehicle is near before its leader stands, and
     pays for it with energy.
 
-    With a ``delay``, a ``lag`` and a ``braking`` of the vehicle (:class:`Actuation`) the bounds are
-    those of the state in which the command begins to act: commands given before it act until then,
-    while the vehicle ahead brakes as hard as is reckoned with; and full braking is reached with the
-    lag (:func:`lcc_rl.functional.braking.safe_command`).
+    A ``robust`` filter reckons with the scenario's actuators and sensors (:class:`Actuation`,
+    :class:`Sensors`). It starts from the worst state within the errors of the measurement, moves it
+    on to the present with the accelerations driven since, then to the moment at which the command
+    begins to act with the commands under way, while the vehicle ahead brakes as hard as is reckoned
+    with; and full braking is reached with the lag
+    (:func:`lcc_rl.functional.braking.safe_command`). Comfort is that of the state expected.
 
     Reads and replaces ``("command", role)``, ``[*batch, n, 1]`` [m/s²]. Differentiable.
     """
 
     max_acceleration: Positive = 3.0  # in both directions [m/s²]
-    delay: NonNegative = 0.0  # of the commands' effect, a number of steps [s]
-    lag: NonNegative = 0.0  # of the acceleration behind the command [s]
-    braking: Positive | None = None  # hardest braking that there is; None: max_acceleration [m/s²]
+    # Reckon with the actuators and sensors of the scenario; false: as if both were exact.
+    robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
     rate: Positive = 3.0  # how fast that limit may be approached [1/s]
     margin: Positive = 0.2  # gap that counts as contact [m]
@@ -84,27 +91,42 @@ class CBFFilter(StepTransform):
     def setup(self, world: World) -> None:
         """Read the commands of the role and what bounds them."""
         self.role, self.string, self.time_step = self.name, world.string, world.time_step
-        own = min(self.braking or self.max_acceleration, self.max_acceleration)
-        self.response = response_of(self.delay, self.lag, own, world, self.role)
-        seen = ["self.speed", "self.gap", "ahead.speed", "ahead.acceleration"]
-        seen += [f"{self.role}.{ACTUATION}"] * self.late
-        self.see(world, [f"next.command.{self.role}", *seen], [("command", self.role)], self.role)
-        self.limits = Braking(own, self.braking_ahead, self.time_to_collision)
-
-    @property
-    def late(self) -> bool:
-        """Whether the vehicle obeys with a delay or a lag."""
-        return bool(self.delay or self.lag)
+        actuation = world.actuators.get(self.role, Actuation())
+        sensors = world.sensors.get(self.role, Sensors())
+        self.answers = self.robust or self.role not in {*world.actuators, *world.sensors}
+        if not self.robust:
+            actuation, sensors = Actuation(), Sensors()
+        self.response = actuation.response_in(world, self.role, self.max_acceleration)
+        self.sensing = sensors.sensing_in(world, self.role)
+        # What is kept of commands under way, and since the measurement, where there is anything.
+        self.late = self.response.late > 0 or self.response.share < 1.0
+        self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
+        self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
+        seen = world.sensed(self.role, STATE)
+        seen = [f"next.command.{self.role}", *seen, *self.memories]
+        self.see(world, seen, [("command", self.role)], self.role)
+        self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> Promised:
         """Return the piece that records the steps for which the filter promises its limit."""
-        late = self.response if self.late else None
-        watching = Promised(braking=self.limits, margin=self.margin, response=late)
-        return watching.bind(World(self.string), self.role)
+        return Promised(safety=self).bind(World(self.string), self.role)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
         return self.filtered(*self.views(*entries))
+
+    def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
+        """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
+        given = iter(memories)
+        return [next(given) if needed else nothing for needed in self.remembers.values()]
+
+    def _when_it_acts(
+        self, motion: Motion, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
+    ) -> Motion:
+        """Return the motion when the command begins to act, from one as old as the measurement."""
+        past = frames_of(sensors, ACCELERATION)[..., : self.sensing.oldest]
+        now = brought_up(motion, sensors[..., :1], past, acceleration, self.time_step)
+        return predicted(now, actuation[..., 1:], acceleration, self.response)[-1]
 
     def filtered(
         self,
@@ -113,28 +135,40 @@ class CBFFilter(StepTransform):
         gap: Tensor,
         ahead: Tensor,
         ahead_acceleration: Tensor,
-        kept: Tensor | None = None,
+        *memories: Tensor,
     ) -> Tensor:
         """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²].
 
         Args:
             wanted: commands [m/s²].
-            speed, gap, ahead, ahead_acceleration: the state [m/s, m, m/s, m/s²].
-            kept: of the actuation, where there is one.
+            speed, gap, ahead, ahead_acceleration: the state measured [m/s, m, m/s, m/s²].
+            *memories: the entries that :attr:`memories` names.
         """
         # Any of them that is no number, or infinite, shows in the sum.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
-        response, free = self.response, gap - self.margin
-        if kept is None:
-            safe = safe_acceleration(speed, free, ahead, self.limits, self.time_step)
-        else:
-            now = Motion(speed, free, ahead, kept[..., :1])
-            worst = predicted(now, kept[..., 1:], -self.braking_ahead, response)[-1]
-            safe = safe_command(worst, response, self.limits)
-            expected = predicted(now, kept[..., 1:], ahead_acceleration, response)[-1]
-            speed, free, ahead = expected.speed, expected.gap, expected.ahead
-            gap = free + self.margin
-        closing, shortest = speed - ahead, self.time_to_collision
+        kept = self.kept(memories, wanted)
+        measured = Motion(speed, gap, ahead, kept[0][..., :1])
+        worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *kept)
+        safe = self._safe(replace(worst, gap=worst.gap - self.margin))
+        now = self._when_it_acts(measured, ahead_acceleration, *kept)
+        command = self._comfortable(wanted, now, ahead_acceleration, safe)
+        command = command.clamp(-self.max_acceleration, self.max_acceleration)
+        return torch.where(known, command, -self.max_acceleration)
+
+    def _safe(self, worst: Motion) -> Tensor:
+        """Return the largest command that leaves the vehicle where braking suffices."""
+        if self.late:
+            return safe_command(worst, self.response, self.limits)
+        state = (worst.speed, worst.gap, worst.ahead)
+        return safe_acceleration(*state, self.limits, self.time_step)
+
+    def _comfortable(
+        self, wanted: Tensor, now: Motion, ahead_acceleration: Tensor, safe: Tensor
+    ) -> Tensor:
+        """Return the command nearest to what is wanted within all bounds, not clamped."""
+        speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
+        free = gap - self.margin
+        shortest = self.time_to_collision
         command = wanted
         if self.time_gap is not None:
             allowed, slope = self._longest_gap(speed, self.time_gap)
@@ -149,8 +183,7 @@ class CBFFilter(StepTransform):
             opening = half * ahead_acceleration - closing
             held = (self.time_gap_rate * room + opening) / (self.shortest_time_gap + half)
             command = torch.minimum(command, held)
-        command = command.clamp(-self.max_acceleration, self.max_acceleration)
-        return torch.where(known, command, -self.max_acceleration)
+        return command
 
     def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
         """Return the longest gap at a speed, and how it grows with the speed."""
@@ -186,31 +219,29 @@ class Promised(StepTransform):
     """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
-    is reckoned with: time-to-collision at its end is then above the filter's limit; else 0.
+    is reckoned with, in the step and since the oldest measurement that may be in use:
+    time-to-collision at its end is then above the filter's limit; else 0.
     """
 
-    braking: InstanceOf[Braking]  # what the filter reckons with
-    margin: Positive  # gap that counts as contact [m]
-    response: InstanceOf[Response] | None = None  # of a vehicle that obeys late
+    safety: InstanceOf[CBFFilter]  # the filter, bound
 
     name = AUTOMATED
 
     def setup(self, world: World) -> None:
-        """Read what bounds the commands of the role."""
+        """Read the true state, and what bounds the commands of the role."""
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
-        seen += [f"{self.name}.{ACTUATION}"] * (self.response is not None)
-        self.see(world, seen, [(self.name, "promised")], self.name)
+        self.see(world, [*seen, *self.safety.memories], [(self.name, "promised")], self.name)
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return 1 for the steps that are covered."""
-        speed, gap, ahead, acceleration, *kept = self.views(*entries)
-        free = gap - self.margin
-        room = least_room(speed, free, ahead, self.braking)
-        if self.response is not None:
-            now = Motion(speed, free, ahead, kept[0][..., :1])
-            path = predicted(now, kept[0][..., 1:], -self.braking.ahead, self.response)
-            rooms = [x.gap - self.braking.time_to_collision * (x.speed - x.ahead) for x in path]
-            rooms.append(least_room_late(path[-1], self.response, self.braking))
-            room = torch.stack(rooms).amin(0)
-        kept_up = acceleration >= -self.braking.ahead - ROUNDING
+        safety, (speed, gap, ahead, acceleration, *memories) = self.safety, self.views(*entries)
+        actuation, sensors = safety.kept(memories, speed)
+        now = Motion(speed, gap - safety.margin, ahead, actuation[..., :1])
+        if safety.late:
+            room = least_room_to_come(now, actuation[..., 1:], safety.response, safety.limits)
+        else:
+            room = least_room(speed, now.gap, ahead, safety.limits)
+        past = frames_of(sensors, AHEAD_ACCELERATION)[..., : safety.sensing.oldest]
+        hardest = torch.cat([acceleration, past], -1).amin(-1, keepdim=True)
+        kept_up = hardest >= -safety.braking_ahead - ROUNDING
         return ((room >= -ROUNDING) & kept_up).to(speed.dtype)

@@ -94,7 +94,8 @@ class Controller(StepTransform):
         """
         self.role, self.string, self.time_step = self.name, world.string, world.time_step
         self.names = tuple(reads)
-        self.see(world, reads, [("command", self.role), *writes], self.role, **more)
+        known = world.sensed(self.role, reads)
+        self.see(world, known, [("command", self.role), *writes], self.role, **more)
 
     def compute(self, *entries: Tensor) -> Any:
         """Return the commands, and what else is written."""

@@ -90,10 +90,11 @@ class ObservationMemory(StepTransform):
         ages = [round(age / time_step) for age in self.seconds]
         self.stacked, self.depth = self.kind == "stacked", max(ages) + 1
         kept = "history" if self.stacked else "entries"
-        reached = [f"{NEXT}.{source}" for source in self.sources]
+        known = world.sensed(AUTOMATED, self.sources)
+        reached = [f"{NEXT}.{source}" for source in known]
         self.views = Views(string, AUTOMATED, [f"memory.{kept}", *reached])
         # The same entries at reset, where there is no step before.
-        self.first = Views(string, AUTOMATED, self.sources)
+        self.first = Views(string, AUTOMATED, known)
         writes = [("memory", "entries")] + ([("memory", "history")] if self.stacked else [])
         self.counted, self.repeat = len(self.sources), len(self.seconds)
         shape = (string.count(AUTOMATED), self.counted * self.repeat)

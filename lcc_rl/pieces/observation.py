@@ -70,7 +70,8 @@ class Observation(Feature):
             bases.append([])
             counts.append(visible)
         names = list(dict.fromkeys([*seen, *(key for keys in bases for key in keys)]))
-        self.views = Views(string, AUTOMATED, [".".join(name) for name in names], visible)
+        known = world.sensed(AUTOMATED, [".".join(name) for name in names])
+        self.views = Views(string, AUTOMATED, known, visible)
         shape = (string.count(AUTOMATED), len(values))
         self.wire(self.views.keys, [(AUTOMATED, OBSERVATION)], shape)
         firsts = [sum(counts[:place]) for place in range(len(counts))]

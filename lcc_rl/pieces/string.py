@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, ClassVar, Protocol
 
@@ -94,7 +94,6 @@ class StringMotion(StepTransform):
     vehicle_length: Positive = 5.0  # of every vehicle, of use on a ring road only [m]
     # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
     initial_speed: NonNegative = 0.0
-    late: Sequence[str] = ()  # roles between whose commands and motion is an Actuation
 
     def setup(self, world: World) -> None:
         """Read the commands of all roles, and bind their starts.
@@ -105,7 +104,8 @@ class StringMotion(StepTransform):
         self.string, self.time_step = world.string, world.time_step
         string = world.string
         commands = [
-            next_key((OBEYED if role in self.late else COMMAND, role)) for role in string.names
+            next_key((OBEYED if role in world.actuators else COMMAND, role))
+            for role in string.names
         ]
         own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
         leader = [] if string.ring else [LEADER_SPEED, next_key(LEADER_SPEED)]

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.errors import require
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.settings import Settings, values
+
+# Views that a role with sensors has from them, and the entries of the role that hold them.
+SENSED = {
+    "self.gap": "sensed_gap",
+    "self.speed": "sensed_speed",
+    "self.relative_speed": "sensed_relative_speed",
+    "ahead.speed": "sensed_ahead_speed",
+    "ahead.acceleration": "sensed_ahead_acceleration",
+}
 
 
 @dataclass(frozen=True)
@@ -22,6 +33,8 @@ class World:
         population: the human drivers.
         energy: the energy models of the vehicles.
         nominal: leaders and starts as in an evaluation, without the deviations of training.
+        actuators: settings of the :class:`lcc_rl.pieces.Actuation` of roles that have one.
+        sensors: settings of the :class:`lcc_rl.pieces.Sensors` of roles that have some.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -31,6 +44,33 @@ class World:
     population: Any = None
     energy: Fleet = field(default_factory=lambda: as_fleet(None))
     nominal: bool = False
+    actuators: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+
+    def steps(self, seconds: float, what: str) -> int:
+        """Return a duration in steps.
+
+        Raises:
+            ConfigError: if it is no number of steps.
+        """
+        count = seconds / self.time_step
+        require(
+            abs(count - round(count)) < 1e-6,
+            f"{what} must be a multiple of the time step, {self.time_step:g} s, got {seconds:g} s",
+        )
+        return round(count)
+
+    def sensed(self, role: str, names: Sequence[str]) -> list[str]:
+        """Return names of views of a role, those that its sensors measure as measured."""
+        if role not in self.sensors:
+            return list(names)
+        return [_sensed(role, name) for name in names]
+
+
+def _sensed(role: str, name: str) -> str:
+    plain = name.removeprefix("next.")
+    prefix = name.removesuffix(plain)
+    return f"{prefix}{role}.{SENSED[plain]}" if plain in SENSED else name
 
 
 class Part(Settings):

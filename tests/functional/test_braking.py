@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -36,8 +38,10 @@ def simulated(speed: Tensor, gap: Tensor, ahead: Tensor, braking: Braking) -> Te
     return least
 
 
-def states(count: int, braking: Braking, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Speeds of both and the gap, less the margin: a third of the states on the boundary."""
+def states(
+    count: int, braking: Braking, seed: int, room: Callable[..., Tensor] = least_room
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Speed, gap less the margin and speed ahead: a third of the states on the boundary."""
     chance = torch.Generator().manual_seed(seed)
     speed, ahead = draw(count, chance, 40.0), draw(count, chance, 40.0)
     near = speed + torch.randn(count, generator=chance)
@@ -46,7 +50,7 @@ def states(count: int, braking: Braking, seed: int) -> tuple[Tensor, Tensor, Ten
     low, high = torch.zeros(count), torch.full((count,), 2000.0)
     for _ in range(50):
         middle = 0.5 * (low + high)
-        safe = least_room(speed, middle, ahead, braking) >= 0.0
+        safe = room(speed, middle, ahead, braking) >= 0.0
         low, high = torch.where(safe, low, middle), torch.where(safe, middle, high)
     more = torch.where(draw(count, chance) < 0.33, 0.0, draw(count, chance, 60.0))
     return speed, high + more, ahead

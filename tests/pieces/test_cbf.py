@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import ACTION, small_env
+from helpers import ACTION, slow_but, small_env
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import play
@@ -13,7 +13,7 @@ from lcc_rl.functional.braking import Braking, safe_command
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.rewards import TERMS
 
-WHOLE = "scenario.horizon=300"
+WHOLE, AUTO = "scenario.horizon=300", "scenario.filters.automated"
 
 
 def driven(action: float | None, *overrides: str, places: tuple[int, ...] = (0,)):
@@ -44,27 +44,31 @@ def test_no_policy_passes_the_limits(action) -> None:
     assert broken.double().mean() > 0.1
 
 
-LATE = "scenario.actuators.automated={_target_: lcc_rl.pieces.Actuation, delay: 0.2, lag: 0.3}"
-
-
-@pytest.mark.parametrize("action", [1.0, 0.0, None])
-def test_late_brakes_need_a_filter_that_knows_them(action) -> None:
-    blind = driven(action, "+filter=cbf", LATE)
-    knows = driven(action, "+filter=cbf_actuation")
+@pytest.mark.parametrize(
+    ("faults", "action"),
+    slow_but(
+        [("all", 1.0)], [(x, y) for x in ("actuation", "sensors", "all") for y in (1.0, None)]
+    ),
+)
+def test_faults_need_a_filter_that_reckons_with_them(faults, action) -> None:
+    both = ["+filter=cbf", f"+faults={faults}"]
+    blind, knows = (driven(action, *both, f"{AUTO}.robust={x}") for x in ("false", "true"))
     assert blind["ttc"].min() < 4.0
+    assert "promised" not in blind  # it answers for nothing
     promised = knows["promised"] == 1.0
     assert promised.double().mean() > 0.9
     assert (knows["ttc"][promised] >= 4.0).all()
     assert knows["gap"].min() > 0.1
 
 
-def test_a_delay_is_a_number_of_steps() -> None:
-    with pytest.raises(ConfigError, match="delay of automated must be a multiple of the time step"):
-        small_env("alcc", 2, ["+filter=cbf_actuation", "scenario.actuators.automated.delay=0.25"])
+def test_what_acts_or_is_measured_late_is_a_number_of_steps() -> None:
+    for option in ("actuators.automated.delay", "sensors.automated.longest_dropout"):
+        with pytest.raises(ConfigError, match=f"{option} must be a multiple of the time step, 0.1"):
+            small_env("alcc", 2, ["+faults=all", f"scenario.{option}=0.25"])
 
 
 def test_the_gradient_passes_the_filter_that_knows_late_brakes() -> None:
-    response, limits = Response.of(0.1, 0.3, 3.0, 0.1), Braking(3.0, 2.6, 4.0)
+    response, limits = Response.of(1, 0.3, 3.0, 0.1), Braking(3.0, 2.6, 4.0)
     gap = torch.tensor([[35.0]], dtype=torch.float64, requires_grad=True)
 
     def bound(x: torch.Tensor) -> torch.Tensor:

@@ -84,6 +84,7 @@ from lcc_rl.pieces import (
     RewardPiece,
     RewardTerm,
     SafetyReward,
+    Sensors,
     SmoothEfficiency,
     Smoothness,
     SmoothRange,
@@ -102,6 +103,8 @@ from lcc_rl.pieces.base import as_key
 from lcc_rl.pieces.world import World
 
 HORIZON, T = 12, 0.1
+LATE = Actuation(delay=0.2, lag=0.3)
+BLURRED = Sensors(gap_error=0.5, delay=0.2, dropouts=0.3, longest_dropout=0.2)
 FLEET = Fleet(
     {"car": CirclesFuel(), "electric": ElectricCar()}, roles={"automated": {"electric": 1.0}}
 )
@@ -188,7 +191,7 @@ def controllers() -> dict[str, tuple[str, Piece]]:
         "CBFFilter": ("automated", CBFFilter()),
         "Corrected": ("automated", Corrected()),
         "ConstantAcceleration, late": ("slow", ConstantAcceleration(acceleration=0.3)),
-        "Actuation": ("slow", Actuation(delay=0.2, lag=0.3)),
+        "Actuation": ("slow", LATE),
     }
 
 
@@ -198,7 +201,7 @@ def motion(string: VehicleString) -> StringMotion:
     start |= {role: HeadwayStart() for role in CONNECTED}
     start |= {} if string.ring else {"recorded": RecordedStart()}
     length = 30.0 * len(string) if string.ring else None
-    return StringMotion(start=start, circumference=length, initial_speed=8.0, late=["slow"])
+    return StringMotion(start=start, circumference=length, initial_speed=8.0)
 
 
 def rewards() -> dict[str, tuple[str | None, Piece]]:
@@ -258,6 +261,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         **controllers(),
         **({} if string.ring else {"RecordedDriver": ("recorded", RecordedDriver())}),
         **{name: (None, piece) for name, piece in unnamed.items()},
+        "Sensors": ("slow", BLURRED),
         **terms,
         "TotalReward": (None, TotalReward(terms=listed)),
     }
@@ -269,6 +273,8 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
 
 def world_of(road: str, label: str) -> World:
     world = World(STRINGS[road], T, HORIZON, followed_profiles(), POPULATION)
+    faults = {"actuators": {"slow": LATE}, "sensors": {"slow": BLURRED}}
+    world = replace(world, **faults)
     if label == "CalibratedDrivers":
         return replace(world, population=MIXED)
     mixed = label.endswith("mixed") or label == "EnergyClasses"

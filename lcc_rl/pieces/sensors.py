@@ -1,0 +1,138 @@
+"""Sensors between the true state and what the vehicles of a role know of it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.random import stream_id, uniform
+from lcc_rl.functional.sensing import Sensing
+from lcc_rl.pieces.base import Key, StepTransform
+from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.world import SENSED, World
+from lcc_rl.settings import NonNegative, Share
+
+SENSORS = "sensors"
+# Columns of a frame of the memory.
+GAP, SPEED, AHEAD, AHEAD_ACCELERATION, ACCELERATION = range(5)
+SEEN = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
+
+
+class Sensors(StepTransform):
+    """Measures gap and speeds for a role: late, with bounded errors, and with drop-outs.
+
+    Controllers, safety filter, observation and memory of the role read what is measured here in
+    the place of ``self.gap``, ``self.speed``, ``self.relative_speed``, ``ahead.speed`` and
+    ``ahead.acceleration``; limits, rewards and energy are those of the true state. The own
+    acceleration is known, as are vehicles behind and what comes by radio. Errors are drawn evenly
+    within their bounds by the episode's seed: for each measurement, or every ``error_time``, and
+    linear in time between.
+
+    Keeps ``(role, "sensors")``, ``[*batch, n, 1 + 5·(oldest + 1)]``: the age of the measurement in
+    steps, then what :data:`SEEN` names, true, at present and in the steps before. Before the
+    episode began, speeds were what they are at its start.
+    """
+
+    gap_error: NonNegative = 0.0  # largest, of the gap [m]
+    speed_error: NonNegative = 0.0  # largest, of the own speed [m/s]
+    ahead_error: NonNegative = 0.0  # largest, of the speed of the vehicle ahead [m/s]
+    error_time: NonNegative = 0.0  # in which errors change, a number of steps; 0: a step [s]
+    delay: NonNegative = 0.0  # age of a measurement that arrives, a number of steps [s]
+    dropouts: Share = 0.0  # chance that a measurement does not arrive: the last one stays
+    longest_dropout: NonNegative = 0.0  # in a row, a number of steps [s]
+
+    name = AUTOMATED
+    index: ClassVar[Tensor]
+
+    def __post_init__(self) -> None:
+        if (self.dropouts > 0.0) != (self.longest_dropout > 0.0):
+            raise ValueError("dropouts and longest_dropout belong together: give both or none")
+
+    def setup(self, world: World) -> None:
+        """Read the true state as the role sees it."""
+        role, self.time_step = self.name, world.time_step
+        self.sensing = self.sensing_in(world, role)
+        self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
+        drawn = ["episode.seed", "next.episode.step"]
+        seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in SEEN), *drawn]
+        writes = [(role, name) for name in (*SENSED.values(), SENSORS)]
+        self.see(world, seen, writes, role)
+        # The same entries at reset, where there is no step before.
+        self.first = Views(world.string, role, [*SEEN, "episode.seed", "episode.step"])
+        self.streams = [stream_id(f"{role}.sensors.{name}") for name in ("gap", "speed", "ahead")]
+        self.missing = stream_id(f"{role}.sensors.missing")
+        self.register_buffer("index", torch.arange(self.event_shape[0]).unsqueeze(-1))
+
+    def sensing_in(self, world: World, role: str) -> Sensing:
+        """Return the bounds of what the role measures.
+
+        Raises:
+            ConfigError: if a duration is no number of steps.
+        """
+        late, longest = (
+            world.steps(getattr(self, name), f"scenario.sensors.{role}.{name}")
+            for name in ("delay", "longest_dropout")
+        )
+        return Sensing(self.gap_error, self.speed_error, self.ahead_error, late, longest)
+
+    def compute(self, *entries: Tensor) -> tuple[Tensor, ...]:
+        """Return what is measured, and what is kept."""
+        memory, *now, seed, step = self.views(*entries)
+        frames = torch.cat([*now, memory[..., 1 : -len(SEEN)]], -1)
+        dropped = memory[..., :1] - self.sensing.late
+        missing = uniform(seed, step, self.missing + self.index) < self.dropouts
+        dropped = torch.where(missing & (dropped < self.sensing.longest), dropped + 1.0, 0.0)
+        return self._measured(frames, self.sensing.late + dropped, seed, step)
+
+    def _measured(
+        self, frames: Tensor, age: Tensor, seed: Tensor, step: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Return what is measured of frames, the latest first, and what is kept."""
+        number = age.long()
+        columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
+        gap, speed, ahead, acceleration, _ = frames.gather(-1, columns).split(1, -1)
+        bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
+        gap_error, speed_error, ahead_error = (
+            bound * self._error(seed, step - number, stream)
+            for bound, stream in zip(bounds, self.streams, strict=True)
+        )
+        speed = (speed + speed_error).clamp(min=0.0)
+        ahead = (ahead + ahead_error).clamp(min=0.0)
+        kept = torch.cat([age, frames], -1)
+        return gap + gap_error, speed, ahead - speed, ahead, acceleration, kept
+
+    def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
+        """Return the error of measurements of that step as a share of its bound, in [−1, 1]."""
+        place = step / self.apart
+        first = place.floor()
+        start, end = (uniform(seed, first.long() + k, stream + self.index) for k in (0, 1))
+        return 2.0 * torch.lerp(start, end, place - first) - 1.0
+
+    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        specs = super().written_specs(batch, device)
+        width = 1 + len(SEEN) * (self.sensing.oldest + 1)
+        shape = (*batch, self.event_shape[0], width)
+        specs[self.targets[-1]] = Unbounded(shape=shape, device=device)
+        return specs
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        *now, seed, step = self.first(*(start.get(key) for key in self.first.keys))
+        closing = self.time_step * (now[SPEED] - now[AHEAD])
+        frames = [
+            torch.cat([now[GAP] + number * closing, *now[SPEED:]], -1)
+            for number in range(self.sensing.oldest + 1)
+        ]
+        age = torch.full_like(closing, self.sensing.late)
+        values = self._measured(torch.cat(frames, -1), age, seed, step)
+        for key, value in zip(self.targets, values, strict=True):
+            start.set(key, value)
+
+
+def frames_of(memory: Tensor, column: int) -> Tensor:
+    """Return a column of :data:`SEEN` in all frames, the latest first, ``[*batch, n, frames]``."""
+    return memory[..., 1 + column :: len(SEEN)]
