@@ -34,7 +34,7 @@ def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> No
 @pytest.mark.parametrize(
     ("settings", "parts", "words"),
     [
-        ({"seeds": 0}, ("main", "ablations"), "seeds must be at least 1"),
+        ({"seeds": 0}, ("main", "ablations"), "seeds must lie from 1 to"),
         ({"ablations": ("no_safty",)}, ("main", "ablations"), "no_safety"),
         ({"ablations": ("mine:reward.terms.safty.weight=0",)}, ["ablations"], "safty"),
         ({"overrides": ("sede=1",)}, ("main", "ablations"), "sede"),
