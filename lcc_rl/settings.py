@@ -32,6 +32,7 @@ Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
+Whole = Annotated[int, Field(ge=0)]
 Million = Annotated[int, Field(ge=1, le=1_000_000)]
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]

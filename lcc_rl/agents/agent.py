@@ -18,7 +18,6 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import Settings, values
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
-Whole = Annotated[int, Field(ge=0)]
 
 
 @dataclass(frozen=True)

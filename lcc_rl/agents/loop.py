@@ -10,60 +10,31 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import pandas as pd
 import torch
-from pydantic import AfterValidator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.agent import Agent, Whole
+from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.checks import check_learner
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config.schemas import TrainingConfig
-from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError
+from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import check_like, read_checked, write_torch
 from lcc_rl.pieces.rewards import REWARD, TERMS
+from lcc_rl.runs.checkpoints import Checkpoint
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.settings import Settings
 
 # What the record of an iteration is made from.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 
 AgentT = TypeVar("AgentT", bound=Agent)
-
-
-def check_columns(columns: dict[str, Any]) -> dict[str, Any]:
-    """Check that the columns of a record are numbers in double precision."""
-    for name, value in columns.items():
-        if not isinstance(value, Tensor) or value.dtype != torch.float64 or value.ndim != 1:
-            raise ValueError(f"column {name!r} is no list of numbers in double precision")
-    return columns
-
-
-Columns = Annotated[dict[str, Any], AfterValidator(check_columns)]
-
-
-class Checkpoint(Settings):
-    """What a checkpoint holds."""
-
-    identity: str
-    iteration: Whole
-    updates: Whole
-    agent: dict[str, Any]
-    rows: Columns  # the record, an entry per iteration
-    times: Columns
-    memory: dict[str, Any]
-
-    def settled(self) -> None:
-        lengths = {len(column) for column in (*self.rows.values(), *self.times.values())}
-        if not {*lengths, *([] if self.rows else [0])} <= {self.iteration}:
-            raise ConfigError(f"iteration {self.iteration}, but rows of {sorted(lengths)}")
 
 
 class TrainingLoop(ABC, Generic[AgentT]):

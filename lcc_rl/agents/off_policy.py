@@ -18,11 +18,11 @@ from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
 from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, Whole, anneal, derived_seed
+from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
 from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.vectors import join, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
-from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, given_as
+from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole, given_as
 
 
 class Exploration(Settings):

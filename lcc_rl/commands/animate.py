@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import pandas as pd
-from pydantic import Field
 
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
 from lcc_rl.figures.animation import FORMS, animate, check_ending
@@ -24,7 +22,7 @@ from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
 from lcc_rl.runs.arguments import Arguments, typed
-from lcc_rl.settings import NonNegative
+from lcc_rl.settings import NonNegative, Whole
 
 KEPT = "evaluation.sample_episodes=4"
 
@@ -117,7 +115,7 @@ def main(words: Sequence[str] | None = None) -> int:
     number = typed(NonNegative)
     parser.add_argument(
         "--episode",
-        type=typed(Annotated[int, Field(ge=0)]),
+        type=typed(Whole),
         default=0,
         help="which sample episode, from 0",
     )

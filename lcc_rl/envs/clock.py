@@ -92,11 +92,10 @@ class Clock(EnvBase):
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        seed = 0 if seed is None else seed
         whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-        if not (whole and 0 <= seed <= LAST_SEED):
+        if seed is not None and not (whole and 0 <= seed <= LAST_SEED):
             raise ConfigError(f"seed must be a whole number from 0 to {LAST_SEED}, got {seed!r}")
-        self.generator.manual_seed(seed)
+        self.generator.manual_seed(0 if seed is None else seed)
 
     def draw_seeds(self) -> torch.Tensor:
         """Draw a seed for a new episode in every place of the batch, ``[*batch, 1]``, int64."""

@@ -95,10 +95,9 @@ def test_survey_and_status_of_a_sweep(tmp_path) -> None:
 
 def test_nothing_to_see(tmp_path) -> None:
     assert status(tmp_path)[-1].endswith("0 runs: none")
-    for name, words in (("nowhere", "no such folder"), ("", "the name of the folder is empty")):
-        done = run_command("lcc_rl.cli.status", name, cwd=tmp_path)
-        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-        assert words in done.stderr
+    done = run_command("lcc_rl.cli.status", "", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "the name of the folder is empty" in done.stderr
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"done": "x"}', "3", "{}"])

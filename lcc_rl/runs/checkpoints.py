@@ -1,0 +1,40 @@
+"""The typed model of a training's checkpoint, by which one that others made is checked."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import torch
+from pydantic import AfterValidator
+from torch import Tensor
+
+from lcc_rl.errors import ConfigError
+from lcc_rl.settings import Settings, Whole
+
+
+def check_columns(columns: dict[str, Any]) -> dict[str, Any]:
+    """Check that the columns of a record are numbers in double precision."""
+    for name, value in columns.items():
+        if not isinstance(value, Tensor) or value.dtype != torch.float64 or value.ndim != 1:
+            raise ValueError(f"column {name!r} is no list of numbers in double precision")
+    return columns
+
+
+Columns = Annotated[dict[str, Any], AfterValidator(check_columns)]
+
+
+class Checkpoint(Settings):
+    """What a checkpoint holds."""
+
+    identity: str
+    iteration: Whole
+    updates: Whole
+    agent: dict[str, Any]
+    rows: Columns  # the record, an entry per iteration
+    times: Columns
+    memory: dict[str, Any]
+
+    def settled(self) -> None:
+        lengths = {len(column) for column in (*self.rows.values(), *self.times.values())}
+        if not {*lengths, *([] if self.rows else [0])} <= {self.iteration}:
+            raise ConfigError(f"iteration {self.iteration}, but rows of {sorted(lengths)}")
