@@ -5,6 +5,7 @@ Tensors of vehicles are ``[*batch, N, 1]``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -13,8 +14,8 @@ from torch import Tensor
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
-# What the hybrid strategy drives by: the better of its candidates (the paper), the best point
-# between them, or the rule and what the first vehicle's best point adds to its own rule.
+# What the hybrid strategy drives by: the better of its candidates (the paper), the point between
+# them nearest to the rule that earns no less, or the rule and what the first vehicle so adds to it.
 Choice = Literal["better", "between", "first"]
 
 
@@ -174,14 +175,16 @@ def hybrid_decision(
     The theorem H15–H21 assumes that each candidate keeps the jerk bound relative to the
     acceleration executed last; without step 1 that is not so.
 
-    With ``choice="between"`` the point between the candidates that earns most takes the place of
-    steps 2 and 3: there is no jump, and no step is expected to earn less than either candidate,
-    as the blend of step 3 is. With ``"first"`` the first vehicle decides so; the others add its
-    correction, what it adds to its rule, to their own. In the errors between neighbours the
-    correction cancels: they obey the rule's law, whatever the policy does.
+    With ``choice="between"`` the point between the candidates that is nearest to the rule and
+    earns no less than either takes the place of steps 2 and 3: there is no jump, and no step
+    falls short of a candidate, as the blend of step 3 does. With ``"first"`` the first vehicle
+    decides so; the others add its correction, what it adds to its rule, to their own. In the
+    errors between neighbours the correction cancels: they obey the rule's law, whatever the
+    policy does.
 
     Args:
-        rule, learned: the candidates [m/s²].
+        rule, learned: the candidates [m/s²]; the rule's may exceed a_max, so that neighbours
+            differ by its law there, too.
         speed: v_i [m/s].
         last_acceleration: a_{k−1} as executed [m/s²].
         last_winner: winner of the frame before; negative or None where there was none.
@@ -191,19 +194,24 @@ def hybrid_decision(
             finite number, the vehicle brakes as hard as it can.
         reward: the reward to compare by.
         time_step: T [s].
-        max_acceleration: a_max [m/s²]; no cap asks for braking harder than it.
+        max_acceleration: a_max [m/s²], of both candidates and of the brakes.
         place: where the vehicle is, which a reward with a spacing weight needs.
         choice: see above. The winner between the candidates is the nearer one.
     """
     (one, two), clamped, capped = _bounded(
         torch.stack([rule, learned]), interval, cap, max_acceleration
     )
-    # Between the candidates the reward bends where the speed error or the jerk vanishes.
-    bends = () if choice == "better" else ((leader_next - speed) / time_step, last_acceleration)
-    shares = _shares(one, two, *bends)
-    options = torch.lerp(one, two, shares)
-    earned = reward.one_step(speed, last_acceleration, options, leader_next, time_step, place)
-    share = shares.gather(-1, earned.argmax(-1, keepdim=True))
+
+    def earned(acceleration: Tensor) -> Tensor:
+        return reward.one_step(
+            speed, last_acceleration, acceleration, leader_next, time_step, place
+        )
+
+    if choice == "better":
+        share = (earned(two) > earned(one)).to(one.dtype)
+    else:  # the reward bends where the speed error or the jerk vanishes
+        bends = torch.cat([(leader_next - speed) / time_step, last_acceleration], -1)
+        share = _nearest(one, two, bends, earned)
     if choice == "first":
         share = share[..., :1, :].expand_as(rule)
     winner = (share > 0.5).to(torch.int64)
@@ -220,17 +228,28 @@ def hybrid_decision(
     return Decision(chosen, winner, switched, clamped, capped)
 
 
-def _shares(rule: Tensor, learned: Tensor, *bends: Tensor) -> Tensor:
-    """Return shares of the learned candidate, ``[*batch, N, n]``: 0, 1, then those of the bends.
+def _nearest(
+    rule: Tensor, learned: Tensor, bends: Tensor, earned: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Return the least share of the learned candidate that earns no less than either, if mixed in.
 
     Args:
         rule, learned: the candidates, ``[*batch, N, 1]`` [m/s²].
-        bends: accelerations of that shape [m/s²]; those beyond a candidate count as it.
+        bends: accelerations between which the reward is linear, ``[*batch, N, n]`` [m/s²].
+        earned: the reward of accelerations, concave.
     """
     span = learned - rule
-    span = torch.where(span == 0.0, 1.0, span)
-    between = [((bend - rule) / span).clamp(0.0, 1.0) for bend in bends]
-    return torch.cat([torch.zeros_like(rule), torch.ones_like(rule), *between], -1)
+    between = ((bends - rule) / torch.where(span == 0.0, 1.0, span)).clamp(0.0, 1.0).sort(-1).values
+    shares = torch.cat([torch.zeros_like(rule), between, torch.ones_like(rule)], -1)
+    rewards = earned(torch.lerp(rule, learned, shares))
+    wanted = torch.maximum(rewards[..., :1], rewards[..., -1:])
+    # Within the stretch at whose end as much is reached for the first time.
+    end = (rewards >= wanted).to(torch.int64).argmax(-1, keepdim=True)
+    begin = (end - 1).clamp(min=0)
+    low, high = rewards.gather(-1, begin), rewards.gather(-1, end)
+    part = (wanted - low) / torch.where(high == low, 1.0, high - low)
+    share = torch.lerp(shares.gather(-1, begin), shares.gather(-1, end), part.clamp(0.0, 1.0))
+    return torch.where(span == 0.0, 0.0, share)
 
 
 def _bounded(
@@ -240,7 +259,8 @@ def _bounded(
     max_acceleration: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the candidates within jerk bound and safe cap, and whether either cut one (step 1)."""
-    free = candidates
+    given, free = candidates, candidates.clamp(-max_acceleration, max_acceleration)
+    candidates = free
     if interval is not None:
         candidates = candidates.clamp(*interval)
     clamped = (candidates != free).any(0)
@@ -248,6 +268,6 @@ def _bounded(
         return candidates, clamped, torch.zeros_like(clamped)
     bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
     # If a candidate, or what the cap is computed from, is no number, nothing is known to be safe.
-    known = (free.isfinite() & bounded.isfinite() & cap.isfinite()).all(0)
+    known = (given.isfinite() & bounded.isfinite() & cap.isfinite()).all(0)
     bounded = torch.where(known, bounded, -max_acceleration)
     return bounded, clamped, (bounded != candidates).any(0)

@@ -62,8 +62,9 @@ class HCFS(Controller):
     # drives through the vehicle ahead: the paper's reward has no spacing term. It brakes fully
     # where a measurement, the action or the rule's command is no finite number.
     safe_cap: bool = True
-    # The better candidate (the paper), the best point between both, or, for a string that is one
-    # platoon, what that of the first vehicle adds to its rule, added to every vehicle's rule.
+    # The better candidate (the paper); the point between both that is nearest to the rule and earns
+    # no less than either; or, for a string that is one platoon, what that of the first vehicle
+    # adds to its rule, added to every vehicle's rule.
     choice: Choice = "better"
     braking: Positive = 3.0  # b of the safe cap [m/s²]
     margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
@@ -89,6 +90,7 @@ class HCFS(Controller):
     def setup(self, world: World) -> None:
         """Read what both candidates and the decision need."""
         self.rule = rule = self.rule.bind(world, self.name)
+        rule.max_acceleration = math.inf  # the decision limits what is executed
         state = [(HYBRID, name) for name in ("winner", *COUNTERS)]
         reads = [f"{self.name}.action", *(f"self.{name}" for name in OWN)]
         reads += [*leader_names(self.lookahead), *(".".join(key) for key in state), *rule.names]
