@@ -6,16 +6,14 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ResultsError
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.settings import Settings, parse
 
-S = TypeVar("S", bound=Settings)
 # Of what is stored here: weights, sums in double precision, counters, flags.
 KINDS = (torch.float32, torch.float64, torch.int64, torch.bool)
 
@@ -59,26 +57,6 @@ def read_torch(path: str | Path) -> Any:
         raise ResultsError(
             f"{path}: not a readable weights file: damaged, or made by something else"
         ) from error
-
-
-def read_checked(path: str | Path, kind: type[S], what: str) -> S:
-    """Read a file of tensors as a typed model, the one door of those that others may have made.
-
-    Args:
-        path: the file.
-        kind: the model.
-        what: what the file should be, for the message.
-
-    Raises:
-        ResultsError: as :func:`read_torch`, or naming the first entry at fault.
-    """
-    content = read_torch(path)
-    if not isinstance(content, dict):
-        raise ResultsError(f"{path}: not a {what}: it holds {type(content).__name__}")
-    try:
-        return parse(kind, {str(key): value for key, value in content.items()}, "")
-    except ConfigError as error:
-        raise ResultsError(f"{path}: not a {what}: {error}") from error
 
 
 def check_like(found: Any, wanted: Any, name: str) -> None:

@@ -14,8 +14,8 @@ from pydantic import AfterValidator, Field
 from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
-from lcc_rl.io.tensors import check_like, read_checked, write_torch
-from lcc_rl.results.trust import trusted
+from lcc_rl.io.tensors import check_like, write_torch
+from lcc_rl.results.trust import read_checked, trusted
 from lcc_rl.settings import Settings
 
 PRETRAINED = "pretrained"
