@@ -231,7 +231,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
             own = group[group["strategy"] == name]
             saved = intervals.saving(energy, spent[strategies[0]])
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
-            row = {"leaders": source, "strategy": NAMES[name]}
+            row: dict[str, object] = {"leaders": source, "strategy": NAMES[name]}
             row |= intervals.crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
             row |= {"gap error_m": own["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
