@@ -117,7 +117,8 @@ def measure(series: Series) -> pd.DataFrame:
     Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² over
     that of the vehicle ahead (string stability: at most 1), missing for the first vehicle and
     where nothing moves. ``energy_kj_per_km`` is that of the scenario's power over the distance
-    driven. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of an automated vehicle.
+    driven, missing for a vehicle at standstill. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of
+    an automated vehicle.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
     energy = series["speed_error"].square().sum(0)
@@ -126,7 +127,7 @@ def measure(series: Series) -> pd.DataFrame:
     ratio[..., 1:] = torch.where(ahead > 1e-3, energy[..., 1:] / ahead.clamp(min=1e-3), torch.nan)
     keeps = series["reward"].isfinite().all(0)
     gap_error = series["gap_error"].abs().amax(0)
-    speed = series["speed"]
+    driven = 0.5 * (series["speed"][1:] + series["speed"][:-1]).sum(0)  # in steps' lengths
     columns = {
         "speed_error_sum": error.sum(0),
         "speed_error_squares": error.square().sum(0),
@@ -137,7 +138,7 @@ def measure(series: Series) -> pd.DataFrame:
         "max_gap_error_m": torch.where(keeps, gap_error, torch.nan),
         "peak_jerk_mps3": jerk.amax(0),
         "energy_ratio": ratio,
-        "energy_kj_per_km": series["power"].sum(0) / (0.5 * (speed[1:] + speed[:-1])).sum(0),
+        "energy_kj_per_km": torch.where(driven > 0.0, series["power"].sum(0) / driven, torch.nan),
     }
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)

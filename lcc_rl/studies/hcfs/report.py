@@ -133,10 +133,14 @@ def _whole(made: Page, episodes: pd.DataFrame) -> None:
 def _sources(made: Page) -> None:
     if not (made.folder / SOURCES).exists():  # only where platoons drove behind other leaders, too
         return
-    text = """HCFS as printed, and as it takes the best point between its parents, decided by the
-        first vehicle, which broadcasts what it adds to CACC."""
-    table = tables.sources(read_parquet(made.folder / SOURCES))
-    made.add("Other leaders", text, [("sources", "Windows of other sources of leaders", table)])
+    text = """HCFS as printed, and as the first vehicle decides for all and broadcasts what it adds
+        to CACC."""
+    runs, title = read_parquet(made.folder / SOURCES), "Windows of other sources of leaders"
+    listed = [
+        ("sources", title, tables.sources(runs, ("cacc tuned", "hcfs", "hcfs first"))),
+        ("sources_in_full", "All strategies", tables.sources(runs)),
+    ]
+    made.add("Other leaders", text, listed)
 
 
 def _training(made: Page) -> None:

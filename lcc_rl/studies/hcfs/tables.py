@@ -53,8 +53,8 @@ LEADERS = {  # sources of leaders, for readers
     "traffic": "I-80",
     "cycles": "cycles at half speed",
     "fast_cycles": "cycles",
-    "openacc_3": "OpenACC 3",
-    "openacc_10": "OpenACC 10",
+    "openacc_3": "OpenACC",
+    "openacc_10": "OpenACC",
     "i24": "I-24",
     "everyday": "everyday drives",
 }
@@ -207,11 +207,12 @@ def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def sources(runs: pd.DataFrame) -> pd.DataFrame:
+def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFrame:
     """Return reward, stability and energy behind several sources of leaders.
 
     Args:
         runs: rows of strategies, seeds and windows, with the ``source`` of the leaders.
+        strategies: those of the table; the first is what energy is compared with.
 
     Returns:
         A row per source and strategy: Σ reward and the energy saved against CACC, with intervals
@@ -219,17 +220,18 @@ def sources(runs: pd.DataFrame) -> pd.DataFrame:
         have one above 1, of all runs.
     """
     rows = []
-    for source, group in runs.groupby("source", sort=False):
+    named = runs["source"].map(LEADERS).fillna(runs["source"])
+    for source, group in runs.groupby(named, sort=False):
         spent = {
             name: per_seed(group, name, WINDOWS, "energy_kj_per_km")
-            for name in STABLE
+            for name in strategies
             if name in set(group["strategy"])
         }
         for name, energy in spent.items():
             own = group[group["strategy"] == name]
-            saved = intervals.saving(energy, spent[STABLE[0]])
+            saved = intervals.saving(energy, spent[strategies[0]])
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
-            row = {"leaders": LEADERS.get(str(source), source), "strategy": NAMES[name]}
+            row: dict[str, object] = {"leaders": source, "strategy": NAMES[name]}
             row |= intervals.crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
             row |= {"gap error_m": own["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
