@@ -267,7 +267,8 @@ def settings_of(words: Sequence[str], own: Path) -> list[str]:
         settings.append(f"hydra.searchpath=[file://{own / flags[1]}]")
         flags = flags[2:]
     assert set(flags) <= {"-m", "--help"}, flags
-    return settings
+    # The folder of a sweep, which a single run may not name.
+    return [word for word in settings if "-m" not in flags or not word.startswith("sweep=")]
 
 
 def one_run(setting: str, choice: int) -> str:

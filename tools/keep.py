@@ -52,7 +52,7 @@ def sources(evaluations: Sequence[Path], path: Path) -> None:
     """Keep what CACC, DDPG and the hybrid, by its choices, did behind every source of leaders."""
     rows = pd.concat([results.load(folder) for folder in evaluations], ignore_index=True)
     hybrid = (rows["strategy"] == "hcfs") & (rows["deployed.choice"] != "better")
-    names = rows["strategy"].mask(hybrid, "hcfs " + rows["deployed.choice"])
+    names = rows["strategy"].astype(str).mask(hybrid, "hcfs " + rows["deployed.choice"].astype(str))
     rows = rows.assign(strategy=names)[(rows["case"] == WINDOWS) & names.isin(STABLE)]
     # Rules and DDPG drove beside every choice.
     rows = rows.drop_duplicates([SOURCE, *RUN, "follower"])

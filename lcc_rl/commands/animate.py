@@ -62,13 +62,13 @@ def run(
         raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
     motions = {}
     with reading(folder):
-        scenario = stored_config(folder)["scenario"]
         known = list(dict.fromkeys(map(str, steps["strategy"])))
         named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
         for strategy, words in named:
             if strategy not in known:
                 raise unknown_name("strategy", strategy, known)
             label, rows = _episode(steps, strategy, episode)
+            scenario = stored_config(folder)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)
             motions[words or f"{in_words(strategy)}: {label}"] = motion
     default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import torch
 from pydantic import AfterValidator, Field
@@ -14,13 +14,34 @@ from pydantic import AfterValidator, Field
 from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
-from lcc_rl.io.tensors import check_like, write_torch
-from lcc_rl.results.trust import read_checked, trusted
-from lcc_rl.settings import Settings
+from lcc_rl.io.tensors import check_like, read_torch, write_torch
+from lcc_rl.results.trust import trusted
+from lcc_rl.settings import Settings, parse
 
 PRETRAINED = "pretrained"
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
+S = TypeVar("S", bound=Settings)
+
+
+def read_checked(path: str | Path, kind: type[S], what: str) -> S:
+    """Read a file of tensors as a typed model, the one door of those that others may have made.
+
+    Args:
+        path: the file.
+        kind: the model.
+        what: what the file should be, for the message.
+
+    Raises:
+        ResultsError: as :func:`read_torch`, or naming the first entry at fault.
+    """
+    content = read_torch(path)
+    if not isinstance(content, dict):
+        raise ResultsError(f"{path}: not a {what}: it holds {type(content).__name__}")
+    try:
+        return parse(kind, {str(key): value for key, value in content.items()}, "")
+    except ConfigError as error:
+        raise ResultsError(f"{path}: not a {what}: {error}") from error
 
 
 def check_weights(weights: dict[str, Any]) -> dict[str, Any]:

@@ -1,44 +1,19 @@
-"""Files that others may have made: what they hold, and what their configuration may name."""
+"""What a stored configuration may name: code of this package, and no place to write."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from lcc_rl.config.nodes import TARGET, find_target, forget_places, settings_at
 from lcc_rl.config.schemas import parse_config
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.io.tensors import read_torch
-from lcc_rl.settings import Settings, parse
-
-S = TypeVar("S", bound=Settings)
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
-
-
-def read_checked(path: str | Path, kind: type[S], what: str) -> S:
-    """Read a file of tensors as a typed model, the one door of those that others may have made.
-
-    Args:
-        path: the file.
-        kind: the model.
-        what: what the file should be, for the message.
-
-    Raises:
-        ResultsError: as :func:`read_torch`, or naming the first entry at fault.
-    """
-    content = read_torch(path)
-    if not isinstance(content, dict):
-        raise ResultsError(f"{path}: not a {what}: it holds {type(content).__name__}")
-    try:
-        return parse(kind, {str(key): value for key, value in content.items()}, "")
-    except ConfigError as error:
-        raise ResultsError(f"{path}: not a {what}: {error}") from error
 
 
 def trusted(

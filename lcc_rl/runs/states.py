@@ -64,10 +64,11 @@ def claim(folder: Path) -> Iterator[None]:
 
     The lock is released however the process ends.
     """
-    made, lock = False, FileLock(folder / LOCK)
+    made: list[Path] = []
+    lock = FileLock(folder / LOCK)
     try:
         str(folder.resolve()).encode()  # pyarrow knows names in UTF-8 only
-        made = not folder.exists()
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout:
@@ -81,9 +82,9 @@ def claim(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             (folder / LOCK).unlink()
         lock.release()
-        if made:
-            with suppress(OSError):  # it holds something
-                folder.rmdir()
+        with suppress(OSError):  # one that holds something
+            for path in made:
+                path.rmdir()
 
 
 def is_claimed(folder: Path) -> bool:

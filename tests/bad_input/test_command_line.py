@@ -63,7 +63,7 @@ REFUSED = {
     "animate nowhere": "nowhere: not a run folder",
     "maps nowhere": "nowhere: not a run folder",
     "clairvoyant --iterations 0": "--iterations: must be greater than or equal to 1",
-    "export pretrained/alcc policy.banana": "'.banana'; valid: .onnx",
+    "export pretrained/alcc policy.banana": "'.banana'; valid: .html, .onnx",
     "status nowhere": "nowhere: no such folder",
     "reproduce alcc --recipe smok": "smok",
     "reproduce alcc --recipe smoke --jobs 1000000000": "jobs must lie from 1 to",

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
-from lcc_rl.results.scores import LARGEST, LEAST, LIMITED, SHARE
+from lcc_rl.results.scores import HEADINGS, LARGEST, LEAST, SHARE
 
 ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
 
@@ -52,7 +52,7 @@ def test_safety() -> None:
     }
     assert set(measures) == set(expected)
     named = {name for name in expected if name.startswith((LARGEST, LEAST, SHARE))}
-    assert named | {"share_leader_faster", "share_ttc_unpromised"} == set(LIMITED)
+    assert named | {"share_leader_faster", "share_ttc_unpromised"} == set(HEADINGS)
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 

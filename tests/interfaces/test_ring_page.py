@@ -21,8 +21,9 @@ from lcc_rl.energy import CirclesFuel
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import load_inputs
 from lcc_rl.errors import LccError
+from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.evaluation.strategies import baseline_controller, by_people, driven_by, trained
+from lcc_rl.evaluation.strategies import by_people, driven_by, trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export
 from lcc_rl.interfaces.ring_page import TASK, filter_data, ring_page
@@ -97,7 +98,7 @@ def driven(policy: str, driver: str, start: int, string: str) -> tuple[torch.Ten
         cfg, actor = strategy.cfg, strategy.policy
         cfg.scenario.filters = own.scenario.filters
     else:
-        after = human if driver == "human" else baseline_controller(driver)
+        after = human if driver == "human" else controller_of(driver)
         both = {"before": human, "after": after, "from_s": 0.1 * start}
         cfg = by_people(driven_by(cfg, {"_target_": "lcc_rl.pieces.Handover", **both}))
     env = build_env(cfg, inputs.evaluation, inputs.population, (1,), nominal=True)

@@ -103,7 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             console.print(drawn(f"{name}, {device}", measured))
             rows += [{"benchmark": name, **row, "device": device} for row in measured]
             # After each, so that what is measured stays whatever happens to the next.
-            table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
-            write_parquet(table, out)
+            if rows:
+                table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
+                write_parquet(table, out)
     console.print(f"{len(rows)} rows: {out}")
     return 0
