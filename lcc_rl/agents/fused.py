@@ -112,7 +112,7 @@ class Workspace(NamedTuple):
 
 
 class ActorCritic:
-    """An actor and its Q networks, with the steps that make up an update (A8–A9).
+    """An actor and its Q networks, with the steps that make up an update (A8–A9, H7–H8).
 
     Args:
         networks: weights and biases of ``"actor"``, a ReLU network before a tanh, and ``"value"``,

@@ -49,7 +49,10 @@ class Exploration(Settings):
 
 
 class OffPolicy(Agent):
-    """A policy, its Q networks, their loss and optimizers; a subclass says what an update is."""
+    """A policy, its Q networks, their loss and optimizers; a subclass says what an update is.
+
+    Target networks follow by a share of the difference (HCFS H9–H10).
+    """
 
     gamma: Share = 0.9  # discount
     hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of policy and Q networks

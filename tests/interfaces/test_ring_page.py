@@ -140,7 +140,7 @@ def test_filter_and_fuel_are_the_packages_in_any_state(browser) -> None:
     filters = [CBFFilter(**settings).bind() for settings in ({}, WIDER)]
     given = {"states": states.tolist(), "filters": [filter_data(f) for f in filters]}
     found = torch.tensor(browser(ring_page(RING), ALL, **given), dtype=torch.float64)
-    wanted = [f.filtered(*states.unbind(-1)) for f in filters]
+    wanted = [f.filtered(*states.unsqueeze(1).split(1, -1)).flatten() for f in filters]
     fuel = CirclesFuel(vehicle="Compact").fuel(states[:, 1], states[:, 4])
     torch.testing.assert_close(found, torch.stack([*wanted, fuel], -1), rtol=1e-7, atol=1e-8)
 

@@ -162,7 +162,7 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     words = ["--strategy", "idm", "--episode", "1", "--start", "1", "--duration", "0.5"]
     assert command.main([str(run_folder), *words, "--out", str(out)]) == 0
     found = data_of(out.read_text())
-    assert (found["title"], found["time"]) == ("idm: profile p, driver 1", [1.0, 1.5])
+    assert (found["title"], found["time"]) == ("one driver (IDM): profile p, driver 1", [1.0, 1.5])
     assert found["speed"][0] == [9.0] * 2
     job = run_folder.parent / "job"
     job.mkdir()
