@@ -20,7 +20,7 @@ from lcc_rl.data.tables import (
     stem,
     whole_numbers,
 )
-from lcc_rl.data.trajectories import FRAME, HOLE, divided, stretches
+from lcc_rl.data.trajectories import FRAME, HOLE, divided, step_of, stretches
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet
 
@@ -43,14 +43,15 @@ FIELDS = (
     Column("recording", "text", required=False),
     Column("follower_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
     Column("leader_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
-    Column("time", "time"),
-    Column("follower_position", "length", required=False),
-    Column("follower_speed", "speed"),
-    Column("leader_position", "length", required=False),
-    Column("leader_speed", "speed"),
+    Column("time", "time", blank=True),
+    Column("follower_position", "length", blank=True, required=False),
+    Column("follower_speed", "speed", blank=True),
+    Column("leader_position", "length", blank=True, required=False),
+    Column("leader_speed", "speed", blank=True),
     Column("leader_length", "length", least=0.0, required=False),
-    Column("gap", "length"),
+    Column("gap", "length", blank=True),
 )
+MEASURED = [column.key for column in FIELDS if column.blank]  # a blank cell costs the row
 COLUMNS = tuple(SCHEMA)
 OWN = dict(zip((column.key for column in FIELDS), COLUMNS, strict=True))  # names by default
 # What a finished table has: every column, episodes are numbers, no speed or gap is negative.
@@ -61,6 +62,7 @@ STRICT = (
             x,
             key=OWN[x.key],
             required=True,
+            blank=False,
             least=0.0 if x.quantity == "speed" or x.key == "gap" else x.least,
         )
         for x in FIELDS[1:]
@@ -69,6 +71,7 @@ STRICT = (
 ALIASES = {"event": "episode", "period": "recording"}
 POSITIONS = ("leader_position_m", "follower_position_m")
 DERIVED = "no positions given: those of leaders are the integral of their speeds"
+MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
 REGULAR = 0.01  # of a step, by which one may differ: times in float32 are off by some 10 µs
 ONE_ROW = "is of one row; expected at least two"
 
@@ -134,9 +137,10 @@ def _table(
     if missing:
         raise lacking(path, missing, file.header, "data.columns")
     read = file.read(FIELDS, names, units, "data.columns")
-    rows = len(read["time"])
-    if not rows:
+    if not len(read["time"]):
         raise DataError(f"{path}: has no episodes; expected at least one row")
+    read, places = file.complete(read, MEASURED)
+    rows = len(places)
     notes = list(file.notes)
     labels = read.get("episode", np.zeros(rows, dtype=str))
     codes, found = pd.factorize(labels)
@@ -159,7 +163,7 @@ def _table(
         if names.get(name) is None:
             notes.append(words)
     table = pd.DataFrame(values)
-    table, more = _even(table.assign(row=np.arange(rows)), file, codes)
+    table, more = _even(table.assign(row=places), file, codes)
     table = table[[*COLUMNS]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
@@ -172,10 +176,12 @@ def _even(
 ) -> tuple[pd.DataFrame, list[str]]:
     """Rows by episode and time, samples 0.1 s apart; holes divide an episode."""
     notes = []
-    sorted_rows = np.lexsort((table["time_s"], order))
+    sorted_rows = np.lexsort((table["time_s"], order))  # stable: the first row of a moment first
     if (np.diff(sorted_rows) != 1).any():
         notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
         table = table.iloc[sorted_rows].reset_index(drop=True)
+    table, more = _once(table, file)
+    notes += more
     same = np.append(False, np.diff(table["episode"]) == 0)
     for name in ("recording", "follower_id", "leader_id"):
         wrong = same & (table[name] != table[name].shift()).to_numpy()
@@ -185,7 +191,7 @@ def _even(
     if not same.any():
         raise file.fault(0, "episode" if "episode" in file.names else "time", ONE_ROW)
     steps = np.diff(table["time_s"], prepend=0.0)
-    step = float(np.median(steps[same]))
+    step = step_of(steps[same], str(file.path))
     short = same & (steps <= step / 2 + 1e-9)
     if short.any():
         at = int(np.argmax(short))
@@ -210,6 +216,23 @@ def _even(
     if not kept:
         raise DataError(f"{file.path}: no episode lasts {FRAME:g} s; is the time in another unit?")
     return pd.concat(kept, ignore_index=True), notes
+
+
+def _once(table: pd.DataFrame, file: TableFile) -> tuple[pd.DataFrame, list[str]]:
+    """Every moment of an episode once: of several rows, the first."""
+    again = table.duplicated(["episode", "time_s"]).to_numpy()
+    if not again.any():
+        return table, []
+    others = again & ~table.duplicated(table.columns.drop("row")).to_numpy()
+    row = int(table["row"].to_numpy()[others if others.any() else again].min())
+    if others.sum() > MOST_TWICE * len(table):
+        words = "is a moment that other rows of the episode have, with other values; expected one"
+        raise file.fault(row, "time", f"{words} (does data.columns name the episode?)")
+    first = file.fault(row, "time", "is a moment that the episode has")
+    return table[~again].reset_index(drop=True), [
+        f"left out {int(again.sum()):,} rows of a moment that an episode has already, "
+        f"{int(others.sum()):,} of them with other values, the first: {first}"
+    ]
 
 
 def _resampled(part: pd.DataFrame) -> pd.DataFrame:

@@ -19,6 +19,7 @@ SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
 LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
+STANDING = 0.5  # both cars stand below it [m/s]
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
 # Column, words with a place for the number found, these numbers, the threshold's name and which
@@ -48,6 +49,9 @@ class Plausible(Settings):
     # Share of the time with a change of speed above 4 m/s in a second; of recorded traffic it is
     # 0.0001 or less, of the same speeds in km/h about 0.06.
     max_hard: Annotated[float, Field(ge=0.0, le=1.0)] = 0.005
+    # Median gap of a follower that stands behind a leader that stands [m]; of recorded traffic it
+    # is 3 to 8, of the same in feet without data.units 10 to 26.
+    max_standing_gap: Positive = 15.0
 
     def select(
         self,
@@ -124,7 +128,14 @@ class Plausible(Settings):
             raise DataError(
                 f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower "
                 f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; are speeds in km/h, mph "
-                "or ft/s, gaps in feet, or leader and follower exchanged?"
+                "or ft/s, gaps in feet, times not in s, or leader and follower exchanged?"
+            )
+        stand = standing_gap(kept)
+        if stand is not None and stand > self.max_standing_gap:
+            raise DataError(
+                f"{source}: cars stand {stand:.3g} m behind a car that stands (median), "
+                f"{setting}.max_standing_gap={self.max_standing_gap:g}; are gaps, and speeds, in "
+                "feet (data.units)?"
             )
         few = f"too few samples to tell whether speeds are in m/s: fewer than {LEAST_SAMPLES}"
         return [f"{few} a second apart"] if hard is None else []
@@ -177,6 +188,14 @@ def hard_share(table: pd.DataFrame) -> float | None:
     return float(max(shares, default=0.0))
 
 
+def standing_gap(table: pd.DataFrame) -> float | None:
+    """Return the median gap while leader and follower stand [m]; None with too few samples."""
+    if not set(table.columns) >= OF_PAIRS:
+        return None
+    stand = table[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING
+    return float(table["gap_m"][stand].median()) if stand.sum() >= LEAST_SAMPLES else None
+
+
 def usual_step(table: pd.DataFrame) -> float:
     """Return the median time between samples of a record [s]; 0 if none has two."""
     step = table["time_s"].diff()[table["episode"].diff() == 0].median()
@@ -196,13 +215,13 @@ def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def pair_place(episodes: pd.DataFrame) -> Callable[[int, str], str]:
-    """Return what describes a row of an episode table: recording, vehicle, time and column."""
+    """Return what describes a sample of an episode table: recording, vehicle, time and column."""
 
     def place(row: int, column: str) -> str:
         entry = episodes.iloc[row]
         role = "leader" if column.startswith("leader") else "follower"
         where = f"recording {entry['recording']}, vehicle {entry[f'{role}_id']} ({role})"
-        return f"row {row} ({where}, {entry['time_s']:g} s), column {column!r}"
+        return f"{where}, {entry['time_s']:g} s, column {column!r}"
 
     return place
 
