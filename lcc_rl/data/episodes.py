@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lcc_rl.data.plausible import without_blank
 from lcc_rl.data.tables import (
     LARGEST_ID,
     Column,
@@ -139,7 +140,7 @@ def _table(
     read = file.read(FIELDS, names, units, "data.columns")
     if not len(read["time"]):
         raise DataError(f"{path}: has no episodes; expected at least one row")
-    read, places = file.complete(read, MEASURED)
+    read, places = without_blank(file, read, MEASURED)
     rows = len(places)
     notes = list(file.notes)
     labels = read.get("episode", np.zeros(rows, dtype=str))
@@ -162,7 +163,7 @@ def _table(
     ):
         if names.get(name) is None:
             notes.append(words)
-    table = pd.DataFrame(values)
+    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
     table, more = _even(table.assign(row=places), file, codes)
     table = table[[*COLUMNS]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
@@ -175,13 +176,7 @@ def _even(
     table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
 ) -> tuple[pd.DataFrame, list[str]]:
     """Rows by episode and time, samples 0.1 s apart; holes divide an episode."""
-    notes = []
-    sorted_rows = np.lexsort((table["time_s"], order))  # stable: the first row of a moment first
-    if (np.diff(sorted_rows) != 1).any():
-        notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
-        table = table.iloc[sorted_rows].reset_index(drop=True)
-    table, more = _once(table, file)
-    notes += more
+    table, notes = _ordered(table, file, order)
     same = np.append(False, np.diff(table["episode"]) == 0)
     for name in ("recording", "follower_id", "leader_id"):
         wrong = same & (table[name] != table[name].shift()).to_numpy()
@@ -218,21 +213,30 @@ def _even(
     return pd.concat(kept, ignore_index=True), notes
 
 
-def _once(table: pd.DataFrame, file: TableFile) -> tuple[pd.DataFrame, list[str]]:
-    """Every moment of an episode once: of several rows, the first."""
+def _ordered(
+    table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Rows by episode and time; of several of a moment, the first."""
+    notes = []
+    sorted_rows = np.lexsort((table["time_s"], order))  # stable
+    if (np.diff(sorted_rows) != 1).any():
+        notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
+        table = table.iloc[sorted_rows].reset_index(drop=True)
     again = table.duplicated(["episode", "time_s"]).to_numpy()
     if not again.any():
-        return table, []
+        return table, notes
     others = again & ~table.duplicated(table.columns.drop("row")).to_numpy()
     row = int(table["row"].to_numpy()[others if others.any() else again].min())
     if others.sum() > MOST_TWICE * len(table):
-        words = "is a moment that other rows of the episode have, with other values; expected one"
-        raise file.fault(row, "time", f"{words} (does data.columns name the episode?)")
-    first = file.fault(row, "time", "is a moment that the episode has")
-    return table[~again].reset_index(drop=True), [
+        words = "repeats a moment of its episode with other values, as do"
+        share = f"{100 * others.mean():.0f} % of the rows"
+        raise file.fault(row, "time", f"{words} {share}; does data.columns name the episode?")
+    first = file.fault(row, "time", "repeats a moment of its episode")
+    notes.append(
         f"left out {int(again.sum()):,} rows of a moment that an episode has already, "
         f"{int(others.sum()):,} of them with other values, the first: {first}"
-    ]
+    )
+    return table[~again].reset_index(drop=True), notes
 
 
 def _resampled(part: pd.DataFrame) -> pd.DataFrame:

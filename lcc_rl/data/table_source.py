@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import SMOOTHING, Plausible
+from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
 from lcc_rl.data.tables import Column, TableFile, check_map, stem, whole_numbers
 from lcc_rl.data.trajectories import (
@@ -104,7 +104,7 @@ class TableSource(Settings):
             table = TableFile(name)
             part = table.read(FIELDS, self.columns, self.units, "data.columns")
             report.rows_read += len(part["time"])
-            part, rows = table.complete(part, MEASURED)
+            part, rows = without_blank(table, part, MEASURED)
             parts.append({"recording": np.full(len(rows), label), **part, "row": rows})
             report.notes += table.notes
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}

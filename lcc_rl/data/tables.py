@@ -181,34 +181,6 @@ class TableFile:
                 read[column.key] = checked(cells[self.names[column.key]], column, fault, scale)
         return read
 
-    def complete(
-        self, read: dict[str, NDArray], keys: Iterable[str]
-    ) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
-        """Leave rows out in which one of the columns is blank, and note how many.
-
-        Args:
-            read: the columns, of :meth:`read`.
-            keys: those in which a blank cell costs the row.
-
-        Returns:
-            The columns without these rows, and the numbers of the rows that are left.
-
-        Raises:
-            DataError: if every row has a blank cell.
-        """
-        blank = {key: np.isnan(read[key]) for key in keys if key in read}
-        wrong = np.logical_or.reduce([*blank.values()])
-        if not wrong.any():
-            return read, np.arange(len(wrong))
-        row = int(np.argmax(wrong))
-        first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank")
-        if wrong.all():
-            raise first
-        self.notes.append(
-            f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
-        )
-        return {key: values[~wrong] for key, values in read.items()}, np.flatnonzero(~wrong)
-
     def fault(self, row: int, key: str, words: str) -> DataError:
         """Return the error about a cell."""
         name = self.names.get(key, key)
