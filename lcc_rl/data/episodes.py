@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lcc_rl.data.plausible import without_blank
 from lcc_rl.data.tables import (
     LARGEST_ID,
     Column,
@@ -20,7 +21,7 @@ from lcc_rl.data.tables import (
     stem,
     whole_numbers,
 )
-from lcc_rl.data.trajectories import FRAME, HOLE, divided, stretches
+from lcc_rl.data.trajectories import FRAME, HOLE, divided, step_of, stretches
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet
 
@@ -43,14 +44,15 @@ FIELDS = (
     Column("recording", "text", required=False),
     Column("follower_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
     Column("leader_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
-    Column("time", "time"),
-    Column("follower_position", "length", required=False),
-    Column("follower_speed", "speed"),
-    Column("leader_position", "length", required=False),
-    Column("leader_speed", "speed"),
+    Column("time", "time", blank=True),
+    Column("follower_position", "length", blank=True, required=False),
+    Column("follower_speed", "speed", blank=True),
+    Column("leader_position", "length", blank=True, required=False),
+    Column("leader_speed", "speed", blank=True),
     Column("leader_length", "length", least=0.0, required=False),
-    Column("gap", "length"),
+    Column("gap", "length", blank=True),
 )
+MEASURED = [column.key for column in FIELDS if column.blank]  # a blank cell costs the row
 COLUMNS = tuple(SCHEMA)
 OWN = dict(zip((column.key for column in FIELDS), COLUMNS, strict=True))  # names by default
 # What a finished table has: every column, episodes are numbers, no speed or gap is negative.
@@ -61,6 +63,7 @@ STRICT = (
             x,
             key=OWN[x.key],
             required=True,
+            blank=False,
             least=0.0 if x.quantity == "speed" or x.key == "gap" else x.least,
         )
         for x in FIELDS[1:]
@@ -69,6 +72,7 @@ STRICT = (
 ALIASES = {"event": "episode", "period": "recording"}
 POSITIONS = ("leader_position_m", "follower_position_m")
 DERIVED = "no positions given: those of leaders are the integral of their speeds"
+MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
 REGULAR = 0.01  # of a step, by which one may differ: times in float32 are off by some 10 µs
 ONE_ROW = "is of one row; expected at least two"
 
@@ -134,9 +138,10 @@ def _table(
     if missing:
         raise lacking(path, missing, file.header, "data.columns")
     read = file.read(FIELDS, names, units, "data.columns")
-    rows = len(read["time"])
-    if not rows:
+    if not len(read["time"]):
         raise DataError(f"{path}: has no episodes; expected at least one row")
+    read, places = without_blank(file, read, MEASURED)
+    rows = len(places)
     notes = list(file.notes)
     labels = read.get("episode", np.zeros(rows, dtype=str))
     codes, found = pd.factorize(labels)
@@ -158,8 +163,8 @@ def _table(
     ):
         if names.get(name) is None:
             notes.append(words)
-    table = pd.DataFrame(values)
-    table, more = _even(table.assign(row=np.arange(rows)), file, codes)
+    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
+    table, more = _even(table.assign(row=places), file, codes)
     table = table[[*COLUMNS]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
@@ -171,11 +176,7 @@ def _even(
     table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
 ) -> tuple[pd.DataFrame, list[str]]:
     """Rows by episode and time, samples 0.1 s apart; holes divide an episode."""
-    notes = []
-    sorted_rows = np.lexsort((table["time_s"], order))
-    if (np.diff(sorted_rows) != 1).any():
-        notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
-        table = table.iloc[sorted_rows].reset_index(drop=True)
+    table, notes = _ordered(table, file, order)
     same = np.append(False, np.diff(table["episode"]) == 0)
     for name in ("recording", "follower_id", "leader_id"):
         wrong = same & (table[name] != table[name].shift()).to_numpy()
@@ -185,7 +186,7 @@ def _even(
     if not same.any():
         raise file.fault(0, "episode" if "episode" in file.names else "time", ONE_ROW)
     steps = np.diff(table["time_s"], prepend=0.0)
-    step = float(np.median(steps[same]))
+    step = step_of(steps[same], str(file.path))
     short = same & (steps <= step / 2 + 1e-9)
     if short.any():
         at = int(np.argmax(short))
@@ -210,6 +211,32 @@ def _even(
     if not kept:
         raise DataError(f"{file.path}: no episode lasts {FRAME:g} s; is the time in another unit?")
     return pd.concat(kept, ignore_index=True), notes
+
+
+def _ordered(
+    table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Rows by episode and time; of several of a moment, the first."""
+    notes = []
+    sorted_rows = np.lexsort((table["time_s"], order))  # stable
+    if (np.diff(sorted_rows) != 1).any():
+        notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
+        table = table.iloc[sorted_rows].reset_index(drop=True)
+    again = table.duplicated(["episode", "time_s"]).to_numpy()
+    if not again.any():
+        return table, notes
+    others = again & ~table.duplicated(table.columns.drop("row")).to_numpy()
+    row = int(table["row"].to_numpy()[others if others.any() else again].min())
+    if others.sum() > MOST_TWICE * len(table):
+        words = "repeats a moment of its episode with other values, as do"
+        share = f"{100 * others.mean():.0f} % of the rows"
+        raise file.fault(row, "time", f"{words} {share}; does data.columns name the episode?")
+    first = file.fault(row, "time", "repeats a moment of its episode")
+    notes.append(
+        f"left out {int(again.sum()):,} rows of a moment that an episode has already, "
+        f"{int(others.sum()):,} of them with other values, the first: {first}"
+    )
+    return table[~again].reset_index(drop=True), notes
 
 
 def _resampled(part: pd.DataFrame) -> pd.DataFrame:

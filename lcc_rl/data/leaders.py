@@ -284,7 +284,7 @@ class DriveLeaders(Settings):
         windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
         if not single:  # what is on one side together is one drive in intervals, too
             windows = replace(windows, recordings=tuple(map(self._family, windows.recordings)))
-        by = "at the end" if single else "by name"
+        by = "at the end" if single else f"by name (a hash, {self.evaluation_share:.2g} each)"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
         return Leaders(training, windows, report=(*report, line))

@@ -8,11 +8,12 @@ for car i ``Speed<i>`` [m/s], ``IVS<i>``, the gap from car i + 1 to car i [m], a
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.plausible import Plausible
@@ -83,8 +84,10 @@ def _cars(table: TableFile, recording: int, driver: str | None, report: ReadRepo
     report.rows_read += len(cars)
     report.drop("blank speed", int((~seen).sum()))
     report.notes += table.notes
-    order = table.preamble.get("Vehicle_order", "").strip(", ").replace(",", ", ")
-    report.notes.append(f"{table.path}: {len(numbers)} cars{': ' if order else ''}{order}")
+    order = table.preamble.get("Vehicle_order", "").strip(", ").split(",")
+    named = ", ".join(order[n - 1] for n in numbers if n <= len(order) and order[n - 1])
+    report.notes.append(f"{table.path}: {len(numbers)} cars{': ' if named else ''}{named}")
+    report.notes.append(f"{table.path}: {_marked(table, gaps, read)}")
     if unknown:
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow nobody")
     if driver is not None:
@@ -98,3 +101,15 @@ def _cars(table: TableFile, recording: int, driver: str | None, report: ReadRepo
         )
     cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
+
+
+def _marked(table: TableFile, followers: Iterable[int], read: Mapping[str, NDArray]) -> str:
+    """Words on who drives the followers: as their column ``Driver`` says, and the header."""
+    marks = [
+        " and ".join(sorted({*np.unique(read.get(f"Driver{n}", [""]))} - {""})) or "unmarked"
+        for n in followers
+    ]
+    counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in sorted({*marks}))
+    header = table.preamble.get("ACC")
+    said = f" (header: ACC,{header})" if header else ""
+    return f"followers by driver: {counts}{said}; data.driver=human keeps those marked Human"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated
 
 import numpy as np
@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.data.tables import TableFile
 from lcc_rl.data.trajectories import divided, starts_of
 from lcc_rl.errors import LARGEST, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
@@ -19,6 +20,7 @@ SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
 LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
+STANDING = 0.5  # both cars stand below it [m/s]
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
 # Column, words with a place for the number found, these numbers, the threshold's name and which
@@ -48,6 +50,9 @@ class Plausible(Settings):
     # Share of the time with a change of speed above 4 m/s in a second; of recorded traffic it is
     # 0.0001 or less, of the same speeds in km/h about 0.06.
     max_hard: Annotated[float, Field(ge=0.0, le=1.0)] = 0.005
+    # Median gap of a follower that stands behind a leader that stands [m]; of recorded traffic it
+    # is 3 to 8, of the same in feet without data.units 10 to 26.
+    max_standing_gap: Positive = 15.0
 
     def select(
         self,
@@ -124,7 +129,14 @@ class Plausible(Settings):
             raise DataError(
                 f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower "
                 f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; are speeds in km/h, mph "
-                "or ft/s, gaps in feet, or leader and follower exchanged?"
+                "or ft/s, gaps in feet, times not in s, or leader and follower exchanged?"
+            )
+        stand = standing_gap(kept)
+        if stand is not None and stand > self.max_standing_gap:
+            raise DataError(
+                f"{source}: cars stand {stand:.3g} m behind a car that stands (median), "
+                f"{setting}.max_standing_gap={self.max_standing_gap:g}; are gaps, and speeds, in "
+                "feet (data.units)?"
             )
         few = f"too few samples to tell whether speeds are in m/s: fewer than {LEAST_SAMPLES}"
         return [f"{few} a second apart"] if hard is None else []
@@ -156,6 +168,34 @@ class Plausible(Settings):
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
 
 
+def without_blank(
+    file: TableFile, read: dict[str, NDArray], keys: Iterable[str]
+) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
+    """Leave rows out in which one of some columns is blank; the notes of the file count them.
+
+    Args:
+        file: the table.
+        read: its columns.
+        keys: those in which a blank cell costs the row.
+
+    Returns:
+        The columns without these rows, and the numbers of the rows that are left.
+
+    Raises:
+        DataError: if every row has a blank cell.
+    """
+    blank = {key: np.isnan(read[key]) for key in keys if key in read}
+    wrong = np.logical_or.reduce([*blank.values()])
+    if not wrong.any():
+        return read, np.arange(len(wrong))
+    row = int(np.argmax(wrong))
+    first = file.fault(row, next(key for key in blank if blank[key][row]), "is blank")
+    if wrong.all():
+        raise first
+    file.notes.append(f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}")
+    return {key: values[~wrong] for key, values in read.items()}, np.flatnonzero(~wrong)
+
+
 def hard_share(table: pd.DataFrame) -> float | None:
     """Return the largest share of samples whose speed changes by more than 4 m/s in a second.
 
@@ -177,6 +217,14 @@ def hard_share(table: pd.DataFrame) -> float | None:
     return float(max(shares, default=0.0))
 
 
+def standing_gap(table: pd.DataFrame) -> float | None:
+    """Return the median gap while leader and follower stand [m]; None with too few samples."""
+    if not set(table.columns) >= OF_PAIRS:
+        return None
+    stand = table[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING
+    return float(table["gap_m"][stand].median()) if stand.sum() >= LEAST_SAMPLES else None
+
+
 def usual_step(table: pd.DataFrame) -> float:
     """Return the median time between samples of a record [s]; 0 if none has two."""
     step = table["time_s"].diff()[table["episode"].diff() == 0].median()
@@ -196,13 +244,13 @@ def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def pair_place(episodes: pd.DataFrame) -> Callable[[int, str], str]:
-    """Return what describes a row of an episode table: recording, vehicle, time and column."""
+    """Return what describes a sample of an episode table: recording, vehicle, time and column."""
 
     def place(row: int, column: str) -> str:
         entry = episodes.iloc[row]
         role = "leader" if column.startswith("leader") else "follower"
         where = f"recording {entry['recording']}, vehicle {entry[f'{role}_id']} ({role})"
-        return f"row {row} ({where}, {entry['time_s']:g} s), column {column!r}"
+        return f"{where}, {entry['time_s']:g} s, column {column!r}"
 
     return place
 

@@ -307,15 +307,15 @@ class Split(Settings):
     def _divide(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
         # The vehicle is the part of the name before the time, so that two episodes behind the
         # same leader never end up on both sides.
-        groups = [
-            name if self.by == "recording" else vehicle.rsplit("@", 1)[0]
-            for name, vehicle in zip(profiles.recordings, profiles.names, strict=True)
-        ]
+        vehicles = [vehicle.rsplit("@", 1)[0] for vehicle in profiles.names]
+        groups = [*profiles.recordings] if self.by == "recording" else vehicles
         distinct = sorted(set(groups))
         if len(distinct) < 2:
+            other = self.by == "recording" and len(set(vehicles)) > 1
+            use = "split.by=vehicle" if other else "split=single (train and evaluate on one)"
             raise DataError(
                 f"cannot split {len(profiles)} profiles by {self.by}: only {distinct} found; "
-                "use split.by=vehicle or give more data"
+                f"give more data, or use {use} or split.evaluation_share=1 (evaluate on all)"
             )
         held = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
         # Evenly spread over the sorted groups, the last always among them: deterministic and

@@ -136,7 +136,21 @@ def _plausible(
     kept, said = (limits or Plausible()).select(
         episodes, source, pair_place(episodes), remedy=remedy
     )
-    return LoadedEpisodes(kept, [*lines, *said])
+    return LoadedEpisodes(kept, [*lines, *said, medians(kept)])
+
+
+def medians(episodes: pd.DataFrame) -> str:
+    """Return the line by which a user sees whether units are right.
+
+    Args:
+        episodes: the table in SI.
+    """
+    speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
+    behind = (gap / speed)[speed > 1.0].median()
+    return (
+        f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, "
+        f"time gap {behind:.2g} s above 1 m/s"
+    )
 
 
 def shipped() -> list[str]:

@@ -10,18 +10,26 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import SMOOTHING, Plausible
+from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
 from lcc_rl.data.tables import Column, TableFile, check_map, stem, whole_numbers
-from lcc_rl.data.trajectories import FRAME, HOLE, ReadReport, Trajectories, find_leaders, stretches
+from lcc_rl.data.trajectories import (
+    FRAME,
+    HOLE,
+    ReadReport,
+    Trajectories,
+    find_leaders,
+    step_of,
+    stretches,
+)
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive, Settings
 
 FIELDS = (
     Column("vehicle", "text"),
-    Column("time", "time"),
-    Column("speed", "speed"),
-    Column("position", "length", required=False),
+    Column("time", "time", blank=True),
+    Column("speed", "speed", blank=True),
+    Column("position", "length", blank=True, required=False),
     Column("lane", "text", required=False),
     Column("leader", "text", blank=True, required=False),
     Column("gap", "length", blank=True, required=False),
@@ -29,8 +37,8 @@ FIELDS = (
     Column("recording", "text", required=False),
 )
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
+MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
 UNEVEN = 0.1  # of a step, by which a time may be off the common grid
-LONGEST = 10.0  # s; samples farther apart tell of no following
 LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
 LEAST_WAY = 50.0  # m, below which that is not compared
@@ -95,16 +103,18 @@ class TableSource(Settings):
         for name, label in zip(report.files, labels(report.files), strict=True):
             table = TableFile(name)
             part = table.read(FIELDS, self.columns, self.units, "data.columns")
-            rows = np.arange(len(part["time"]))
+            report.rows_read += len(part["time"])
+            part, rows = without_blank(table, part, MEASURED)
             parts.append({"recording": np.full(len(rows), label), **part, "row": rows})
             report.notes += table.notes
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-        report.rows_read = len(columns["time"])
+        count = len(columns["time"])
+        report.drop("blank time, speed or position", report.rows_read - count)
         if not report.rows_read:
             raise DataError(f"{', '.join(report.files)}: has a header but no rows")
         columns |= _vehicles(columns["vehicle"], columns.get("leader"), report)
         if self.vehicle_length is not None:
-            length = columns.get("length", np.zeros(report.rows_read))
+            length = columns.get("length", np.zeros(count))
             columns["length"] = np.where(length > 0, length, self.vehicle_length)
         if "lane" in columns:
             columns["lane"] = np.unique(columns["lane"], return_inverse=True)[1]
@@ -173,12 +183,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     steps = rows.time.diff().to_numpy()
     if not together.any():
         raise DataError(f"{files}: no vehicle has two samples; expected trajectories")
-    step = float(np.median(steps[together]))
-    if step > LONGEST:
-        raise DataError(
-            f"{files}: samples of a vehicle are {step:g} s apart; expected at most {LONGEST:g} s; "
-            "is the time in another unit?"
-        )
+    step = step_of(steps[together], files)
     short = together & (steps < step / 2)
     if short.any():
         row = int(np.argmax(short))

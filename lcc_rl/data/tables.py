@@ -31,7 +31,7 @@ from lcc_rl.errors import ConfigError, DataError, unknown_name
 from lcc_rl.io.memory import available, require_memory
 
 PARQUET = (".parquet", ".pq")
-BLANK = ["", "NA", "N/A", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
+BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
 TEXT_TAKES, PARQUET_TAKES = 3, 8  # bytes of memory that reading a byte of a file takes

@@ -9,9 +9,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.errors import DataError
+
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
 HOLE = 1.5  # of the usual step; a longer one is a missing sample
+LONGEST = 10.0  # s; samples so far apart tell of no following
 
 
 @dataclass
@@ -98,6 +101,25 @@ class Trajectories:
 
     samples: pd.DataFrame
     report: ReadReport
+
+
+def step_of(steps: NDArray[np.float64], source: str) -> float:
+    """Return the usual step, checked before samples are interpolated.
+
+    Args:
+        steps: time between consecutive samples of a vehicle [s].
+        source: the file or files, for messages.
+
+    Raises:
+        DataError: if it is too long for seconds.
+    """
+    step = float(np.median(steps))
+    if step >= LONGEST:
+        raise DataError(
+            f"{source}: samples of a vehicle are {step:g} s apart; expected less than "
+            f"{LONGEST:g} s; is the time in another unit (data.units={{time: ms}})?"
+        )
+    return step
 
 
 class Places:

@@ -41,7 +41,7 @@ ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
 OUT = "_out"
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
 IMPLAUSIBLE_FIT = "IMPLAUSIBLE FIT"
-CONGESTED = "congested traffic does not tell how fast these drivers would like to go"
+CONGESTED = "; followers that never drive freely do not tell it"
 
 
 @dataclass(frozen=True)
@@ -267,13 +267,15 @@ def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, 
             speed, gap = 100.0 * drivers[f"rmspe{end}"], drivers[f"gap_rmse_m{end}"]
             lines.append(f"{part}: RMSPE {speed.mean():.2f} %, gap RMSE {gap.mean():.2f} m (means)")
     for name in names:
-        share = drivers[f"{name}_at_bound"].mean()
-        if share > 0.0:
+        bound = drivers[f"{name}_at_bound"]
+        if bound.any():
             low, high = limits[name]
-            why = CONGESTED if name == "desired_speed" else f"calibration.bounds.{name} widens them"
+            upper = drivers[COLUMNS[name]] > (low + high) / 2
+            shares = [100 * (bound & side).mean() for side in (~upper, upper)]
             lines.append(
-                f"{100 * share:.0f} % of the values of {COLUMNS[name]} lie on a bound ({low:g} or "
-                f"{high:g}): {why}"
+                f"{100 * bound.mean():.0f} % of the values of {COLUMNS[name]} lie on a bound: "
+                f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
+                f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
             )
     off = 100.0 * drivers["gap_nrmse"].median()
     if off > 100.0 * IMPLAUSIBLE:

@@ -209,7 +209,7 @@ def test_training_and_evaluation_share_no_recording_or_vehicle() -> None:
     assert len(training) + len(held_out) == 12
     nothing, everything = Split(evaluation_share=1.0)(profiles)
     assert (len(nothing), everything) == (0, profiles)
-    with pytest.raises(DataError, match="cannot split 1 profiles by recording"):
+    with pytest.raises(DataError, match=r"cannot split 1 profiles by recording: .*split=single"):
         Split()(profiles.select([0]))
 
 

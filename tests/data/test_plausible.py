@@ -39,7 +39,11 @@ def test_an_implausible_episode_is_left_out_and_many_are_refused(
     validate_episodes(loaded.episodes, "what is left")
     said = [line for line in loaded.report if line.startswith("left out")]
     assert len(said) <= 2  # a jump is one of two samples
-    assert pd.Series(said).str.contains(rf"row 95 \(recording a.* column '{column}' {words}").all()
+    assert (
+        pd.Series(said)
+        .str.contains(rf"recording a, vehicle .*, 0\.5 s, column '{column}' {words}")
+        .all()
+    )
     frame.loc[95:215:30, column] = value  # five of twenty
     write_episodes(frame, path)
     with pytest.raises(DataError, match=r"pairs\.parquet: 2[58].* % of the samples are impl"):
@@ -96,6 +100,16 @@ def test_speeds_and_gaps_in_other_units_that_agree_are_refused(shared_data: Path
     Plausible(max_hard=0.1).select(table, "f.csv", lambda row, column: f"row {row}")
 
 
+def test_forgotten_feet_are_found_where_cars_stand_or_brake(shared_data: Path) -> None:
+    table = EpisodesSource(path=str(shared_data / "i80_pairs.parquet")).load().episodes
+    queue = wavy().assign(gap_m=6.0, **dict.fromkeys(SPEEDS, 0.0))
+    for metres, words in ((table, "more than 4 m/s within"), (queue, r"cars stand 19\.7 m behind")):
+        Plausible().select(metres, "f.csv", lambda row, column: f"row {row}")
+        feet = metres.assign(**{name: metres[name] / 0.3048 for name in [*SPEEDS, "gap_m"]})
+        with pytest.raises(DataError, match=words):
+            Plausible().select(feet, "f.csv", lambda row, column: f"row {row}")
+
+
 @pytest.mark.parametrize("spell", [csv_text, native_text])
 @pytest.mark.parametrize("lengths", [True, False])
 def test_a_file_in_metres_is_refused_and_read_when_said(tmp_path, spell, lengths: bool) -> None:
@@ -144,3 +158,32 @@ def test_a_bad_sample_costs_itself_and_divides_its_record(tmp_path: Path) -> Non
     report = "\n".join(loaded.report)
     assert "2 of 3 records were cut there: 47 samples, 5 s, are left out" in report
     assert "speeds below 0, the least -0.0015 m/s, count as 0" in report
+
+
+BLANK = {0: 200, 3: 399, 1: 600, 2: 600}  # samples of the parts
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "sizes"),
+    [
+        ("gap_m", "", BLANK),
+        ("follower_speed_mps", "n/a", BLANK),
+        ("leader_speed_mps", "NaN", BLANK),
+        ("time_s", "", BLANK),
+        ("time_s", 19.9, BLANK),  # the time of the row before
+        ("gap_m", None, {0: 600, 1: 600, 2: 600}),  # None: the row is there twice
+    ],
+)
+def test_a_blank_cell_or_a_row_twice_costs_the_row(tmp_path: Path, column, cell, sizes) -> None:
+    frame = wavy().astype({column: object})
+    if cell is None:
+        frame = pd.concat([frame, frame.iloc[[200]]])
+    else:
+        frame.loc[200, column] = cell
+    path = tmp_path / "pairs.csv"
+    frame.to_csv(path, index=False)
+    loaded = EpisodesSource(path=str(path)).load()
+    assert loaded.episodes.groupby("episode").size().to_dict() == sizes
+    said = [line for line in loaded.report if line.startswith("left out 1 rows")]
+    assert len(said) == 1
+    assert f"data row {1801 if cell is None else 201}, column" in said[0]

@@ -121,8 +121,10 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     frame = long_table()
     frame = pd.concat([frame, frame.iloc[[5, 6]]])
     frame.loc[frame["id"] == 2, "ahead"] = 77
+    frame.loc[20, "v"] = np.nan
     loaded = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
     assert "dropped 2 rows: exact duplicate (vehicle, time)" in loaded.report
+    assert "dropped 1 rows: blank time, speed or position" in loaded.report
     assert loaded.episodes["follower_id"].unique().tolist() == [3]
     assert any(
         "400 samples that name a preceding vehicle that is not seen" in x for x in loaded.report
@@ -231,6 +233,7 @@ def test_every_car_follows_the_car_before_it(openacc) -> None:
     loaded.episodes["time_s"] -= 430
     truth(loaded)
     assert f"{openacc}: 3 cars: SMART, MAZDA, TESLA" in loaded.report
+    assert "by driver: 2 unmarked (header: ACC,1); data.driver=human" in "\n".join(loaded.report)
 
 
 def test_columns_of_missing_cars_are_absent_and_followers_are_chosen(tmp_path) -> None:
@@ -240,7 +243,9 @@ def test_columns_of_missing_cars_are_absent_and_followers_are_chosen(tmp_path) -
     frame["Driver2"], frame["Driver5"] = "ACC", ["Human"] * 300 + ["ACC"] * 100
     path = tmp_path / "platoon.csv"
     path.write_text(f"{head}Distance_setting,S\n{frame.to_csv(index=False)}")
-    assert OpenAccSource(path=str(path)).load().episodes["follower_id"].unique().tolist() == [2, 5]
+    loaded = OpenAccSource(path=str(path)).load()
+    assert loaded.episodes["follower_id"].unique().tolist() == [2, 5]
+    assert "by driver: 1 ACC, 1 ACC and Human (header" in "\n".join(loaded.report)
     found = OpenAccSource(path=str(path), driver="human").load()
     assert found.episodes["follower_id"].tolist() == [5] * 300
     assert f"{path}: 300 samples of followers driven by human, 500 of others" in found.report
