@@ -389,9 +389,14 @@ def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
     error = 100.0 * found[who]["rmspe"].mean()
+    gaps, far = (
+        [found[x][name].mean() for x in (who, RECORDED)] for name in ("gap_m", "long_gap_share")
+    )
     return (
         f"drivers {who}: RMSPE {error:.1f} %; {energies} of the recorded energy per km, {losses} "
         f"of what accelerating loses (speeds smoothed over {', '.join(map(str, SMOOTHINGS))} s); "
         f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "
-        f"{one_step:.2f} m/s²"
+        f"{one_step:.2f} m/s²; distance {each[0]['distance']:.3f} of the recorded one, gap "
+        f"{gaps[0]:.1f} m against {gaps[1]:.1f} m, long time gaps {100 * far[0]:.1f} % against "
+        f"{100 * far[1]:.1f} %"
     )
