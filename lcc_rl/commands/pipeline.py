@@ -160,7 +160,7 @@ def _run(
         limit = held_to(trainings.values())
         page, found = write_page(folder, [command], limit)
         table = headline(found)
-        title = f"A leader, the car, and a human driver behind it: {sample_of(rows)}"
+        title = f"Leader, car, human behind it: {sample_of(rows)}"
         show(as_rich(table, title, caption_of(table, limit)))
         tell(verdict(found))
         tell(f"rows, figures and policies: {folder}")

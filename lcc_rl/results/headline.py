@@ -119,8 +119,8 @@ def verdict(found: pd.DataFrame) -> str:
         return ""
     windows = rows[NETWORK]["windows"]
     if windows < FEW:
-        both = (f"{rows[name][PER_KM]:.1f} kJ with {in_words(name)}" for name in (NETWORK, other))
-        return f"Per vehicle and km, {', '.join(both)}: {windows} window(s) are no finding."
+        both = (f"{rows[name][PER_KM]:.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
+        return f"Per vehicle and km: {', '.join(both)}; {windows} window(s) allow no finding."
     key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"
     saved, low, high = (100.0 * rows[NETWORK][f"{key}{end}"] for end in ("", "_low", "_high"))
     less = "less"
