@@ -41,7 +41,7 @@ class Run:
 
     @cached_property
     def headline(self) -> pd.DataFrame:
-        """The table that commands print: energy per km, saved, distance, safety."""
+        """The table that commands print: energy per vehicle and km, saved, distance, safety."""
         return headline(self.table)
 
     @cached_property

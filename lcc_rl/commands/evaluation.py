@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +198,14 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     for line in inputs.report:
         log.info(line)
     check_evaluation(cfg, inputs)
-    strategies = [one for one in baselines(cfg, rivals) if _is_played(one, inputs, rivals)]
+    lacking = _lacking_record(cfg, inputs)
+    require(
+        not lacking or RECORDED not in rivals,
+        f"compare={RECORDED}: {lacking}; use trajectories of several vehicles",
+    )
+    if lacking and RECORDED in cfg.evaluation.baselines:
+        log.warning("%s is left out: %s", RECORDED, lacking)
+    strategies = [one for one in baselines(cfg, rivals) if not lacking or one.name != RECORDED]
     for name, path in paths.items():
         one = trained(cfg, path, policies[name], inputs.population)
         named = isinstance(cfg.compare, Mapping)
@@ -214,16 +221,12 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     return strategies, inputs
 
 
-def _is_played(strategy: Strategy, inputs: Inputs, rivals: Collection[str]) -> bool:
-    """Whether a baseline can be played: a recorded follower only where one was recorded."""
-    if strategy.name != RECORDED or inputs.evaluation.followers is not None:
-        return True
-    require(
-        RECORDED not in rivals,
-        f"compare={RECORDED}: nobody was recorded behind these leaders; use trajectories of "
-        "several vehicles",
-    )
-    return False
+def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:
+    """Return why no vehicle drives as a recorded one; empty where one can."""
+    if inputs.evaluation.followers is None:
+        return "nobody was recorded behind these leaders"
+    first = applies(cfg, RECORDED)
+    return "" if first else "the automated vehicle is not the first behind the leader"
 
 
 def evaluate_and_write(

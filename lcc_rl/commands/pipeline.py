@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import shlex
 import threading
+from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields
@@ -39,7 +41,7 @@ from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
-from lcc_rl.results.headline import as_rich, caption_of, headline, show, verdict
+from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
 from lcc_rl.results.runs import check_folder, load_config, save_config
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
@@ -58,6 +60,11 @@ PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last o
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 NETWORKS, RULE = ("reference", "alcc"), "rule"  # trained by default; the rule by the gradient
 ANALYTIC = "lcc_rl.agents.Analytic"
+# Words in lines of reports that nobody should have to look for.
+CONCERNS = (
+    *(IMPLAUSIBLE_FIT, "lie on a bound", "reaction delay", "front to front"),
+    *("were cut there", "episodes cut where", "episodes dropped"),
+)
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
@@ -84,7 +91,7 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
             trainings, final = composed(cfg, overrides)
             cfg.variants = list(trainings)
             check_folder(cfg, folder)
-            command = " ".join(["lcc-rl run", *overrides])
+            command = shlex.join(["lcc-rl", "run", *overrides])
         elif (folder / COMMAND).is_file():
             cfg = load_config(folder, cfg.trust)
             trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants or ()}
@@ -153,7 +160,7 @@ def _run(
         limit = held_to(trainings.values())
         page, found = write_page(folder, [command], limit)
         table = headline(found)
-        title = "A leader, the car, and a human driver behind it: held-out windows"
+        title = f"Leader, car, human behind it: {sample_of(rows)}"
         show(as_rich(table, title, caption_of(table, limit)))
         tell(verdict(found))
         tell(f"rows, figures and policies: {folder}")
@@ -174,8 +181,7 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
     if not table.exists():
         loaded = build_source(cfg.data).load()
-        for line in loaded.report:
-            log.info(line)
+        _pass_on(loaded.report)
         counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
         tell(f"data: {(counts or loaded.report)[-1]}")
         load_inputs(cfg, loaded.episodes).to_learn_from()  # whether they can be split
@@ -185,10 +191,16 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
         own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
         said = StringIO()
         found = calibration.run(own, drivers.parent, Console(file=said, width=100))
-        for line in said.getvalue().splitlines():
-            (tell if IMPLAUSIBLE_FIT in line else log.info)(line)
+        _pass_on(said.getvalue().splitlines())
         tell(f"drivers: {len(found)} calibrated, mean RMSPE {100.0 * found['rmspe'].mean():.2f} %")
     return drivers
+
+
+def _pass_on(lines: Sequence[str]) -> None:
+    """Log what was read and calibrated; what changes the results is also on the terminal."""
+    for line in lines:
+        loud = any(words in line for words in CONCERNS)
+        log.log(logging.WARNING if loud else logging.INFO, line)
 
 
 def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:

@@ -388,10 +388,13 @@ def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
     each = [ratios(found[who], found[RECORDED], smoothing=width) for width in SMOOTHINGS]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
-    error = 100.0 * found[who]["rmspe"].mean()
+    own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED))
     return (
-        f"drivers {who}: RMSPE {error:.1f} %; {energies} of the recorded energy per km, {losses} "
-        f"of what accelerating loses (speeds smoothed over {', '.join(map(str, SMOOTHINGS))} s); "
+        f"drivers {who}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
+        f"{losses} of what accelerating loses (speeds smoothed over {SMOOTHINGS[0]}, "
+        f"{SMOOTHINGS[1]} s); "
         f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "
-        f"{one_step:.2f} m/s²"
+        f"{one_step:.2f} m/s²; distance {each[0]['distance']:.3f} of the recorded one, gap "
+        f"{own.gap_m:.1f} m against {theirs.gap_m:.1f} m, long time gaps "
+        f"{100 * own.long_gap_share:.1f} % against {100 * theirs.long_gap_share:.1f} %"
     )

@@ -143,11 +143,12 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
 def described(population: Population, cfg: StudyConfig) -> str:
     """Return a line on who drives, and behind whom."""
     speed, gap = population.desired_speed, population.time_gap
-    shipped = "as set" if "desired_speed" in cfg.drivers else "fitted to NGSIM I-80"
+    shipped = "fixed" if "desired_speed" in cfg.drivers else "fitted to NGSIM I-80, shipped"
+    path = cfg.drivers.get("path")
     leaders = cfg.leader if cfg.leader is not None and "source" not in cfg.leader else cfg.data
     whose = leaders.get("path") or "synthetic or shipped traffic"
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
-    who = f"{len(gap)} human drivers ({cfg.drivers.get('path') or shipped})"
+    who = f"{len(gap)} human drivers ({f'calibrated, {path}' if path else shipped})"
     line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or not (reaction.delay or reaction.noise):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.evaluation import named
 from lcc_rl.evaluation.metrics import (
     KILO,
     energy_measures,
@@ -176,10 +177,12 @@ def describe(
 
 
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
-    """Return v0 [m/s] by episode: the strategy's own one, or that of the episode's driver."""
+    """Return v0 [m/s] by episode: the strategy's own, or the driver's; NaN of recorded drivers."""
     controllers = strategy.cfg.scenario.controllers
     own = controllers.get(AUTOMATED) if strategy.cfg.scenario.vehicles.count(AUTOMATED) else None
     given = None if own is None else own.get("desired_speed")
+    if strategy.name == named.RECORDED:
+        given = np.nan
     drivers = episodes["desired_speed_mps"].to_numpy()
     return drivers if given is None else np.full_like(drivers, given)
 
@@ -189,8 +192,8 @@ def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> n
     shares = np.zeros(len(desired))
     for index in profile.unique().tolist():
         speeds, rows = profiles.record(index).numpy(), (profile == index).numpy()
-        shares[rows] = 1.0 - (speeds[:, None] <= desired[rows]).mean(0)
-    return shares
+        shares[rows] = (speeds[:, None] > desired[rows]).mean(0)
+    return np.where(np.isnan(desired), np.nan, shares)
 
 
 def leader_measures(

@@ -118,7 +118,7 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 
 def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
-    """Speeds of one episode, and the mean energies of both cars per km by strategy."""
+    """Speeds of one episode, and the mean energies per vehicle and km by strategy."""
     figure = new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _over_time(left, _one_episode(steps, strategy), "speed")
@@ -159,7 +159,7 @@ def _mean_energies(axis: Axes, cars: pd.DataFrame) -> None:
     axis.tick_params(axis="y", labelsize=9)
     axis.set_xlim(0.0, 1.4 * totals.max())
     against = f"\nin brackets: saved against {in_words(baseline)}" if baseline else ""
-    style(axis, f"path energy [kJ/km]{against}")
+    style(axis, f"path energy [kJ per vehicle and km]{against}")
     legend_above(axis)
     title = (
         f"{cars['profile_id'].nunique()} held-out profiles × {cars['driver_id'].nunique()} drivers"

@@ -12,7 +12,15 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import AGAINST, COLUMNS, caption_of, headline, in_words, verdict
+from lcc_rl.results.headline import (
+    AGAINST,
+    COLUMNS,
+    caption_of,
+    headline,
+    in_words,
+    sample_of,
+    verdict,
+)
 from lcc_rl.results.savings import UNTRAINED
 from lcc_rl.results.tables import ROWS, summary
 
@@ -28,7 +36,7 @@ AS_RECORDED = (
 )
 # Files of figures, in the job's folder and without their ending, and their captions.
 RESULTS = {
-    "evaluation/figures/overview": "A held-out episode, and the path energy of both cars",
+    "evaluation/figures/overview": "A held-out episode, and the path energy per vehicle and km",
     "evaluation/figures/learning_curve": "The trainings: what they minimise, and their limit",
 }
 DRIVERS = {
@@ -67,7 +75,8 @@ def write_page(
         ResultsError: if a table is missing, or the page cannot be written.
     """
     page = Page(folder)
-    found = summary(read_parquet(page.folder / "evaluation" / "episodes.parquet"))
+    episodes = read_parquet(page.folder / "evaluation" / "episodes.parquet")
+    found = summary(episodes)
     table = headline(found)
 
     def figures(names: dict[str, str]) -> list[tuple[str, str, Path]]:
@@ -76,7 +85,7 @@ def write_page(
 
     shown = table.rename(columns={"who": COLUMNS[0].heading})
     words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
-    page.add("Results", words, [("", "Held-out windows", shown)], figures(RESULTS))
+    page.add("Results", words, [("", sample_of(episodes), shown)], figures(RESULTS))
     learned = [str(name) for name in table["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.results.cells import MISSING, column_cells
+from lcc_rl.results.savings import KEYS
 from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
 
 HUMAN, NETWORK = "human", "alcc"
@@ -34,7 +35,8 @@ RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likew
 FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
 FEW, WIDEST = 5, 10_000  # windows; characters
 CAPTION = (
-    "energy of all vehicles, without what their motion stores; {}shares of the time: "
+    "energy per vehicle and km, of all vehicles, without what their motion stores; {}shares of "
+    "the time: "
     "time-to-collision < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
 )
 COMPARED = "saved: against {}, with the 95 % interval over windows; distance against theirs; "
@@ -86,10 +88,10 @@ def headline(found: pd.DataFrame) -> pd.DataFrame:
         found: of :func:`lcc_rl.results.tables.summary`.
 
     Returns:
-        A row per strategy with a controlled car, those that draw most first: path energy per km
-        [kJ/km], the share saved [%] against :func:`baseline_of` with its interval, the distance
-        [%] against it, the shares of the time [%] with an unsafe time-to-collision and a long time
-        gap, and collisions. ``attrs["against"]`` names the baseline.
+        A row per strategy with a controlled car, those that draw most first: path energy per
+        vehicle and km [kJ/km], the share saved [%] against :func:`baseline_of` with its interval,
+        the distance [%] against it, the shares of the time [%] with an unsafe time-to-collision
+        and a long time gap, and collisions. ``attrs["against"]`` names the baseline.
     """
     cars = found[found[PATH].notna()].sort_values(PER_KM, ascending=False, kind="stable")
     against = baseline_of(cars["strategy"])
@@ -115,6 +117,10 @@ def verdict(found: pd.DataFrame) -> str:
     other = next((name for name in (*RULES, HUMAN) if name in rows), None)
     if NETWORK not in rows or other is None:
         return ""
+    windows = rows[NETWORK]["windows"]
+    if windows < FEW:
+        both = (f"{rows[name][PER_KM]:.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
+        return f"Per vehicle and km: {', '.join(both)}; {windows} window(s) allow no finding."
     key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"
     saved, low, high = (100.0 * rows[NETWORK][f"{key}{end}"] for end in ("", "_low", "_high"))
     less = "less"
@@ -123,10 +129,16 @@ def verdict(found: pd.DataFrame) -> str:
     within = "" if low > 0.0 else ", within the uncertainty"
     own, theirs = (100.0 * rows[name][long] for name in (NETWORK, other))
     return (
-        f"With the {in_words(NETWORK)}, energy per km is {saved:.1f} % ({low:.1f} … {high:.1f}) "
-        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of the time "
-        f"against {theirs:.2f} %."
+        f"With the {in_words(NETWORK)}, energy per vehicle and km is {saved:.1f} % ({low:.1f} … "
+        f"{high:.1f}) {less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
+        f"the time against {theirs:.2f} %."
     )
+
+
+def sample_of(episodes: pd.DataFrame) -> str:
+    """Return how many windows and drivers an evaluation is of, for a title."""
+    windows, drivers = (episodes[key].nunique() for key in KEYS)
+    return f"{windows} held-out windows × {drivers} drivers"
 
 
 def caption_of(table: pd.DataFrame, more: str = "") -> str:

@@ -14,7 +14,7 @@ from lcc_rl.results.savings import BASELINES, KINDS, NOTHING, savings
 from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
-PER_KM = "path_energy_kj_per_km"  # of both cars; who falls back gains nothing by it
+PER_KM = "path_energy_kj_per_km"  # and vehicle; who falls back gains nothing by it
 FASTER = "share_leader_faster"
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
@@ -44,9 +44,10 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         source: of the leaders whose rows count; empty for all.
 
     Returns:
-        One row per strategy: mean energies [kJ] and energy per kilometre, savings against each of
-        :data:`BASELINES` as shares, positive if energy is saved, with their intervals; shares of
-        (window, driver) pairs and of drivers whose path takes more; and the safety measures.
+        One row per strategy: mean energies [kJ] and energy per vehicle and km, savings against
+        each of :data:`BASELINES` as shares, positive if energy is saved, with their intervals;
+        shares of (window, driver) pairs and of drivers whose path takes more; and the safety
+        measures.
         Values that a strategy does not have are NaN.
     """
     # A string without automated vehicles, or without others, has no energies of them.
@@ -58,9 +59,11 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     ways = every[["cav_distance_m", "hdv_distance_m"]].sum(axis=1).replace(0.0, np.nan)
     windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
     rows = []
+    counts = windows.groupby("strategy")["profile_id"].nunique()
     for strategy in found.strategies:
         mean, total = every.loc[strategy].to_dict(), sums.loc[strategy].to_dict()
         row: dict[str, object] = {"strategy": strategy, "episodes": int(total["rows"])}
+        row["windows"] = int(counts[strategy])
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = mean[f"{vehicle}_{kind}"]
@@ -100,12 +103,12 @@ def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
 ROWS = (
     ("path energy [kJ]", PATH, "{:.1f}"),
     ("  lost to accelerating [kJ]", LOST, "{:.1f}"),
-    ("  per km [kJ]", PER_KM, "{:.1f}"),
+    ("  path energy per vehicle and km [kJ]", PER_KM, "{:.1f}"),
     ("distance of all vehicles [m]", "distance_m", "{:.0f}"),
     ("energy as drawn [kJ]", "total_energy_kj", "{:.1f}"),
     ("  CAV [kJ]", "cav_energy_kj", "{:.1f}"),
     ("  HDV [kJ]", "hdv_energy_kj", "{:.1f}"),
-    ("  per vehicle and km [kJ]", "kj_per_km", "{:.0f}"),
+    ("  as drawn, per vehicle and km [kJ]", "kj_per_km", "{:.0f}"),
     *(row for baseline in BASELINES for row in _rows_against(baseline)),
     ("collisions", "collisions", "{:d}"),
     ("minimum time-to-collision [s]", "min_ttc_s", "{:.2f}"),
@@ -115,6 +118,7 @@ ROWS = (
     ("  above 1 m/s", "share_time_gap_long_moving", "{:.2%}"),
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
+    ("windows", "windows", "{:d}"),
     ("episodes", "episodes", "{:d}"),
 )
 
@@ -133,6 +137,7 @@ def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
         "direct": "drivers=highway, or drivers calibrated on such traffic",
         "idm": "variant=idm scenario.controllers.automated.desired_speed=45 'compare=[<run>]'",
     }
+    remedies["human"] = remedies["direct"]
     if of_task:
         remedies["idm"] = "compare with human, whose v0 is that of drivers=…"
     parts = [

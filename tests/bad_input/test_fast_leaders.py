@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from commands import tiny
@@ -14,7 +15,7 @@ from lcc_rl.data.leaders import stretch
 from lcc_rl.data.profiles import from_records
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rows import leader_faster
-from lcc_rl.results.tables import FASTER
+from lcc_rl.results.tables import FASTER, leader_too_fast
 
 
 def test_the_share_of_time_by_hand() -> None:
@@ -34,6 +35,13 @@ def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, said)
         rows = evaluation.run(cfg, tmp_path, quiet=True)
     assert (rows[FASTER].mean() > 0.5) == said
     assert ("Raise v0: drivers=highway" in caplog.text) == said
+
+
+def test_every_baseline_with_a_desired_speed_is_warned_of() -> None:
+    shares = {"direct": 0.3, "human": 0.3, "idm": 0.1, "recorded": np.nan}
+    rows = pd.DataFrame({"strategy": shares.keys(), FASTER: shares.values()})
+    said = [line.split("speed of ")[1].split()[0] for line in leader_too_fast(rows)]
+    assert said == ["direct", "human"]
 
 
 def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:

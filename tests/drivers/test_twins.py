@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 
@@ -10,6 +11,7 @@ import pandas as pd
 import pytest
 import torch
 
+from lcc_rl.commands.pipeline import _pass_on
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
 from lcc_rl.drivers.parameters import COLUMNS
@@ -104,14 +106,20 @@ def test_calibration_smooths_drivers_and_the_reaction_restores_them() -> None:
     assert any("reaction delay" in line for line in result.report)
 
 
-def test_forgotten_units_and_bounds_are_said() -> None:
+def test_forgotten_units_and_bounds_are_said(caplog) -> None:
     episodes, _ = followed(0.0, 0.0, drivers=6)
     assert not any("IMPLAUSIBLE" in line for line in Calibrator()(episodes).report)
     speeds = episodes.filter(like="speed").columns
     wrong = episodes.assign(**{name: 3.6 * episodes[name] for name in speeds})  # km/h
-    report = "\n".join(Calibrator()(wrong).report)
-    assert re.search(r"lie on a bound: \d+ % on 5, \d+ % on \d+ \(calibration.bounds", report)
-    assert "IMPLAUSIBLE FIT: the gap of the median driver is off by" in report
+    result = Calibrator()(wrong)
+    _pass_on(result.report)
+    loud = "\n".join(x.message for x in caplog.records if x.levelno >= logging.WARNING)
+    assert re.search(r"lie on a bound: \d+ % on 5, \d+ % on \d+ \(calibration.bounds", loud)
+    assert "IMPLAUSIBLE FIT: the gap of the median driver is off by" in loud
+    assert "RMSPE" not in loud
+    mean = result.twins.groupby("driver")["gap_m"].mean()
+    gaps = f"gap {mean[TWINS]:.1f} m against {mean[RECORDED]:.1f} m"
+    assert any(gaps in line for line in result.report)
 
 
 def test_measures_by_hand() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +19,7 @@ from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import applies, baseline, baselines
+from lcc_rl.results.tables import FASTER
 
 
 def drive(*overrides: str):
@@ -73,6 +76,7 @@ def test_the_strategy_starts_and_drives_as_recorded() -> None:
         speed = windows.follower(window)[:, 0].double()
         expected = 0.1 * float((speed[1:] + speed[:-1]).sum()) / 2.0
         assert distance == pytest.approx(expected, rel=1e-4)
+    assert rows[FASTER].isna().all()  # nobody knows how fast they would like to go
     assert applies(cfg, "recorded")
     assert not applies(composed("variant=idm", "scenario.string=human automated"), "recorded")
     assert not applies(composed("variant=reference", "scenario=ring"), "recorded")
@@ -132,10 +136,12 @@ def test_followers_stay_beside_their_leaders() -> None:
         (["scenario=ring"], "compare=recorded: it has no vehicle to drive in this string"),
     ],
 )
-def test_a_recorded_rival_that_cannot_be_played_is_an_error(words, message) -> None:
+def test_a_recorded_driver_that_cannot_be_played_is_never_silent(words, message, caplog) -> None:
     small = ["scenario.horizon=40", "evaluation.profiles=2", "evaluation.drivers=2"]
     cfg = load("evaluate", ["variant=idm", "compare=[recorded]", *words, *small])
     with pytest.raises(ConfigError, match=message):
         strategies_of(cfg)
     cfg.compare, cfg.evaluation.baselines = [], ["idm", "recorded"]
-    assert "recorded" not in [one.name for one in strategies_of(cfg)[0]]
+    with caplog.at_level(logging.WARNING, logger="lcc_rl"):
+        assert "recorded" not in [one.name for one in strategies_of(cfg)[0]]
+    assert "recorded is left out: nobody was recorded behind these leaders" in caplog.text

@@ -17,7 +17,14 @@ from lcc_rl.figures.drawing import new_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.cells import as_markdown, heading
-from lcc_rl.results.headline import as_rich, caption_of, headline, in_words, verdict
+from lcc_rl.results.headline import (
+    as_rich,
+    caption_of,
+    headline,
+    in_words,
+    sample_of,
+    verdict,
+)
 from lcc_rl.results.tables import summary
 
 TABLE = pd.DataFrame(
@@ -134,6 +141,12 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     own, rule = (found.set_index("strategy").loc[x] for x in ("alcc", "rule"))
     saved = 100.0 * (1.0 - own["path_energy_kj_per_km"] / rule["path_energy_kj_per_km"])
     words = verdict(found)
-    assert words.startswith(f"With the network, for both, energy per km is {saved:.1f} % (")
+    assert words.startswith(
+        f"With the network, for both, energy per vehicle and km is {saved:.1f} % ("
+    )
     assert "less than with IDM, tuned on these data; long time gaps: 0.40 % of" in words
     assert "within the uncertainty" in verdict(found.assign(km_saving_vs_rule_low=-1.0))
+    assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
+    few = verdict(summary(frame[frame["profile_id"] < 4]))
+    assert few.endswith("; 4 window(s) allow no finding.")
+    assert "%" not in few
