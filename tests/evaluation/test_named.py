@@ -67,9 +67,8 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
 @pytest.mark.parametrize(
     "words",
     [
-        ["task=i24-follow5", f"compare=[{PATH}]"],
         ["task=ring-22", f"compare=[{PATH}]", "evaluation.profiles=1"],
-        ["variant=cacc", f"compare=[{PATH}]"],
+        pytest.param(["variant=cacc", f"compare=[{PATH}]"], marks=pytest.mark.slow),
         # Whom a task would let learn gives way to a controller that takes no action.
         ["task=i24-follow5", f"{AUTO}={{_target_: {PATH}}}", "compare=[idm_acc]"],
     ],
@@ -80,6 +79,7 @@ def test_an_own_controller_has_its_row_on_every_variant_and_task(words, tmp_path
     assert "steady" in set(rows["strategy"])
 
 
+@pytest.mark.slow
 def test_a_variant_and_a_controller_of_a_folder_stand_in_the_table(tmp_path) -> None:
     node = f"{{_target_: {PATH}, gain: 0.3}}"
     place = "override /controller@scenario.controllers.automated: null"
