@@ -66,16 +66,16 @@ def test_the_command(tmp_path, capsys) -> None:
     from lcc_rl.commands import clairvoyant as tool
 
     short = ["scenario.horizon=30", "evaluation.profiles=1", "evaluation.drivers=2"]
-    own = ["--iterations", "2", "--no-compile", "--out", str(tmp_path)]
-    assert tool.main([*own, *short]) == 0
+    own = ["--iterations", "2", "--no-compile", "--out"]
+    assert tool.main([*own, str(tmp_path / "one"), *short]) == 0
     assert "clairvoyant" in capsys.readouterr().out
-    rows = pd.read_parquet(tmp_path / "episodes.parquet")
+    rows = pd.read_parquet(tmp_path / "one" / "episodes.parquet")
     assert rows["strategy"].value_counts().to_dict() == {"idm": 2, "alcc": 2, "clairvoyant": 2}
     starts = ["--policy", "pretrained", "--policy", "pretrained/reference", "--regard"]
     two = ["scenario.horizon=30", "evaluation.profiles=2", "evaluation.drivers=2"]
-    assert tool.main([*own, *starts, *two]) == 0
+    assert tool.main([*own, str(tmp_path / "two"), *starts, *two]) == 0
     assert "take" in capsys.readouterr().out
-    rows = pd.read_parquet(tmp_path / "episodes.parquet")
+    rows = pd.read_parquet(tmp_path / "two" / "episodes.parquet")
     names = ["idm", "alcc", "reference", "clairvoyant", "clairvoyant own"]
     assert rows["strategy"].value_counts().to_dict() == dict.fromkeys(names, 4)
     assert rows.groupby("strategy")["profile_id"].agg(set).map(sorted).tolist() == [[0, 1]] * 5
