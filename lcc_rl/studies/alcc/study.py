@@ -206,7 +206,7 @@ def _series(study: Study, parts: Sequence[str]) -> dict[Path, Change]:
 
 def _calibration(study: Study) -> PipelineConfig:
     own = [item for item in study.overrides if root_key(item) not in OF_TRAINING]
-    cfg: PipelineConfig = load("pipeline", ["experiment=null", "calibration=both", *own])
+    cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
     return cfg
 
 
