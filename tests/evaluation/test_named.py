@@ -70,7 +70,10 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
         ["task=ring-22", f"compare=[{PATH}]", "evaluation.profiles=1"],
         pytest.param(["variant=cacc", f"compare=[{PATH}]"], marks=pytest.mark.slow),
         # Whom a task would let learn gives way to a controller that takes no action.
-        ["task=i24-follow5", f"{AUTO}={{_target_: {PATH}}}", "compare=[idm_acc]"],
+        pytest.param(
+            ["task=i24-follow5", f"{AUTO}={{_target_: {PATH}}}", "compare=[idm_acc]"],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_an_own_controller_has_its_row_on_every_variant_and_task(words, tmp_path) -> None:

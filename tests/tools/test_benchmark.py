@@ -9,7 +9,7 @@ import torch
 from benchmarks import command
 from lcc_rl.io.files import read_parquet
 
-LONG = ("calibrate", "read", "start", "evaluate")  # longer than all others together
+LONG = ("calibrate", "read", "loading", "start", "evaluate")  # longer than all others together
 
 
 def check_rows(rows: pd.DataFrame, name: str) -> None:
