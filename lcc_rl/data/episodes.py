@@ -70,7 +70,6 @@ STRICT = (
     ),
 )
 ALIASES = {"event": "episode", "period": "recording"}
-POSITIONS = ("leader_position_m", "follower_position_m")
 DERIVED = "no positions given: those of leaders are the integral of their speeds"
 MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
 REGULAR = 0.01  # of a step, by which one may differ: times in float32 are off by some 10 µs

@@ -13,7 +13,7 @@ from typing import Any, cast
 import torch
 
 from lcc_rl.config import is_sweep
-from lcc_rl.config.nodes import CALLED, build
+from lcc_rl.config.nodes import CALLED, TARGET, build, short_name
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
@@ -23,6 +23,8 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
 
+# What makes drivers of a table, by default the shipped one.
+TABLED = ("lcc_rl.drivers.population.bootstrap", "lcc_rl.drivers.population.kde")
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
 
@@ -143,17 +145,23 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
 def described(population: Population, cfg: StudyConfig) -> str:
     """Return a line on who drives, and behind whom."""
     speed, gap = population.desired_speed, population.time_gap
-    shipped = "fixed" if "desired_speed" in cfg.drivers else "fitted to NGSIM I-80, shipped"
-    path = cfg.drivers.get("path")
     leaders = cfg.leader if cfg.leader is not None and "source" not in cfg.leader else cfg.data
     whose = leaders.get("path") or "synthetic or shipped traffic"
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
-    who = f"{len(gap)} human drivers ({f'calibrated, {path}' if path else shipped})"
+    who = f"{len(gap)} human drivers ({_origin(cfg.drivers)})"
     line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or not (reaction.delay or reaction.noise):
         return line
     return f"{line}, reaction delay {reaction.delay:g} s, noise {reaction.noise:g} m/s²"
+
+
+def _origin(drivers: Mapping[str, Any]) -> str:
+    """Return where drivers come from; of a function of the user's own only its name is known."""
+    if drivers[TARGET] not in TABLED:
+        return short_name(drivers[TARGET])
+    path = drivers.get("path")
+    return f"calibrated, {path}" if path else "fitted to NGSIM I-80, shipped"
 
 
 def constant_profiles(

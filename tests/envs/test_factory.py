@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from commands import tiny
 from helpers import (
     ACTION,
     POPULATION,
@@ -20,7 +21,8 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
-from lcc_rl.envs import build_env
+from lcc_rl.drivers.population import DriverPopulation, fixed
+from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.step import Step, closure, entries, pieces_of
 from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.power import motor_power
@@ -205,3 +207,21 @@ def test_compiled_environment_agrees_with_eager_over_an_episode() -> None:
         # Until the first collision; what follows depends on rounding.
         running = ~runs[0]["terminated"].cumsum(1).bool().unsqueeze(-1)
         assert (difference * running).max() < 1e-3 * runs[0][key].abs().max(), key
+
+
+def own_drivers() -> DriverPopulation:
+    """A population of a user's own."""
+    return fixed(desired_speed=20.0, time_gap=1.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "origin"),
+    [
+        ("drivers=i80", "fitted to NGSIM I-80, shipped"),
+        ("drivers=fixed", "fixed"),
+        (f"drivers._target_={__name__}.own_drivers", "own_drivers"),
+    ],
+)
+def test_the_report_says_whose_drivers_drive(words, origin) -> None:
+    line = next(x for x in load_inputs(tiny("train", words)).report if "human drivers" in x)
+    assert f"human drivers ({origin})" in line
