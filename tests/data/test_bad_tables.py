@@ -3,37 +3,15 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from ngsim_text import OFFICIAL, cells, csv_text, native_text, pair, portal_text
-from table_text import long_table, openacc_text, pairs
+from table_text import READERS, long_table, openacc_text, pairs
 
-from lcc_rl.data.leaders import RecordLeaders
-from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.openacc import OpenAccSource
-from lcc_rl.data.sources import EpisodesSource, NgsimSource
-from lcc_rl.data.speed_records import COLUMNS, read_drives, read_speed_record
-from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError
 
-BY_GAP = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
-STRETCH = {"a": {"to_s": 9.0}}
-READERS: dict[str, Callable[[str], object]] = {
-    "ngsim": lambda path: read_ngsim(path),
-    "source": lambda path: NgsimSource(path=path).load(),
-    "i-80": lambda path: read_ngsim(path, location="i-80"),
-    "table": lambda path: TableSource(path=path, columns={**BY_GAP, "position": "x"}).load(),
-    "episodes": lambda path: EpisodesSource(path=path).load(),
-    "openacc": lambda path: OpenAccSource(path=path).load(),
-    "drives": lambda path: read_drives(path, COLUMNS, 0.1),
-    "record": lambda path: read_speed_record(path),
-    "leaders": lambda path: RecordLeaders(path=path, training=STRETCH, held_out=STRETCH).load(
-        0.1, 9
-    ),
-}
 GOOD = csv_text(pair())
 TABLE = long_table()
 RECORD = "time_s,speed_mps\n"
