@@ -11,6 +11,11 @@ from typing import Any
 class LccError(Exception):
     """Base class of errors caused by input: a file, a row, a key or an option."""
 
+    def __str__(self) -> str:
+        """Return the message; what a file brings into it cannot steer a terminal."""
+        text = super().__str__()
+        return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
 
 class DataError(LccError, ValueError):
     """A trajectory, profile or driver file is not what was expected."""
