@@ -29,6 +29,10 @@ class ResultsError(LccError, RuntimeError):
     """A result, policy or checkpoint file is missing, damaged or of another version."""
 
 
+class Concern(str):
+    """A line of a report that changes results: nobody should have to look for it."""
+
+
 class Interrupted(LccError):
     """A job was stopped by the user after saving its state."""
 

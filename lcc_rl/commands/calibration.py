@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -34,7 +36,12 @@ ERRORS = (
 )
 
 
-def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None) -> pd.DataFrame:
+def run(
+    cfg: CalibrateConfig,
+    folder: str | Path,
+    console: Console | None = None,
+    tell: Callable[[Sequence[str]], None] | None = None,
+) -> pd.DataFrame:
     """Calibrate the drivers of ``cfg.data`` as ``cfg.calibration`` says.
 
     Writes ``config.yaml``, ``twins.parquet``, ``drivers.parquet``, ``calibration.png``,
@@ -43,7 +50,8 @@ def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None
     Args:
         cfg: configuration of the entry point ``calibrate``.
         folder: where the files go.
-        console: where progress, report and summary go; by default the terminal.
+        console: where progress and summary go; by default the terminal.
+        tell: where the report's lines go; by default the console.
 
     Returns:
         The calibrated drivers, as written.
@@ -53,15 +61,18 @@ def run(cfg: CalibrateConfig, folder: str | Path, console: Console | None = None
     """
     with claim(Path(folder)):
         check_folder(cfg, Path(folder))
-        return _run(cfg, Path(folder), console or Console(highlight=False))
+        console = console or Console(highlight=False)
+        return _run(cfg, Path(folder), console, tell or partial(_say, console))
 
 
-def _run(cfg: CalibrateConfig, folder: Path, console: Console) -> pd.DataFrame:
+def _run(
+    cfg: CalibrateConfig, folder: Path, console: Console, tell: Callable[[Sequence[str]], None]
+) -> pd.DataFrame:
     device = prepare_torch(cfg)
     # Settings are checked before the data are read, which may take long.
     calibrator = build(cfg.calibration, "calibration", CALLED)
     dataset = build_source(cfg.data).load()
-    _say(console, dataset.report)
+    tell(dataset.report)
     start = perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(
@@ -75,10 +86,10 @@ def _run(cfg: CalibrateConfig, folder: Path, console: Console) -> pd.DataFrame:
         result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=show)
     seconds = perf_counter() - start
     save_config(cfg, folder)
-    _say(console, result.report)
+    tell(result.report)
     _write(result, dataset.report, cfg, folder)
     console.print(_summary(result.drivers))
-    _say(console, [f"calibrated in {seconds:.1f} s; results in {folder}"])
+    tell([f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
 
 
@@ -98,7 +109,7 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 
 
-def _say(console: Console, lines: list[str]) -> None:
+def _say(console: Console, lines: Sequence[str]) -> None:
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +30,8 @@ from lcc_rl.config.schemas import (
     TrainConfig,
 )
 from lcc_rl.data.episodes import write_episodes
-from lcc_rl.drivers.calibrator import IMPLAUSIBLE_FIT
 from lcc_rl.envs.inputs import build_source, load_inputs
-from lcc_rl.errors import ConfigError, Interrupted
+from lcc_rl.errors import Concern, ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.main_page import held_to, write_page
@@ -60,11 +58,6 @@ PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last o
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 NETWORKS, RULE = ("reference", "alcc"), "rule"  # trained by default; the rule by the gradient
 ANALYTIC = "lcc_rl.agents.Analytic"
-# Words in lines of reports that nobody should have to look for.
-CONCERNS = (
-    *(IMPLAUSIBLE_FIT, "lie on a bound", "reaction delay", "front to front"),
-    *("were cut there", "episodes cut where", "episodes dropped"),
-)
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
@@ -189,9 +182,7 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     if not drivers.exists():
         shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
         own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
-        said = StringIO()
-        found = calibration.run(own, drivers.parent, Console(file=said, width=100))
-        _pass_on(said.getvalue().splitlines())
+        found = calibration.run(own, drivers.parent, Console(quiet=True), tell=_pass_on)
         tell(f"drivers: {len(found)} calibrated, mean RMSPE {100.0 * found['rmspe'].mean():.2f} %")
     return drivers
 
@@ -199,8 +190,7 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
 def _pass_on(lines: Sequence[str]) -> None:
     """Log what was read and calibrated; what changes the results is also on the terminal."""
     for line in lines:
-        loud = any(words in line for words in CONCERNS)
-        log.log(logging.WARNING if loud else logging.INFO, line)
+        log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
 
 
 def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:

@@ -33,7 +33,7 @@ from lcc_rl.data.tables import (
     single_spaces,
 )
 from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 
 HEADER = (
     "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,"
@@ -384,7 +384,9 @@ def _sorted(read: _Rows) -> pd.DataFrame:
     _fill_headways(read.report, columns, places, key)
     report = read.report
     report.empty_columns = [name for name in CONSEQUENCES if name not in read.filled]
-    report.notes += [f"{x} is all zero or blank: {CONSEQUENCES[x]}" for x in report.empty_columns]
+    for name in report.empty_columns:
+        line = f"{name} is all zero or blank: {CONSEQUENCES[name]}"
+        report.notes.append(Concern(line) if name == "v_Length" else line)
     if read.blank_classes and "v_Class" in read.filled:
         report.notes.append(f"v_Class is blank in {read.blank_classes:,} rows: class unknown")
     recording = pd.Categorical.from_codes(columns.pop("recording"), categories=pd.Index(names))

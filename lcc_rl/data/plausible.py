@@ -12,7 +12,7 @@ from pydantic import Field
 
 from lcc_rl.data.tables import TableFile
 from lcc_rl.data.trajectories import divided, starts_of
-from lcc_rl.errors import LARGEST, DataError
+from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
@@ -108,11 +108,12 @@ class Plausible(Settings):
         if lines:
             records = int(np.logical_or.reduceat(wrong, starts).sum())
             count = len(table) - len(kept)
-            lines.append(
+            line = (
                 f"{records:,} of {len(starts):,} records were cut there: {count:,} samples, "
                 f"{count * usual_step(table):,.0f} s, are left out, with parts shorter than "
                 f"{SHORTEST:g} s"
             )
+            lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
         return kept, [*lines, *more_lines, *self._check_units(kept, source, setting)]
 

@@ -27,7 +27,7 @@ from lcc_rl.drivers.parameters import (
     fitted,
 )
 from lcc_rl.drivers.twins import compare
-from lcc_rl.errors import DataError, unknown_name
+from lcc_rl.errors import Concern, DataError, unknown_name
 from lcc_rl.functional.driver_models import DriverConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Positive, Settings, given_as, values
@@ -40,7 +40,6 @@ INNER = GeneticSettings(population=16, generations=8)
 ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
 OUT = "_out"
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
-IMPLAUSIBLE_FIT = "IMPLAUSIBLE FIT"
 CONGESTED = "; followers that never drive freely do not tell it"
 
 
@@ -272,15 +271,17 @@ def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, 
             low, high = limits[name]
             upper = drivers[COLUMNS[name]] > (low + high) / 2
             shares = [100 * (bound & side).mean() for side in (~upper, upper)]
-            lines.append(
+            line = (
                 f"{100 * bound.mean():.0f} % of the values of {COLUMNS[name]} lie on a bound: "
                 f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
                 f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
             )
+            lines.append(Concern(line))
     off = 100.0 * drivers["gap_nrmse"].median()
     if off > 100.0 * IMPLAUSIBLE:
-        lines.append(
-            f"{IMPLAUSIBLE_FIT}: the gap of the median driver is off by {off:.0f} %; are speeds in "
+        line = (
+            f"IMPLAUSIBLE FIT: the gap of the median driver is off by {off:.0f} %; are speeds in "
             "km/h or ft/s, or gaps and positions in feet, in columns of m/s and m (data.units)?"
         )
+        lines.append(Concern(line))
     return lines

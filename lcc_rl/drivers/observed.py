@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.data.episodes import ALIASES
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 from lcc_rl.settings import NonNegative, Settings
 
 IDENTITY = ("recording", "follower_id", "leader_id")
@@ -212,7 +212,7 @@ def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, lis
         f"{episode[low].nunique()} of {episode.nunique()} episodes cut where the gap is below "
         f"{selection.min_gap_m:g} m; their longest part is used"
     )
-    return kept.reset_index(drop=True), [line]
+    return kept.reset_index(drop=True), [Concern(line)]
 
 
 def _truncate(frame: pd.DataFrame, duration: float | None) -> pd.DataFrame:
@@ -262,12 +262,12 @@ def _select(table: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, li
         < selection.min_mean_speed_mps,
     }
     keep = pd.Series(True, index=table.index)
-    lines = []
+    lines: list[str] = []
     for reason, bad in reasons.items():
         dropped = int((keep & bad).sum())
         keep &= ~bad
         if dropped:
-            lines.append(f"{dropped} of {len(table)} episodes dropped: {reason}")
+            lines.append(Concern(f"{dropped} of {len(table)} episodes dropped: {reason}"))
     if not keep.any():
         raise DataError(f"no episode is fit for calibration: {'; '.join(lines)}")
     lines.append(f"{int(keep.sum())} of {len(table)} episodes used for calibration")

@@ -23,6 +23,7 @@ from torch import Tensor
 from lcc_rl.drivers.observed import Observed
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.energy import PaperMotor
+from lcc_rl.errors import Concern
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.laws import LAWS
@@ -374,7 +375,7 @@ def compare(
         f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
         f"{CARS}th in a row); below, each driver has what was chosen on others"
     )
-    lines = [line, *(_line(who, found, one) for who, one in errors.items())]
+    lines = [Concern(line), *(_line(who, found, one) for who, one in errors.items())]
     return reaction, _together(found, observed), lines
 
 
