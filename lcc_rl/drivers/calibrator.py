@@ -142,7 +142,7 @@ class Calibrator(Settings):
                 own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
                 drivers = drivers.assign(**own)
             parts.append(drivers)
-            report += [f"{mode}: {line}" for line in [*lines, *more]]
+            report += [type(line)(f"{mode}: {line}") for line in [*lines, *more]]
         tables = (pd.concat(tables, ignore_index=True) for tables in (parts, twins))
         return Calibration(next(tables), report, next(tables))
 
