@@ -417,5 +417,7 @@ class Mixture:
             replace(windows, sources=names),
             tuple(case for one in found.values() for case in one.cases),
             tuple(case for one in found.values() for case in one.full_length),
-            tuple(type(line)(f"{name}: {line}") for name, one in found.items() for line in one.report),
+            tuple(
+                type(line)(f"{name}: {line}") for name, one in found.items() for line in one.report
+            ),
         )
