@@ -93,14 +93,18 @@ def _cars(table: TableFile, recording: int, driver: str | None, report: ReadRepo
     if driver is not None:
         none = np.full(rows, "")
         who = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
-        other = cars.gap.notna() & (np.char.lower(who.astype(str)) != driver)
-        cars["gap"] = cars.gap.mask(other)
-        report.notes.append(
-            f"{table.path}: {int(cars.gap.notna().sum()):,} samples of followers driven by "
-            f"{driver}, {int(other.sum()):,} of others"
-        )
+        cars["gap"], note = _driven_by(driver, cars.gap, who)
+        report.notes.append(f"{table.path}: {note}")
     cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
+
+
+def _driven_by(driver: str, gap: pd.Series, who: NDArray) -> tuple[pd.Series, str]:
+    """Return the gaps of the samples that a kind of driver drives, and a line on both kinds."""
+    other = gap.notna() & (np.char.lower(who.astype(str)) != driver)
+    own = gap.mask(other)
+    words = f"{int(own.notna().sum()):,} samples of followers driven by {driver}"
+    return own, f"{words}, {int(other.sum()):,} of others"
 
 
 def _marked(table: TableFile, followers: Iterable[int], read: Mapping[str, NDArray]) -> str:

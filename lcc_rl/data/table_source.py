@@ -163,22 +163,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
             agree; it names file, row and column.
     """
     files = ", ".join(report.files)
-
-    def place(row: int) -> str:
-        recording = names[rows.recording[row]]
-        return f"{files}: recording {recording}, data row {rows.row[row] + 1}"
-
-    rows = _sorted(rows, report)
-    again = rows.duplicated(["recording", "vehicle", "time"])
-    differ = (again & ~rows.duplicated(rows.columns.drop("row"))).to_numpy()
-    if differ.any():
-        row = int(np.argmax(differ))
-        raise DataError(
-            f"{place(row)} and data row {rows.row[row - 1] + 1} differ, but are of one vehicle "
-            f"({rows.vehicle[row]}) at one time ({rows.time[row]:g} s); expected one row"
-        )
-    report.drop(EXACT, int(again.sum()))
-    rows = rows[~again].reset_index(drop=True)
+    rows = _once(_sorted(rows, report), names, report)
     together = rows[["recording", "vehicle"]].diff().eq(0).all(axis=1).to_numpy()
     steps = rows.time.diff().to_numpy()
     if not together.any():
@@ -188,8 +173,8 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     if short.any():
         row = int(np.argmax(short))
         raise DataError(
-            f"{place(row)} is {steps[row]:g} s after the sample before it of vehicle "
-            f"{rows.vehicle[row]}; expected steps of about {step:g} s"
+            f"{_place(rows, row, names, report)} is {steps[row]:g} s after the sample before it of "
+            f"vehicle {rows.vehicle[row]}; expected steps of about {step:g} s"
         )
     first = ~together | (steps > HOLE * step)
     _check_way(rows, first, files)
@@ -199,8 +184,8 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     if frames.max() > LAST:
         row = int(np.argmax(frames > LAST))
         raise DataError(
-            f"{place(row)} is {FRAME * frames[row]:g} s after the first; is the time in another "
-            "unit?"
+            f"{_place(rows, row, names, report)} is {FRAME * frames[row]:g} s after the first; is "
+            "the time in another unit?"
         )
     frame, segment = np.rint(frames).astype(np.int64), np.cumsum(first) - 1
     if abs(step - FRAME) > UNEVEN * FRAME or np.abs(frames - frame).max() > UNEVEN:
@@ -272,6 +257,31 @@ def _interpolated(
         mixed = (1 - weight) * found.gap + weight * following.gap
         found["gap"] = found.gap.where(weight == 0, mixed)
     return found, frame, segment[first]
+
+
+def _place(rows: pd.DataFrame, row: int, names: list[str], report: ReadReport) -> str:
+    """Describe a row to the user."""
+    files, recording = ", ".join(report.files), names[rows.recording[row]]
+    return f"{files}: recording {recording}, data row {rows.row[row] + 1}"
+
+
+def _once(rows: pd.DataFrame, names: list[str], report: ReadReport) -> pd.DataFrame:
+    """Return one row per vehicle and moment of sorted rows.
+
+    Raises:
+        DataError: if two rows of a vehicle and moment differ.
+    """
+    again = rows.duplicated(["recording", "vehicle", "time"])
+    differ = (again & ~rows.duplicated(rows.columns.drop("row"))).to_numpy()
+    if differ.any():
+        row = int(np.argmax(differ))
+        raise DataError(
+            f"{_place(rows, row, names, report)} and data row {rows.row[row - 1] + 1} differ, but "
+            f"are of one vehicle ({rows.vehicle[row]}) at one time ({rows.time[row]:g} s); "
+            "expected one row"
+        )
+    report.drop(EXACT, int(again.sum()))
+    return rows[~again].reset_index(drop=True)
 
 
 def _samples(
