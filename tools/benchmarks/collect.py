@@ -27,7 +27,8 @@ KEPT = ("observation", "reward", "terminated", "done")
 def collect(options: Namespace) -> list[Row]:
     """Return transitions per second, collected without exploration and kept for learning.
 
-    "StringCollector" is the training's own, "Collector" TorchRL's, which keeps every entry. The
+    "StringCollector" is the training's own, "Collector" TorchRL's, which keeps every entry;
+    compiled, its environment is, by ``env.compile()``, and its policy. The
     plain loop runs the same network and stacks what a learner needs. First the vehicles start so
     far apart that no episode ends; then, "in training", gaps are spread at the start, vehicles
     collide, and episodes that end are replaced, by the plain loop, too. stable-baselines3 calls
@@ -38,17 +39,16 @@ def collect(options: Namespace) -> list[Row]:
     batch, steps = (16, 10) if options.quick else (1024, 60)
     policy = DDPG().start(Scene(7, device=options.device)).policy
     runs: dict[str, Run] = {}
-    against: dict[str, list[str]] = {"Collector": ["plain loop"]}
+    against: dict[str, list[str]] = {}
     for ending in endings(options):
-        env, own, plain = (
-            alcc(options, batch, 30),
-            f"StringCollector{ending}",
-            f"plain loop{ending}",
+        own, theirs, plain = (
+            f"{x}{ending}" for x in ("StringCollector", "Collector", "plain loop")
         )
-        runs[plain] = loop(env, policy.module, steps, bool(ending), resets=False)
-        runs[own] = collector(env, policy, steps, bool(ending))
-        against[own] = [plain]
-    runs["Collector"] = torchrl_collector(alcc(options, batch, 30), policy, steps)
+        env, compiled = alcc(options, batch, 30), bool(ending)
+        runs[plain] = loop(env, policy.module, steps, compiled, resets=False)
+        runs[own] = collector(env, policy, steps, compiled)
+        runs[theirs] = torchrl_collector(alcc(options, batch, 30), policy, steps, compiled)
+        against |= {own: [plain], theirs: [plain, own]}
     counts = dict.fromkeys(runs, batch * steps)
     rows = rates(options, runs, "steps/s", counts, against, batch)
     for size in (batch,) if options.quick else (20, batch, 8192):
@@ -84,10 +84,13 @@ def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> R
     ).collect
 
 
-def torchrl_collector(env: TransformedEnv, policy: Any, steps: int) -> Run:
+def torchrl_collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
     """Return TorchRL's collector, which keeps every entry."""
     count = env.batch_size.numel() * steps
-    how = {"track_traj_ids": False, "auto_register_policy_transforms": False}
+    how: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
+    if compiled:
+        how["compile_policy"] = {"dynamic": False}
+        env.compile()
     batches = iter(
         Collector(env, shared_policy(policy), frames_per_batch=count, total_frames=-1, **how)
     )
