@@ -130,7 +130,7 @@ def sweep(command: Callable[[], Any]) -> None:
     try:
         command()
     except (KeyboardInterrupt, Exception) as error:
-        if was_interrupted(error) and not isinstance(error, LccError):
+        if was_interrupted(error) and not isinstance(input_error(error), Interrupted):
             folder = SweepCallback.end()
             if folder is None:
                 raise KeyboardInterrupt from error

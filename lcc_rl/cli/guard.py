@@ -24,8 +24,13 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def guarded(*arguments: Any, **settings: Any) -> Any:
         try:
-            with unbroken_output(), interruptible():
-                return function(*arguments, **settings)
+            with unbroken_output(), interruptible() as interrupted:
+                try:
+                    return function(*arguments, **settings)
+                except Exception as error:
+                    if interrupted.is_set() and not isinstance(input_error(error), Interrupted):
+                        raise KeyboardInterrupt from error
+                    raise
         except KeyboardInterrupt:
             stop("interrupted", INTERRUPTED)
         except Exception as error:

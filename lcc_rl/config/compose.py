@@ -166,15 +166,16 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
-    check_used(content, overrides, sweep)
     try:
-        return parse_config(content, KINDS[entry])
+        tree = parse_config(content, KINDS[entry])
     except ConfigError as error:  # of a class that has no such setting; another choice may
         found = re.match(r"unknown setting of (\w+) \(", str(error))
         group = found.group(1) if found else ""
         if not group or not choices(group):
             raise
         raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from error
+    check_used(content, overrides, sweep)
+    return tree
 
 
 def _learns(content: Mapping[str, Any]) -> bool:
@@ -182,7 +183,9 @@ def _learns(content: Mapping[str, Any]) -> bool:
     agent, driver = content.get("agent"), content.get("scenario", {}).get("controllers", {})
     if not isinstance(agent, dict) or TARGET not in agent:  # a recipe's settings of an agent
         return False
-    return AUTOMATED not in driver or takes_action(driver[AUTOMATED])
+    if not isinstance(driver, Mapping) or AUTOMATED not in driver:
+        return True
+    return takes_action(driver[AUTOMATED])
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:

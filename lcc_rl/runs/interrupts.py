@@ -63,14 +63,19 @@ def _handled_by(
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt on a signal that ends a command."""
+def interruptible() -> Iterator[threading.Event]:
+    """Raise KeyboardInterrupt on a signal that ends a command, and set the event.
+
+    What the interrupt breaks into may answer with an error of its own.
+    """
+    event = threading.Event()
 
     def interrupt(number: int, restore: Restore) -> None:
+        event.set()
         raise KeyboardInterrupt
 
     with _handled_by(interrupt):
-        yield
+        yield event
 
 
 @contextmanager

@@ -21,7 +21,9 @@ from commands import (
     wait_for,
 )
 
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.commands import training
+from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.runs.interrupts import SIGNALS, interruptible, stop_signal
 
@@ -60,6 +62,21 @@ def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch, kind) 
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_an_error_that_follows_from_an_interrupt_is_one(capsys) -> None:
+    @main_guard
+    def command() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except KeyboardInterrupt:
+            pass  # as a library may do that was in the midst of its work
+        raise ConfigError("'NoneType' object has no attribute 'flags'")
+
+    with pytest.raises(SystemExit) as end:
+        command()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "lcc_rl: interrupted\n"
 
 
 def test_a_closed_terminal_is_ignored_where_nohup_says_so() -> None:
