@@ -116,10 +116,12 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         cfg = by_people(driven_by(cfg, controller_of(name)))
         cfg.scenario.start[AUTOMATED] = {TARGET: RECORDED_START}
         return Strategy(name, cfg)
-    behind, named = cfg.scenario.filters.get(AUTOMATED) is not None, name.endswith(FILTERED)
-    require(behind or not named, f"{name} drives behind the safety filter: add +filter=cbf")
-    controller = controller_of(who or name, behind)
-    if named or (behind and name in TUNED):
+    kept, named = cfg.scenario.filters.get(AUTOMATED) or {}, name.endswith(FILTERED)
+    require(bool(kept) or not named, f"{name} drives behind the safety filter: add +filter=cbf")
+    # Constants tuned behind a filter count on the longest time gap that it keeps.
+    held = bool(kept) and kept.get("time_gap", True) is not None
+    controller = controller_of(who or (name if held else name.removesuffix(FILTERED)), held)
+    if named or (kept and name in TUNED):
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)

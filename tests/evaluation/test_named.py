@@ -13,6 +13,7 @@ from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.errors import LccError
 from lcc_rl.evaluation.named import controller_of
+from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
 from lcc_rl.pieces import ConstantAcceleration, Controller, Law
@@ -62,6 +63,16 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
     assert found["full"] != found["full_filtered"]
     with pytest.raises(LccError, match=r"add \+filter=cbf"):
         lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
+
+
+@pytest.mark.parametrize(("longest", "own"), [("2.45", True), ("null", False)])
+def test_constants_tuned_behind_a_filter_need_its_longest_gap(longest: str, own: bool) -> None:
+    words = ["variant=alcc", "+filter=cbf", f"scenario.filters.automated.time_gap={longest}"]
+    plain, behind = (
+        baseline(load("evaluate", words), name).cfg.scenario.controllers["automated"]
+        for name in ("idm_acc", "idm_acc_filtered")
+    )
+    assert (behind["desired_speed"] < plain["desired_speed"]) == own
 
 
 @pytest.mark.parametrize(
