@@ -21,7 +21,17 @@ from lcc_rl.settings import defaults
 CONF = Path(lcc_rl.conf.__file__).parent
 AUTO = "scenario.controllers.automated"
 # Choices that need the path of a file.
-OF_FILES = ("ngsim", "openacc", "table", "episodes", "drives", "record", "i24", "calibrated")
+OF_FILES = (
+    "ngsim",
+    "openacc",
+    "table",
+    "episodes",
+    "drives",
+    "record",
+    "i24",
+    "roads",
+    "calibrated",
+)
 # The variant whose scenario a controller of conf/controller fits: what it reads must be there.
 SCENARIO_OF = {"cacc": "cacc", "deadbeat": "cacc", "hcfs": "hcfs"}
 

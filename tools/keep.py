@@ -2,6 +2,7 @@
 
 lengths: the held-out windows of HCFS studies whose trainings differ in length, one file.
 sources: the windows of platoons behind several sources of leaders, one file.
+classes: the scores of evaluations with task=… by source and speed of the leader, one file.
 means: the means of one evaluation per window and per driver, two files in a folder.
 alcc: those of an ALCC study's main part, its learning curves, an episode and its drivers.
 """
@@ -13,16 +14,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import leaderboard
+import numpy as np
 import pandas as pd
 
 from lcc_rl import results
 from lcc_rl.cli.guard import main_guard
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.means import TRAINED, Means
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.results.savings import SOURCE
+from lcc_rl.results.savings import DRIVE, SOURCE
+from lcc_rl.results.scores import LEAST, scores
 from lcc_rl.studies.alcc.report import CURVES, MAIN
 from lcc_rl.studies.alcc.study import DRIVERS
 from lcc_rl.studies.hcfs.study import TRAINING
@@ -30,6 +35,9 @@ from lcc_rl.studies.hcfs.tables import LEARNED, MEASURES, RUN, STABLE, per_run, 
 
 # Columns of the learning curves that are kept, besides the terms of the reward.
 CURVE = ("variant", "seed", "iteration", "episodes", "updates", "episode_reward", "collisions")
+
+# Classes of a leader's mean speed, and the column with the lower end of one [m/s].
+CLASSES, FASTER = (0.0, 15.0, 25.0, 29.0, np.inf), "faster_than_mps"
 
 
 def lengths(studies: Sequence[Path], path: Path) -> None:
@@ -60,6 +68,35 @@ def sources(evaluations: Sequence[Path], path: Path) -> None:
     write_parquet(rounded(pd.concat(parts)[[SOURCE, *RUN, *MEASURES]]), path)
 
 
+def classes(evaluations: Sequence[Path], path: Path) -> None:
+    """Keep how every strategy scores by source and class of the leader's mean speed.
+
+    ``outside_…`` counts the episodes, over all seeds, that break a limit of the task.
+    """
+    kept = []
+    for folder in evaluations:
+        cfg, task, rows, _ = leaderboard.task_scores(folder)
+        # That of most strategies: a collision ends an episode early.
+        speed = rows.groupby("profile_id")["leader_speed_mps"].transform("median")
+        rows[FASTER] = pd.cut(speed, CLASSES, labels=CLASSES[:-1]).astype(float)
+        for name, bound in task.limits.items():
+            broken = rows[name] < bound if name.startswith(LEAST) else rows[name] > bound
+            rows[f"outside_{name}"] = broken
+        counts = [name for name in rows if str(name).startswith("outside_")]
+        for _, part in rows.groupby([SOURCE, FASTER]):
+            table = scores(part, task, build_energy(cfg)).set_index("strategy")
+            table = table.join(part.groupby("strategy")[counts].sum()).reset_index()
+            labelled = table.assign(
+                evaluation=folder.name,
+                source=part[SOURCE].iloc[0],
+                faster_than_mps=part[FASTER].iloc[0],
+                windows=part["profile_id"].nunique(),
+                drives=part[DRIVE].nunique(),
+            )
+            kept.append(labelled)
+    write_parquet(rounded(pd.concat(kept)), path)
+
+
 def means(evaluations: Sequence[Path], target: Path) -> None:
     """Keep the means of an evaluation per window and per driver."""
     Means.of(read_parquet(_only(evaluations) / EPISODES)).write(target)
@@ -87,7 +124,7 @@ def _only(folders: Sequence[Path]) -> Path:
     return folders[0]
 
 
-KINDS = {"lengths": lengths, "sources": sources, "means": means, "alcc": alcc}
+KINDS = {"lengths": lengths, "sources": sources, "classes": classes, "means": means, "alcc": alcc}
 
 
 def main(words: Sequence[str] | None = None) -> int:

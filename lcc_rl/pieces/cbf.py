@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -52,6 +53,11 @@ class CBFFilter(StepTransform):
     With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
     expectation as comfort: as far as the vehicle ahead keeps its acceleration and braking suffices.
 
+    With a ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, likewise, with
+    ``h = √(2·longest_gap / max_acceleration)``: the gap that the present speeds lead to within h.
+    Where it is, half of the acceleration suffices to keep it, so that the other half can answer a
+    vehicle ahead that accelerates. Limits of nearness win.
+
     Behind a leader at standstill both limits are about the same number, gap / speed, so who comes
     from afar must break one. With a ``full_speed``, ``longest(v)`` is ``time_gap·v`` from there on
     and falls with the square of the speed below: the vehicle is near before its leader stands, and
@@ -76,7 +82,9 @@ class CBFFilter(StepTransform):
     braking_ahead: Positive = 2.6  # hardest braking of the vehicle ahead reckoned with [m/s²]
     time_gap: Positive | None = 2.45  # longest allowed; None: no limit [s]
     shortest_time_gap: Positive | None = None  # shortest allowed; None: no limit [s]
-    time_gap_rate: Positive = 0.2  # how fast limits of the time gap may be approached [1/s]
+    longest_gap: Positive | None = None  # longest allowed; None: no limit [m]
+    # How fast the limits of the time gap and the longest gap may be approached [1/s].
+    time_gap_rate: Positive = 0.2
     # Speed below which the longest time gap falls in proportion; 0: it does not [m/s].
     full_speed: NonNegative = 0.0
     least_gap: NonNegative = 2.0  # gap that the limit of the time gap always allows [m]
@@ -167,25 +175,29 @@ class CBFFilter(StepTransform):
     ) -> Tensor:
         """Return the command nearest to what is wanted within all bounds, not clamped."""
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
-        free = gap - self.margin
+        free, half = gap - self.margin, 0.5 * self.time_step
         shortest = self.time_to_collision
         command = wanted
         if self.time_gap is not None:
-            allowed, slope = self._longest_gap(speed, self.time_gap)
+            allowed, slope = self._allowed(speed, self.time_gap)
             least = (-closing - self.time_gap_rate * (allowed - gap)) / slope
             command = torch.maximum(command, least)
+        if self.longest_gap is not None:
+            foresight = math.sqrt(2.0 * self.longest_gap / self.max_acceleration)
+            room = self.longest_gap - gap + foresight * closing
+            faster = (-closing - self.time_gap_rate * room) / (foresight + half)
+            command = torch.maximum(command, ahead_acceleration + faster)
         slower = self.rate * (free - shortest * closing) - closing
-        comfort = ahead_acceleration + slower / (shortest + 0.5 * self.time_step)
+        comfort = ahead_acceleration + slower / (shortest + half)
         command = torch.minimum(command, torch.minimum(comfort, safe))
         if self.shortest_time_gap is not None:
             room = gap - self.shortest_time_gap * speed
-            half = 0.5 * self.time_step
             opening = half * ahead_acceleration - closing
             held = (self.time_gap_rate * room + opening) / (self.shortest_time_gap + half)
             command = torch.minimum(command, held)
         return command
 
-    def _longest_gap(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
+    def _allowed(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
         """Return the longest gap at a speed, and how it grows with the speed."""
         moving = speed.clamp(min=SLOWEST)
         share = (moving / max(self.full_speed, SLOWEST)).clamp(max=1.0)

@@ -125,3 +125,36 @@ def test_the_promise_holds_with_faults(fault) -> None:
 @pytest.mark.parametrize("fault", ["errors", "sensors 0.2 s late"])
 def test_a_filter_that_does_not_reckon_with_a_fault_breaks_it(fault) -> None:
     assert driven(Road(fault, 500, 0, robust=False))[1] > 100
+
+
+def farthest_behind(piece: CBFFilter) -> tuple[float, float]:
+    """Largest gap [m] and least TTC [s] of a minute: the vehicle brakes, or coasts, if it may.
+
+    The leaders accelerate by half of what the vehicle can, and brake, in waves.
+    """
+    chance, longest = torch.Generator().manual_seed(0), 115.0
+    speed, room, ahead = states(10_000, piece.limits, 0)
+    gap, opening = room + MARGIN, (2.0 * longest / HARD) ** 0.5 * (ahead - speed)
+    inside = gap + opening.clamp(min=0.0) < longest
+    speed, gap, ahead = (x[inside].unsqueeze(-1) for x in (speed, gap, ahead))
+    phase = 20.0 * draw(len(gap), chance).unsqueeze(-1)
+    wish = torch.where(draw(len(gap), chance).unsqueeze(-1) < 0.5, -HARD, 0.0)
+    seen, farthest, least = torch.zeros_like(gap), 0.0, torch.inf
+    for step in range(600):
+        command = piece.filtered(wish, speed, gap, ahead, seen)
+        pressed = torch.where((step * STEP + phase) % 20.0 < 12.0, 0.5 * HARD, -2.6)
+        reached = advance_speed(speed, command, STEP)[0]
+        ahead_reached = advance_speed(ahead, pressed, STEP)[0].clamp(max=50.0)
+        gap = advance_gap(gap, ahead, speed, ahead_reached, reached, STEP)
+        seen, speed, ahead = (ahead_reached - ahead) / STEP, reached, ahead_reached
+        farthest = max(farthest, float(gap.max()))
+        least = min(least, float(time_to_collision(gap, speed - ahead).min()))
+    return farthest, least
+
+
+@pytest.mark.parametrize(("longest", "kept"), [(115.0, True), (None, False)])
+def test_the_longest_gap_is_kept_and_nearness_wins(longest, kept) -> None:
+    piece = CBFFilter(time_gap=None, longest_gap=longest, shortest_time_gap=1.05).bind()
+    farthest, least = farthest_behind(piece)
+    assert (farthest < 116.0) == kept
+    assert least >= LIMIT

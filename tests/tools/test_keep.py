@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 from study_frames import episodes
 
+from lcc_rl.commands.evaluation import task_of
+from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.studies.hcfs.tables import LARGEST, SUMS, sources
@@ -61,6 +63,34 @@ def test_runs_behind_other_leaders_are_named_by_the_choice(tmp_path) -> None:
     assert first["string ratio, above 1"] == "0.50, 0 of 1"
     # 598 against CACC's 592 kJ/km.
     assert first["energy saved_pct"] == pytest.approx(100 * (1 - 598 / 592))
+
+
+def test_scores_by_source_and_speed_of_the_leader(tmp_path, monkeypatch) -> None:
+    cfg = load("evaluate", ["task=i24-follow5", "compare=[idm]"])
+    # Leader's mean speed, gap and energy of the network behind it; humans need 100 kJ.
+    found = [(20.0, 110.0, 96.0), (29.1, 119.0, 99.0), (40.0, 121.0, 95.0)]
+    rows = pd.DataFrame(
+        [
+            {
+                "profile_id": number,
+                "strategy": strategy,
+                "leader_speed_mps": speed,
+                "max_gap_m": gap,
+            }
+            | {"total_net_energy_kj": energy if strategy == "alcc" else 100.0, "driver_id": 0}
+            for number, (speed, gap, energy) in enumerate(found)
+            for strategy in ("human", "alcc")
+        ]
+    ).assign(source="i24", drive="a", training_seed=0, min_time_gap_s=1.2, collided=False)
+    rows = rows.assign(cav_distance_m=1e3, hdv_distance_m=4e3)
+    task = task_of(cfg)
+    monkeypatch.setattr(keep.leaderboard, "task_scores", lambda folder: (cfg, task, rows, None))
+    keep.classes([tmp_path], tmp_path / "classes.parquet")
+    table = pd.read_parquet(tmp_path / "classes.parquet").set_index(["strategy", keep.FASTER])
+    own = table.loc["alcc"]
+    assert own["saving"].to_dict() == pytest.approx({15.0: 0.04, 29.0: 0.03})
+    assert own["outside_max_gap_m"].to_dict() == {15.0: 0, 29.0: 1}
+    assert own["windows"].to_dict() == {15.0: 1, 29.0: 2}
 
 
 def test_means_per_window_and_per_driver(tmp_path) -> None:
