@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -67,10 +68,8 @@ def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch, kind) 
 def test_an_error_that_follows_from_an_interrupt_is_one(capsys) -> None:
     @main_guard
     def command() -> None:
-        try:
+        with suppress(KeyboardInterrupt):  # as a library may do that was in the midst of its work
             os.kill(os.getpid(), signal.SIGTERM)
-        except KeyboardInterrupt:
-            pass  # as a library may do that was in the midst of its work
         raise ConfigError("'NoneType' object has no attribute 'flags'")
 
     with pytest.raises(SystemExit) as end:
