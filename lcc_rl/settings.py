@@ -30,6 +30,7 @@ from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
+Speed = Annotated[float, Field(ge=0.0, le=100.0)]  # of a vehicle [m/s]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
 Whole = Annotated[int, Field(ge=0)]

@@ -12,7 +12,7 @@ from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.overview import counts, draw, headline, live, note, progress
-from lcc_rl.runs.states import survey
+from lcc_rl.runs.states import clean, survey
 from lcc_rl.runs.sweeps import read_plan
 
 
@@ -58,7 +58,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = Arguments(prog="lcc-rl status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
+    parser.add_argument(
+        "--clean", action="store_true", help="first remove failed runs that hold no results"
+    )
     options = parser.parse_args(arguments)
+    if options.clean:
+        for path in clean(Path(options.folder)):
+            print(f"removed {path}")
     look(options.folder, Console(highlight=False), options.watch)
 
 

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field
 from lcc_rl.config.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.functional.pattern import VehicleString, parse_string
-from lcc_rl.settings import Count, Million, NonNegative, Parallel, Positive, Settings, parse
+from lcc_rl.settings import Count, Million, Parallel, Positive, Settings, Speed, parse
 
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
@@ -57,7 +57,7 @@ class ScenarioConfig(Settings):
     road: Literal["open", "ring"]
     circumference: Positive | None = None  # of a ring [m]
     vehicle_length: Positive  # [m]
-    initial_speed: NonNegative  # on a ring [m/s]
+    initial_speed: Speed  # on a ring [m/s]
     controllers: Nodes
     start: Nodes
     filters: Nodes

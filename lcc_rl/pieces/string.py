@@ -18,7 +18,7 @@ from lcc_rl.functional.string import Motion, advance_string, entries_ahead, sele
 from lcc_rl.pieces.base import SEED, Key, StepTransform, next_key
 from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import Part, World
-from lcc_rl.settings import NonNegative, Positive
+from lcc_rl.settings import Positive, Speed
 
 COMMAND, OBEYED = "command", "obeyed"
 LEADER_SPEED = (LEADER, "speed")
@@ -93,7 +93,7 @@ class StringMotion(StepTransform):
     circumference: Positive | None = None  # of a ring road [m]
     vehicle_length: Positive = 5.0  # of every vehicle, of use on a ring road only [m]
     # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
-    initial_speed: NonNegative = 0.0
+    initial_speed: Speed = 0.0
 
     def setup(self, world: World) -> None:
         """Read the commands of all roles, and bind their starts.

@@ -130,12 +130,27 @@ def forget(folder: Path) -> None:
 
 def withdraw(folders: Sequence[Path]) -> None:
     """Remove the folder of a run that did not begin, and those above it, if they hold no more."""
-    own = folders[0]
-    if {path.name for path in own.iterdir() if path.suffix != ".log"} <= {HYDRA, ERROR, LOCK}:
-        shutil.rmtree(own)
+    if _holds_only(folders[0], {HYDRA, ERROR, LOCK}):
+        shutil.rmtree(folders[0])
         with suppress(OSError):  # one that holds something else
             for folder in folders[1:]:
                 folder.rmdir()
+
+
+def clean(root: Path) -> list[Path]:
+    """Remove the folders of failed runs that hold neither rows nor a state; return them."""
+    failed = [root / run.name for run in survey(root) if run.state == "failed"]
+    empty = [run for run in failed if _holds_only(run, {HYDRA, ERROR, LOCK, CONFIG, PROGRESS})]
+    for folder in empty:
+        shutil.rmtree(folder)
+    return empty
+
+
+def _holds_only(folder: Path, names: set[str]) -> bool:
+    """Whether a folder holds nothing but files of these names, and logs."""
+    with suppress(OSError):
+        return {path.name for path in folder.iterdir() if path.suffix != ".log"} <= names
+    return False
 
 
 def record(folder: Path, error: Exception) -> None:

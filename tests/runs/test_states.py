@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from commands import run_command
 
+from lcc_rl.cli.status import main
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.runs.states import Busy, claim, inspect_run, is_claimed, survey, working
 
@@ -91,6 +92,19 @@ def test_survey_and_status_of_a_sweep(tmp_path) -> None:
     assert printed[-1].endswith(
         "6 runs: 1 finished, 1 running, 1 stopped, 1 failed, 2 waiting; about 1:10 left"
     )
+
+
+def test_clean_removes_failed_runs_without_work(tmp_path, capsys) -> None:
+    for name in ("failed", "failed_late", "stopped"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").write_text("")
+    for name in ("failed", "failed_late"):
+        (tmp_path / name / "error.txt").write_text("full")
+        (tmp_path / name / "train.log").write_text("")
+    (tmp_path / "failed_late" / "checkpoint.pt").write_text("")
+    main([str(tmp_path), "--clean"])
+    assert f"removed {tmp_path / 'failed'}\n" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"failed_late", "stopped"}
 
 
 def test_nothing_to_see(tmp_path) -> None:
