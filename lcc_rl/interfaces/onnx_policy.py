@@ -6,8 +6,8 @@ text with the name and the unit of every input, in order (:data:`MEASURED`), and
 
     {"inputs": [{"name": "self.gap", "unit": "m"}], "output": "acceleration [m/s²]"}
 
-A program that remembers has a further input and output ``memory``, ``[batch, n]``: zeros at first,
-then what it returned in the step before.
+A program that remembers has a further input ``memory`` and output ``next_memory``, ``[batch, n]``:
+zeros at first, then what it returned in the step before.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive, Settings, given_as, parse
 
-ABOUT, STATE, OUT, MEMORY = "lcc_rl", "state", "acceleration", "memory"
+ABOUT = "lcc_rl"  # key of the metadata
+STATE, MEMORY = TAKES = ("state", "memory")
+MAKES = ("acceleration", "next_memory")
 # What a program may read, and its unit: entries of a vehicle and of its neighbours.
 MEASURED = {
     f"{view}.{entry}": unit
@@ -51,8 +53,7 @@ class ProgramInput(Settings):
         if self.name not in MEASURED:
             raise ValueError(
                 f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
-                "a vehicle, such as ahead.speed; what a program remembers is its input and "
-                "output memory"
+                "a vehicle, such as ahead.speed; what a program remembers is its input memory"
             )
         if self.unit != MEASURED[self.name]:
             raise ValueError(f"{self.name} is in {MEASURED[self.name]}, got {self.unit!r}")
@@ -107,17 +108,17 @@ class Program:
         """Check names, types and widths of inputs and outputs; return the width of the memory."""
         takes, makes = self.session.get_inputs(), self.session.get_outputs()
         names = [[one.name for one in side] for side in (takes, makes)]
-        further = [MEMORY] if MEMORY in names[0] else []
-        wanted = [[STATE, *further], [OUT, *further]]
+        count = 1 + (MEMORY in names[0])
+        wanted = [list(TAKES[:count]), list(MAKES[:count])]
         shapes = {one.name: one.shape for one in takes}
         state, memory = shapes.get(STATE, []), shapes.get(MEMORY, ["batch", 0])
         right = names == wanted and len(memory) == 2 and isinstance(memory[1], int)
         right = right and len(state) == 2 and state[1] == len(self.names)
         if not right or any(one.type != "tensor(float)" for one in (*takes, *makes)):
             raise ResultsError(
-                f"{self.path}: expected the input {STATE} [batch, {len(self.names)}], the output "
-                f"{OUT} [batch, 1] and maybe {MEMORY} [batch, n] in both, in single precision; got "
-                f"{names[0]} of {list(shapes.values())}, {names[1]}"
+                f"{self.path}: expected the input {STATE} [batch, {len(self.names)}], maybe "
+                f"{MEMORY} [batch, n], and the outputs {' and '.join(MAKES[:count])}, in single "
+                f"precision; got {names[0]} of {list(shapes.values())}, {names[1]}"
             )
         return int(memory[1])
 
@@ -127,7 +128,7 @@ class Program:
         Args:
             *given: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
         """
-        named = zip((STATE, MEMORY), given, strict=False)
+        named = zip(TAKES, given, strict=False)
         feed = {name: value.detach().cpu().float().numpy() for name, value in named}
         try:
             found = self.session.run(None, feed)

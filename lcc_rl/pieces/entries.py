@@ -53,7 +53,6 @@ ENTRIES: dict[Key, tuple[str, str]] = {
     (ROLE, "covariance"): ("–, s, s²", "its covariance (C_qq, C_qT, C_TT)"),
     (ROLE, "speed_history"): ("m/s", "own speeds of the last steps, latest first"),
     (ROLE, "commanded_speed"): ("m/s", "speed that PI with saturation commanded last"),
-    (ROLE, "program"): ("–", "what an ONNX program remembers"),
     (ROLE, "unsolved"): ("–", "1 where the plan of MPC had no solution, and it brakes"),
     ("command", ROLE): ("m/s²", "acceleration that the role's controller commands"),
     ("obeyed", ROLE): ("m/s²", "acceleration that engine and brakes make of the command"),

@@ -9,8 +9,10 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from lcc_rl.errors import require
 from lcc_rl.results import headline
 from lcc_rl.results.headline import Shown, in_words, saved
+from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import DRIVE
 from lcc_rl.results.scores import HEADINGS, LEAST, PER_DISTANCE, Task
 
@@ -101,6 +103,68 @@ def _cells(row: Row) -> dict[str, str]:
         "drives": str(row["drives"]),
         "kept": "yes" if row["kept"] else broken(row),
     }
+
+
+def as_markdown(documents: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table for each task: who was scored, and what was saved on each source.
+
+    Args:
+        documents: contents of the files of ``lcc-rl score``.
+
+    Raises:
+        ConfigError: if two rows of one task and source are not comparable.
+    """
+    check_alike(documents)
+    every = [{**row, "who": one["name"]} for one in documents for row in one["results"]]
+    parts = []
+    for task in dict.fromkeys(row["task"] for row in every):
+        rows = [row for row in every if row["task"] == task]
+        sources = list(dict.fromkeys(row["source"] for row in rows))
+        head = [
+            "",
+            *(f"{x}, {next(_sample(r) for r in rows if r['source'] == x)}" for x in sources),
+        ]
+        lines = [head, ["---"] * len(head)]
+        for who in dict.fromkeys(row["who"] for row in rows):
+            own = {row["source"]: row for row in rows if row["who"] == who}
+            cells = (_markdown_cell(own[x]) if x in own else "" for x in sources)
+            lines.append([f"`{who}`", *cells])
+        text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        parts.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
+    return "\n".join(parts)
+
+
+def check_alike(documents: Sequence[Mapping[str, Any]]) -> None:
+    """Check that all rows of a task and source were measured on the same data and settings.
+
+    Raises:
+        ConfigError: naming the document, the row, and what differs.
+    """
+    first: dict[tuple[str, str], Row] = {}
+    for document in documents:
+        for row in document["results"]:
+            place = (row["task"], row["source"])
+            known = first.setdefault(place, row)
+            for key in ("data", "settings"):
+                require(
+                    row[key] == known[key],
+                    f"{document['name']}: {place[0]} behind {place[1]} was measured with other "
+                    f"{key} ({row[key][:8]}, not {known[key][:8]})",
+                )
+
+
+def _sample(row: Row) -> str:
+    return (
+        f"{row['drives']} drives" if row["drives"] >= LEAST_DRIVES else f"{row['windows']} windows"
+    )
+
+
+def _markdown_cell(row: Row) -> str:
+    """Return saving, flow, and either that all limits are kept, in bold, or which is not."""
+    cells = _cells(row)
+    share = f"{cells['saved']} %" if cells["saved"] != headline.MISSING else "baseline"
+    share = f"**{share}**" if row["kept"] else f"{share}, not kept: {cells['kept']}"
+    return f"{share}; {cells['flow']}/h"
 
 
 def broken(row: Row) -> str:
