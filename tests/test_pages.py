@@ -59,6 +59,8 @@ ENOUGH = {
     '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
+    "batch_size=64,": "batch_size=4,",
+    "frames_per_batch=19200, total_frames=192000": "frames_per_batch=80, total_frames=160",
     "rollout(6000": "rollout(20",
     "rollout(300": "rollout(20",
     "(0, 2999, 5999)": "(0, 9, 19)",

@@ -41,7 +41,7 @@ from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, requir
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy
 from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, baseline, trained
-from lcc_rl.functional.pattern import RING
+from lcc_rl.functional.pattern import HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.board import as_rich, row_of
@@ -130,7 +130,8 @@ def roads(
     if own.leader is not None and "held_out" in own.leader:
         return {" ".join(own.leader["held_out"]): own}
     # Drivers that a task fixes are part of it; a population is that of the source.
-    left = ("drivers",) if own.drivers[TARGET] == FIXED else ()
+    people = HUMAN in own.scenario.vehicles.names and own.drivers[TARGET] != FIXED
+    left = () if people else ("drivers",)
     return {
         name: load("evaluate", [*words, *(word for word in of if root_key(word) not in left)])
         for name, of in given.items()

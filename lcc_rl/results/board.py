@@ -20,7 +20,7 @@ Row = Mapping[str, Any]
 COLUMNS = (
     Shown("where", "task, leaders"),
     Shown("score", "score"),
-    Shown("saved", "saved\n[%]"),
+    Shown("saved", "saved [%]\nagainst"),
     Shown("distance", "dis-\ntance\n[%]"),
     Shown("flow", "flow\n[1/h]"),
     Shown("ratio", "string\nratio"),
@@ -75,7 +75,7 @@ def as_rich(who: str, rows: Sequence[Row]) -> Table:
     for row in rows:
         if not lines or row["task"] not in (line["where"] for line in lines):
             lines.append(dict.fromkeys((column.key for column in COLUMNS), ""))
-            against = f"against {in_words(row['against'])}"
+            against = in_words(row["against"])
             lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
