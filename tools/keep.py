@@ -22,7 +22,7 @@ from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.means import TRAINED, Means
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.results.savings import SOURCE
+from lcc_rl.results.savings import DRIVE, SOURCE
 from lcc_rl.studies.alcc.report import CURVES, MAIN
 from lcc_rl.studies.alcc.study import DRIVERS
 from lcc_rl.studies.hcfs.study import TRAINING
@@ -57,7 +57,7 @@ def sources(evaluations: Sequence[Path], path: Path) -> None:
     # Rules and DDPG drove beside every choice.
     rows = rows.drop_duplicates([SOURCE, *RUN, "follower"])
     parts = [per_run(part).assign(source=name) for name, part in rows.groupby(SOURCE, sort=False)]
-    write_parquet(rounded(pd.concat(parts)[[SOURCE, *RUN, *MEASURES]]), path)
+    write_parquet(rounded(pd.concat(parts)[[SOURCE, *RUN, DRIVE, *MEASURES]]), path)
 
 
 def means(evaluations: Sequence[Path], target: Path) -> None:

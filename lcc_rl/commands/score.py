@@ -2,7 +2,7 @@
 
     lcc-rl score policy.onnx                    # or a run folder, pretrained/<name>, idm_acc …
     lcc-rl score outputs/train/<run> --task i24-follow5 --on everyday
-    lcc-rl score idm --source i24 'leader=i24 leader.path=i24_leaders.parquet'
+    lcc-rl score idm --source i24 leader=i24 leader.path=i24_leaders.parquet
 
 Prints one table and writes score.json: scores, intervals over drives, limits, and what they were
 measured on: hashes of the windows that leaders drove, of all settings and of the policy's file, and
@@ -17,7 +17,6 @@ import json
 import logging
 import platform
 import re
-import shlex
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -219,9 +218,9 @@ def leaving_out(what: str, left_out: list[str]) -> Iterator[None]:
         left_out.append(f"{what}: {error}")
 
 
-def _source(pair: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """Return name and settings of a source that the command line names."""
-    name, words = pair[0], shlex.split(pair[1])
+    name, *words = given
     require(
         re.fullmatch(r"\w[\w-]*", name) is not None and name not in SOURCES,
         f"--source {name}: expected a new name of letters, digits, - and _",
@@ -229,7 +228,8 @@ def _source(pair: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     for word in words:
         require(
             "=" in word and root_key(word) in OF_A_SOURCE,
-            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}",
+            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; others "
+            "stand before it",
         )
     people = () if any(root_key(word) == "drivers" for word in words) else ("drivers=highway",)
     return name, (*people, *words)
@@ -243,11 +243,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--on", action="append", default=[], help="only this source")
     parser.add_argument(
         "--source",
-        nargs=2,
+        nargs="+",
         action="append",
         default=[],
-        metavar=("NAME", "SETTINGS"),
-        help="a further source of leaders, such as i24 'leader=i24 leader.path=…'",
+        metavar=("NAME", "SETTING"),
+        help="a further source of leaders, such as i24 leader=i24 leader.path=…",
     )
     parser.add_argument("--out", type=Path, help="folder, by default below outputs/score")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")

@@ -48,8 +48,8 @@ def test_an_exported_policy_scores_as_the_policy_itself(tmp_path, capsys) -> Non
 
 def test_a_controller_is_played_where_it_fits_and_the_rest_is_named(tmp_path, capsys) -> None:
     tasks = ("--task", "i80-follow", "--task", "platoon-highway")
-    source = ("--source", "mine", "leader=everyday leader.evaluation_share=0.6")
-    found = scores(tmp_path / "a", "deadbeat", *tasks, "--on", "everyday", *source, *SMALL)
+    source = ("--source", "mine", "leader=everyday", "leader.evaluation_share=0.6")
+    found = scores(tmp_path / "a", "deadbeat", *tasks, "--on", "everyday", *SMALL, *source)
     places = [(row["task"], row["source"]) for row in found["results"]]
     assert places == [("platoon-highway", "everyday"), ("platoon-highway", "mine")]
     one, other = found["results"]
