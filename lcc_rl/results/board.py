@@ -24,7 +24,7 @@ COLUMNS = (
     Shown("distance", "dis-\ntance\n[%]"),
     Shown("flow", "flow\n[1/h]"),
     Shown("ratio", "string\nratio"),
-    Shown("drives", "drives"),
+    Shown("drives", "dri-\nves"),
     Shown("kept", "limits\nkept"),
 )
 SHARE = ("saving", "saving_low", "saving_high")
