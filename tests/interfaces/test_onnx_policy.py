@@ -19,7 +19,9 @@ from lcc_rl.errors import LccError
 from lcc_rl.evaluation.named import controller_of, is_policy
 from lcc_rl.evaluation.strategies import driven_by
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.interfaces.driver import Driver, Measured, entries
 from lcc_rl.interfaces.onnx_policy import OnnxPolicy
+from lcc_rl.pieces.base import SEED, STEP
 
 onnx = pytest.importorskip("onnx", reason="extra interfaces")
 pytest.importorskip("onnxruntime", reason="extra interfaces")
@@ -88,6 +90,13 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
     kept = data["next", "automated", "program"]
     torch.testing.assert_close(kept, data["vehicles", "gap"][:, :, :1].cumsum(1))
     torch.testing.assert_close(data["next", "command", "automated"], gaps)
+    # Alike where another simulator measures, such as SUMO.
+    driver, measured = Driver(path, 0.1), entries([Measured(*[1.0] * 9)] * 2)
+    measured |= {key: torch.zeros(2, 1, dtype=torch.int64) for key in (SEED, STEP)}
+    kept = driver.begin(measured)
+    for step in range(1, 4):
+        command, kept = driver(measured, kept)
+        assert command.tolist() == [float(step)] * 2
 
 
 FOREIGN = [
