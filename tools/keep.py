@@ -65,7 +65,7 @@ def sources(evaluations: Sequence[Path], path: Path) -> None:
     # Rules and DDPG drove beside every choice.
     rows = rows.drop_duplicates([SOURCE, *RUN, "follower"])
     parts = [per_run(part).assign(source=name) for name, part in rows.groupby(SOURCE, sort=False)]
-    write_parquet(rounded(pd.concat(parts)[[SOURCE, *RUN, *MEASURES]]), path)
+    write_parquet(rounded(pd.concat(parts)[[SOURCE, *RUN, DRIVE, *MEASURES]]), path)
 
 
 def classes(evaluations: Sequence[Path], path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Write the tables of tasks: python tools/leaderboard.py outputs/evaluate/<run>… (docs/tasks.md).
+"""Write the tables of tasks: python tools/leaderboard.py outputs/evaluate/<run>… (docs/tasks.md),
+and that of the files of lcc-rl score that are kept in outputs/reference/scores (leaderboard.md).
 
 Each run is an evaluation with task=…. Its scores, and the time that each strategy takes for a
 decision, measured here for one vehicle, are kept below --reference. Without runs the tables are
@@ -8,6 +9,7 @@ written again from the kept scores.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -31,6 +33,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces import Controller
+from lcc_rl.results.board import as_markdown
 from lcc_rl.results.runs import load_config
 from lcc_rl.results.scores import LEAST, SHARE, Task, scores
 
@@ -38,6 +41,7 @@ BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
 DECISIONS, WARM_UP = 200, 20
 LIMIT = "limit_"
 REFERENCE, PAGE = Path("outputs/reference/tasks"), Path("docs/tasks.md")
+SCORES, BOARD = Path("outputs/reference/scores"), Path("docs/leaderboard.md")
 
 
 def decision_ms(strategy: Strategy, env: TransformedEnv) -> float:
@@ -140,6 +144,17 @@ def write_tables(reference: Path, page: Path) -> None:
         given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
         task = Task(name=path.stem, limits=limits, **given)
         parts.append(f"### {path.stem}\n\n{first['windows']} windows.\n\n{drawn(task, table)}\n")
+    _write_between(page, parts)
+
+
+def write_board(scores: Path, page: Path) -> None:
+    """Write the table of all files of ``lcc-rl score`` in a folder into the page."""
+    documents = [json.loads(path.read_text()) for path in sorted(scores.glob("*.json"))]
+    _write_between(page, [as_markdown(documents)])
+
+
+def _write_between(page: Path, parts: Sequence[str]) -> None:
+    """Replace what stands between the marks of a page."""
     text = page.read_text()
     require(BEGIN in text and END in text, f"{page}: it lacks the lines {BEGIN} and {END}")
     before, after = text.partition(BEGIN)[0], text.partition(END)[2]
@@ -160,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name, table = scored(folder)
         write_parquet(table, options.reference / f"{options.name or name}.parquet")
     write_tables(options.reference, options.page)
+    write_board(SCORES, BOARD)
     return 0
 
 

@@ -21,6 +21,7 @@ HYDRA = {
 }
 TOOLS = {
     "status": ("lcc_rl.cli.status", "what runs are running, waiting, finished, failed"),
+    "score": ("lcc_rl.commands.score", "any policy on every task and source that it fits"),
     "animate": ("lcc_rl.commands.animate", "episodes as a moving picture: page, SVG, GIF, MP4"),
     "maps": ("lcc_rl.commands.maps", "what policies do over gap and relative speed"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study, to one page"),

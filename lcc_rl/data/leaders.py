@@ -298,9 +298,12 @@ class DriveLeaders(Settings):
         held = place < share
         if held.all() or not held.any():
             side = "evaluation" if held.any() else "training"
+            trips = len({self._family(name) for name in profiles.recordings})
             raise DataError(
-                f"{self.path}: the names of all {len(held)} drives fall on the side of {side}; "
-                "change leader.evaluation_share (1: all for evaluation) or give more drives"
+                f"{self.path}: the names of all {len(held)} drives ({trips} apart by "
+                f"leader.together={self.together}) fall on the side of {side}; change "
+                "leader.evaluation_share (1: all for evaluation) or give more drives; "
+                "leader.together=null divides parts of one trip, too"
             )
         return profiles.select(np.flatnonzero(~held)), profiles.select(np.flatnonzero(held))
 

@@ -18,7 +18,7 @@ from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
-from lcc_rl.results.savings import SOURCE
+from lcc_rl.results.savings import DRIVE, SOURCE
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")
@@ -46,6 +46,7 @@ def evaluate(
             "training_seed": pd.array([strategy.seed] * len(frame), dtype="Int64"),
             "case": case.name,
             "profile": [case.profile.names[i] for i in frame["run_id"]],
+            DRIVE: [case.profile.recordings[i] for i in frame["run_id"]],
             "followers": int(frame["follower"].max()),
         }
         frame = pd.concat([pd.DataFrame(labels), frame], axis=1)

@@ -41,8 +41,16 @@ PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers dr
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 YAML = (".yaml", ".yml")
+ONNX, ONNX_POLICY = ".onnx", "lcc_rl.interfaces.onnx_policy.OnnxPolicy"
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
-OTHERS = ("<module.Class>", "<controller.yaml>", PRETRAINED, "<run folder>", "<policy.pt>")
+OTHERS = (
+    "<module.Class>",
+    "<controller.yaml>",
+    "<program.onnx>",
+    PRETRAINED,
+    "<run folder>",
+    "<policy.pt>",
+)
 
 
 def rules() -> tuple[str, ...]:
@@ -53,7 +61,7 @@ def rules() -> tuple[str, ...]:
 
 def is_policy(who: Any) -> bool:
     """Whether a name is that of a trained policy's file or folder."""
-    if not isinstance(who, str) or who.endswith(YAML):
+    if not isinstance(who, str) or who.endswith((*YAML, ONNX)):
         return False
     path = Path(who)
     return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"
@@ -65,7 +73,7 @@ def controller_of(who: Any, behind: bool = False) -> Any:
     Args:
         who: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
             dotted path of a class or of a function of named entries; a yaml file that holds a
-            node; or a node.
+            node; an ONNX program (:mod:`lcc_rl.interfaces.onnx_policy`); or a node.
         behind: whether it drives behind the safety filter, for which tuned ones have constants of
             their own.
 
@@ -90,6 +98,8 @@ def label_of(who: Any) -> str:
         return short_name(who.get("law") or who.get(TARGET))
     if who in rules() or who in choices("variant"):
         return str(who)
+    if who.endswith(ONNX):
+        return Path(who).name
     return Path(who).stem if who.endswith(YAML) else short_name(who)
 
 
@@ -130,6 +140,8 @@ def _loaded(words: tuple[str, ...], _hydra: int) -> Any:
 def _node(who: Any) -> Any:
     if isinstance(who, Mapping):
         return who
+    if who.endswith(ONNX):
+        return {TARGET: ONNX_POLICY, "path": who}
     if who.endswith(YAML):
         return parse_yaml(read_text(Path(who)), who)
     if DOTTED.fullmatch(who) is None:

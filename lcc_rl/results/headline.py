@@ -187,10 +187,10 @@ def _cells(table: pd.DataFrame, name: str) -> list[str]:
     if f"{name}_low" not in table:
         return column_cells(table, name)
     bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
-    return [_saved(*row) for row in bounds]
+    return [saved(*row) for row in bounds]
 
 
-def _saved(share: float, low: float, high: float) -> str:
+def saved(share: float, low: float, high: float) -> str:
     if pd.isna(share):
         return MISSING
     within = "" if pd.isna(low) else f" ({low:.1f} … {high:.1f})"

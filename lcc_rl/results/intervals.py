@@ -39,12 +39,12 @@ def mean(values: ArrayLike) -> Estimate:
     return Estimate(_mean(numbers), float(low), float(high))
 
 
-def crossed(values: ArrayLike) -> Estimate:
+def crossed(values: ArrayLike, drives: Sequence[object] | None = None) -> Estimate:
     """Return the mean of ``[windows, seeds]`` with its interval, resampled as in :func:`saving`."""
     table = np.asarray(values, dtype=np.float64)
     if max(table.shape) < 2:
         return Estimate(_mean(table))
-    return Estimate(_mean(table), *bounds(_means(table, 1)))
+    return Estimate(_mean(table), *bounds(_means(table, 1, drives)))
 
 
 def share_saved(value: Any, baseline: Any) -> Any:
@@ -83,8 +83,7 @@ def saving(
     value = share_saved(_mean(own), _mean(other))
     if max(*own.shape, *other.shape) < 2:
         return Estimate(value)
-    known = drives if drives is not None and len(set(drives)) >= LEAST_DRIVES else None
-    means = _means(own, 1, known), _means(other, 1 if paired else 2, known)
+    means = _means(own, 1, drives), _means(other, 1 if paired else 2, drives)
     return Estimate(value, *bounds(share_saved(*means)))
 
 
@@ -93,7 +92,7 @@ def _means(
 ) -> NDArray[np.float64]:
     """Return the resampled means of ``[windows, seeds]``; a stream draws its own seeds."""
     drawn = weights(len(table), 0)
-    if drives is not None:
+    if drives is not None and len(set(drives)) >= LEAST_DRIVES:
         names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
         drawn = weights(len(names), 0)[:, [names[name] for name in drives]]
         drawn = drawn / drawn.sum(1, keepdims=True)

@@ -86,6 +86,21 @@ def pretrained_path(variant: str) -> Path:
     return path
 
 
+def policy_file(path: str | Path, variant: str = "") -> Path:
+    """Return the file that :func:`load_policy` reads; arguments as there.
+
+    Raises:
+        ConfigError: if no policy ships for the variant.
+    """
+    path = Path(path)
+    first = path.parts[0] if path.parts else ""
+    if first != PRETRAINED and not path.exists() and get_close_matches(first, [PRETRAINED]):
+        raise ConfigError(f"policy={path}: no such file; did you mean {PRETRAINED!r}?")
+    if first == PRETRAINED and not path.exists():
+        path = pretrained_path(path.name if len(path.parts) > 1 else variant)
+    return path / "policy.pt" if path.is_dir() else path
+
+
 def load_policy(
     path: str | Path, variant: str = "", trust: Sequence[str] = ()
 ) -> tuple[dict[str, Any], StudyConfig]:
@@ -104,14 +119,7 @@ def load_policy(
         ConfigError: if no policy ships for the variant.
         ResultsError: if it is missing, damaged or no policy.
     """
-    path = Path(path)
-    first = path.parts[0] if path.parts else ""
-    if first != PRETRAINED and not path.exists() and get_close_matches(first, [PRETRAINED]):
-        raise ConfigError(f"policy={path}: no such file; did you mean {PRETRAINED!r}?")
-    if first == PRETRAINED and not path.exists():
-        path = pretrained_path(path.name if len(path.parts) > 1 else variant)
-    if path.is_dir():
-        path = path / "policy.pt"
+    path = policy_file(path, variant)
     content = read_checked(path, PolicyFile, "policy")
     cfg, _ = trusted(parse_yaml(content.config, f"{path} (config)"), str(path), trust)
     if not isinstance(cfg, StudyConfig) or cfg.agent is None:

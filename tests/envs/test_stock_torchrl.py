@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
-from helpers import ACTION, OBSERVATION, REWARD, single_env, small_env, string
+from commands import DATA
+from helpers import single_env
+from pages import ROOT, blocks
 from tensordict.nn import InteractionType, TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import RewardSum
 from torchrl.modules import (
     Actor,
     AdditiveGaussianModule,
-    MultiAgentMLP,
     NormalParamExtractor,
     ProbabilisticActor,
     TanhNormal,
@@ -23,7 +25,6 @@ from torchrl.objectives import ClipPPOLoss, DDPGLoss, SoftUpdate, ValueEstimator
 from torchrl.objectives.value import GAE
 
 FRAMES, ITERATIONS = 80, 3
-AGENTS = string("automated human automated human automated human automated human")
 
 
 @pytest.fixture(autouse=True)
@@ -120,69 +121,20 @@ def test_single_agent_ppo() -> None:
     assert not torch.equal(vector(actor), before)
 
 
-def test_multi_agent_ppo() -> None:
-    """As TorchRL's multi-agent tutorial: one policy and one critic for the group."""
-    env = small_env("alcc", 4, [AGENTS])
-    env = env.append_transform(RewardSum([REWARD], [("automated", "episode_reward")]))
-    assert env.group_map == {"automated": [f"automated_{i}" for i in range(4)]}
-    size = env.observation_spec[OBSERVATION].shape[-1]
-
-    def shared(outputs: int, centralised: bool) -> MultiAgentMLP:
-        return MultiAgentMLP(
-            n_agent_inputs=size,
-            n_agent_outputs=outputs,
-            n_agents=4,
-            centralised=centralised,
-            share_params=True,
-            depth=1,
-            num_cells=32,
-        )
-
-    network = TensorDictModule(
-        nn.Sequential(shared(2, False), NormalParamExtractor()),
-        [OBSERVATION],
-        [("automated", "loc"), ("automated", "scale")],
-    )
-    log_prob = ("automated", "action_log_prob")
-    policy = ProbabilisticActor(
-        network,
-        spec=env.full_action_spec_unbatched,
-        in_keys=[("automated", "loc"), ("automated", "scale")],
-        out_keys=[ACTION],
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": -1.0, "high": 1.0},
-        return_log_prob=True,
-        log_prob_key=log_prob,
-    )
-    critic = TensorDictModule(shared(1, True), [OBSERVATION], [("automated", "state_value")])
-    loss = ClipPPOLoss(policy, critic, entropy_coeff=1e-4, normalize_advantage=False)
-    loss.set_keys(
-        reward=REWARD,
-        action=ACTION,
-        sample_log_prob=log_prob,
-        value=("automated", "state_value"),
-        done=("automated", "done"),
-        terminated=("automated", "terminated"),
-    )
-    loss.make_value_estimator(ValueEstimators.GAE, gamma=0.9, lmbda=0.9)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-    before, losses = vector(policy), []
-    collector = Collector(env, policy, frames_per_batch=FRAMES, total_frames=ITERATIONS * FRAMES)
-    for data in collector:
-        # Done is that of the string; the losses want one for each agent.
-        shape = data["next", *REWARD].shape
-        for name in ("done", "terminated"):
-            own = data["next", name].unsqueeze(-2).expand(shape)
-            data.set(("next", "automated", name), own)
-        with torch.no_grad():
-            loss.value_estimator(
-                data,
-                params=loss.critic_network_params,
-                target_params=loss.target_critic_network_params,
-            )
-        assert data["advantage"].shape == shape
-        losses += [step(loss, data.reshape(-1), optimizer) for _ in range(2)]
-    collector.shutdown()
-    assert torch.tensor(losses).isfinite().all()
-    assert not torch.equal(vector(policy), before)
-    assert shape == (4, FRAMES // 4, 4, 1)
+@pytest.mark.parametrize("centralised", [True, False], ids=["mappo", "ippo"])
+def test_the_example_of_the_page_teaches_several_vehicles(centralised) -> None:
+    page = blocks(ROOT / "docs" / "interfaces.md")
+    (text,) = (block.text for block in page if "MultiAgentMLP" in block.text)
+    small = {"centralised = True": f"centralised = {centralised}", "batch_size=64": "batch_size=4"}
+    small |= {"19200": str(FRAMES), "192000": str(ITERATIONS * FRAMES), "[mixed]": "[mixed, *DATA]"}
+    for much, little in small.items():
+        assert much in text
+        text = re.sub(rf"{re.escape(much)}\b" if much.isdigit() else re.escape(much), little, text)
+    space = {"DATA": DATA}
+    exec(text, space)
+    assert space["env"].group_map == {"automated": ["automated_0", "automated_1"]}
+    assert len(space["rewards"]) == ITERATIONS
+    assert torch.tensor(space["rewards"]).isfinite().all()
+    for state in space["optimizer"].state.values():  # of every weight of both networks
+        assert torch.isfinite(state["exp_avg"]).all()
+        assert state["exp_avg"].abs().sum() > 0.0

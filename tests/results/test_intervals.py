@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from lcc_rl.results.fronts import ENERGY, SHARE, energy_at, points, saving_at
-from lcc_rl.results.intervals import mean, saving, share_saved
+from lcc_rl.results.intervals import crossed, mean, saving, share_saved
 from lcc_rl.results.savings import per_window, savings
 
 NETWORK, RULE = ("alcc", "network"), ("alcc", "idm")
@@ -123,6 +123,10 @@ def test_windows_of_one_drive_are_resampled_together() -> None:
     assert whole.value == alone.value
     assert whole.high - whole.low > 2.0 * (alone.high - alone.low)
     assert saving(own, traffic[:, None], drives=["a"] * 40 + ["b"] * 40) == alone  # too few to tell
+    # With ten windows alike in every drive, drives are all that there is.
+    alike = np.repeat(generator.normal(0.0, 1.0, (8, 2)), 10, axis=0)
+    found, each = crossed(alike, drives=drives), crossed(alike[::10])
+    assert (found.low, found.high) == pytest.approx((each.low, each.high))
     shuffled = generator.permutation(80)
     again = saving(own[shuffled], traffic[shuffled][:, None], drives=[drives[i] for i in shuffled])
     assert again.high - again.low == pytest.approx(whole.high - whole.low, rel=0.1)

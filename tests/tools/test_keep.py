@@ -46,7 +46,7 @@ def test_runs_behind_other_leaders_are_named_by_the_choice(tmp_path) -> None:
         rows = pd.DataFrame({"strategy": strategies, "reward": [-8.0, -6.0, reward, -1.0]})
         rows["training_seed"] = pd.Series([None, 0, 0, 0], dtype="Int64")
         rows = rows.assign(**dict.fromkeys([*SUMS[:4], *SUMS[5:], *LARGEST], 0.5), case="windows")
-        rows = rows.assign(profile="a", run_id=0, min_gap_m=4.0, learned_share=0.0)
+        rows = rows.assign(profile="a", drive="a", run_id=0, min_gap_m=4.0, learned_share=0.0)
         rows = rows.assign(energy_kj_per_km=600.0 + rows["reward"])
         both = pd.concat([rows.assign(follower=1), rows.assign(follower=2, min_gap_m=3.0)])
         write_parquet(both.assign(source="cycles"), tmp_path / choice / "episodes.parquet")

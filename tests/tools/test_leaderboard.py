@@ -19,6 +19,12 @@ def test_the_page_holds_the_scores_kept(tmp_path) -> None:
     assert Path(page).read_text() == (ROOT / "docs" / "tasks.md").read_text()
 
 
+def test_the_page_holds_the_files_of_scores(tmp_path) -> None:
+    page = shutil.copy(ROOT / leaderboard.BOARD, tmp_path)
+    leaderboard.write_board(ROOT / leaderboard.SCORES, Path(page))
+    assert Path(page).read_text() == (ROOT / leaderboard.BOARD).read_text()
+
+
 def test_a_page_without_its_marks_is_named(tmp_path) -> None:
     page = tmp_path / "page.md"
     page.write_text("nothing\n")

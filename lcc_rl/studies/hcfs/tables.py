@@ -12,6 +12,7 @@ from lcc_rl.data.leaders import WHOLE
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import intervals
+from lcc_rl.results.savings import DRIVE
 from lcc_rl.results.string_tables import COUNTS, case_table
 
 LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
@@ -64,6 +65,7 @@ def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum the rows of the vehicles of each run; :func:`case_table` reads the result alike."""
     how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST, "max")}
     how |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
+    how |= {DRIVE: "first"} if DRIVE in episodes else {}
     return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(how)
 
 
@@ -91,11 +93,24 @@ def weights() -> pd.DataFrame:
 
 
 def per_seed(episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward") -> pd.DataFrame:
-    """Return a sum of every run, ``[runs × seeds]``; one column where nothing was learned."""
+    """Return a sum of every run, ``[runs × seeds]``; one column where nothing was learned.
+
+    The index names the run's window and its drive; of rows without drives each window is one.
+    """
     rows = episodes[(episodes["strategy"] == strategy) & (episodes["case"] == case)]
-    return rows.assign(training_seed=rows["training_seed"].fillna(-1)).pivot_table(
-        index="profile", columns="training_seed", values=of, aggfunc="sum"
+    seeds, drives = rows["training_seed"].fillna(-1), rows.get(DRIVE, rows["profile"])
+    return rows.assign(**{"training_seed": seeds, DRIVE: drives}).pivot_table(
+        index=["profile", DRIVE], columns="training_seed", values=of, aggfunc="sum", observed=True
     )
+
+
+def crossed(runs: pd.DataFrame) -> intervals.Estimate:
+    """Return the mean of a table of :func:`per_seed` with its interval over drives and seeds."""
+    return intervals.crossed(runs, drives=_drives(runs))
+
+
+def _drives(runs: pd.DataFrame) -> list[object]:
+    return runs.index.get_level_values(DRIVE).tolist()
 
 
 def win_rates(
@@ -109,7 +124,7 @@ def win_rates(
     Returns:
         One row per other strategy: share of windows [%] in which ``of`` earns more (a tie counts
         half), mean difference of Σ reward, and that difference as a share of the other's loss [%],
-        with 95 % intervals over windows and seeds. Trained strategies are compared seed by seed;
+        with 95 % intervals over drives and seeds. Trained strategies are compared seed by seed;
         ``seeds_ahead`` counts the seeds with a positive difference.
     """
     own = per_seed(episodes, of, case)
@@ -124,10 +139,11 @@ def win_rates(
         wins = (difference > 1e-6) + 0.5 * (difference.abs() <= 1e-6)
         row: dict[str, object] = {"strategy": of, "against": name}
         row |= {"trainings": len(shared), "windows": len(difference)}
-        row |= intervals.crossed(wins).columns("wins_pct", 100.0)
-        row |= intervals.crossed(difference).columns("reward_gain")
+        row |= crossed(wins).columns("wins_pct", 100.0)
+        row |= crossed(difference).columns("reward_gain")
         # Rewards are negative: the share of the loss that is saved.
-        gain = intervals.saving(-own[shared], -other[shared], paired=True)
+        both = -own[shared], -other[shared]
+        gain = intervals.saving(*both, paired=True, drives=_drives(own))
         row |= gain.columns("gain_pct", 100.0)
         rows.append(row | {"seeds_ahead": int((difference.mean() > 0).sum())})
     return pd.DataFrame(rows)
@@ -145,7 +161,7 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
             "strategy": NAMES[name],
             "Σ abs e_v_mps": table.at[name, "speed_error_sum_mps"],
             "Σ abs jerk_mps3": table.at[name, "jerk_sum_mps3"],
-            **intervals.crossed(per_seed(episodes, name, WINDOWS)).columns("Σ reward"),
+            **crossed(per_seed(episodes, name, WINDOWS)).columns("Σ reward"),
         }
         for name in strategies
     ]
@@ -199,8 +215,8 @@ def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
             {
                 "episodes of training": episodes,
                 "trainings": parent["trainings"],
-                **intervals.crossed(per_seed(group, LEARNED, WINDOWS)).columns("DDPG"),
-                **intervals.crossed(per_seed(group, "hcfs", WINDOWS)).columns("HCFS"),
+                **crossed(per_seed(group, LEARNED, WINDOWS)).columns("DDPG"),
+                **crossed(per_seed(group, "hcfs", WINDOWS)).columns("HCFS"),
                 **{new: parent[old] for old, new in GAINED.items() if old.startswith("gain")},
             }
         )
@@ -229,10 +245,10 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
         }
         for name, energy in spent.items():
             own = group[group["strategy"] == name]
-            saved = intervals.saving(energy, spent[strategies[0]])
+            saved = intervals.saving(energy, spent[strategies[0]], drives=_drives(energy))
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
             row: dict[str, object] = {"leaders": source, "strategy": NAMES[name]}
-            row |= intervals.crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
+            row |= crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
             row |= {"gap error_m": own["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
             rows.append(row | saved.columns("energy saved_pct", 100.0))

@@ -1,0 +1,261 @@
+"""Score a policy or controller on every task that it fits, behind the leaders of every source.
+
+    lcc-rl score policy.onnx                    # or a run folder, pretrained/<name>, idm_acc …
+    lcc-rl score outputs/train/<run> --task i24-follow5 --on everyday
+    lcc-rl score idm --source i24 leader=i24 leader.path=i24_leaders.parquet
+
+Prints one table and writes score.json: scores, intervals over drives, limits, and what they were
+measured on: hashes of the windows that leaders drove, of all settings and of the policy's file, and
+versions. The rows of all episodes stand beside it. Words that are no options are further settings
+of every task; they change the hash of the settings.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import platform
+import re
+from argparse import Namespace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from lcc_rl.commands.checks import check_evaluation, check_installed
+from lcc_rl.commands.evaluation import evaluate_and_write, task_of
+from lcc_rl.config import check_overrides, choices, identity, load, root_key
+from lcc_rl.config.nodes import TARGET
+from lcc_rl.config.schemas import EvaluateConfig
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.envs import build_env, load_inputs
+from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
+from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
+from lcc_rl.evaluation.episodes import any_leader
+from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy
+from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, baseline, trained
+from lcc_rl.functional.pattern import HUMAN, RING
+from lcc_rl.io.atomic import atomic_path, own_folder
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.board import as_rich, row_of
+from lcc_rl.results.headline import show
+from lcc_rl.results.policies import load_policy, policy_file
+from lcc_rl.results.runs import EPISODES, save_config
+from lcc_rl.results.scores import scores
+from lcc_rl.runs.arguments import Arguments
+from lcc_rl.runs.precision import prepare_torch
+
+log = logging.getLogger("lcc_rl")
+
+# Where leaders come from, and human drivers who keep up with them.
+SOURCES: dict[str, tuple[str, ...]] = {
+    "stream": ("data=stream", "drivers=i80"),
+    "highway": ("data=highway", "drivers=highway"),
+    "platoons": ("data=platoons", "drivers=highway"),
+    "everyday": ("leader=everyday", "drivers=highway"),
+}
+OF_A_SOURCE = ("data", "split", "leader", "drivers")
+GIVEN = (*OF_A_SOURCE, "task", "variant", "policy", "compare", "agent", "observation", "reward")
+FIXED = "lcc_rl.drivers.population.fixed"
+PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "onnxruntime")
+FILE = "score.json"
+
+
+class Scored(NamedTuple):
+    """Who is scored: the name in tables, what was given, and the policy where it is one."""
+
+    label: str
+    who: str
+    policy: TrainedPolicy | None
+
+    def strategy(self, cfg: EvaluateConfig) -> Strategy:
+        """Return it as a strategy of a task.
+
+        Raises:
+            LccError: if it does not fit the task's vehicles, observation or action.
+        """
+        population, scenario = build_drivers(cfg), cfg.scenario
+        if self.policy is not None:
+            found = replace(trained(cfg, self.who, self.policy, population), name=self.label)
+        else:
+            require(applies(cfg, self.label), "it has no vehicle to drive in this string")
+            found = baseline(cfg, self.label, self.who)
+        road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
+        build_env(any_leader(found.cfg), road, population, 1, nominal=True)
+        return found
+
+    def file(self) -> Path | None:
+        """Return the file that it was read from; None of a controller of the package."""
+        if self.policy is not None:
+            return policy_file(self.who)
+        return Path(self.who) if self.who.endswith((*YAML, ONNX)) else None
+
+
+def scored(who: str, trust: Sequence[str] = ()) -> Scored:
+    """Read a policy, or find a controller.
+
+    Raises:
+        LccError: if there is none, or it drives nobody.
+    """
+    require(who not in (DIRECT, RECORDED), f"{who} is no controller that could be scored")
+    if is_policy(who):
+        return Scored(who, who, load_policy(who, trust=trust))
+    controller_of(who)
+    # The name of a file never stands for a rule of that name.
+    return Scored(Path(who).name if who.endswith((*YAML, ONNX)) else who, who, None)
+
+
+def roads(
+    who: Scored, task: str, given: Mapping[str, Sequence[str]], further: Sequence[str]
+) -> dict[str, EvaluateConfig]:
+    """Return the configurations of a task by the source of its leaders.
+
+    A ring has no leader, and a task that names its own record no others.
+
+    Raises:
+        LccError: if a setting is wrong, or who is scored does not fit the task.
+    """
+    words = (f"task={task}", *further)
+    own: EvaluateConfig = load("evaluate", words)
+    who.strategy(own)
+    if own.scenario.road == RING:
+        return {"ring": own}
+    if own.leader is not None and "held_out" in own.leader:
+        return {" ".join(own.leader["held_out"]): own}
+    # Drivers that a task fixes are part of it; a population is that of the source.
+    people = HUMAN in own.scenario.vehicles.names and own.drivers[TARGET] != FIXED
+    left = () if people else ("drivers",)
+    return {
+        name: load("evaluate", [*words, *(word for word in of if root_key(word) not in left)])
+        for name, of in given.items()
+    }
+
+
+def play(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
+    """Play a task behind the leaders of a source; return its row.
+
+    Raises:
+        LccError: if it does not fit the task, or the source has no leaders for it.
+    """
+    prepare_torch(cfg)
+    task, strategy = task_of(cfg), who.strategy(cfg)
+    assert task is not None
+    check_installed(cfg)
+    inputs = load_inputs(cfg)
+    check_evaluation(cfg, inputs)
+    against = [] if task.against == strategy.name else [baseline(cfg, task.against)]
+    save_config(cfg, folder)
+    evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
+    rows = read_parquet(folder / EPISODES)
+    hashes = {"data": hash_of(inputs.evaluation), "settings": identity(cfg)}
+    return row_of(scores(rows, task, build_energy(cfg)), task, source, strategy.name, rows) | hashes
+
+
+def hash_of(windows: Profiles) -> str:
+    """Return the SHA-256 of what the leaders drive, in mm/s, window by window."""
+    digest = hashlib.sha256()
+    for index in range(len(windows)):
+        speeds = (1e3 * windows.record(index).double()).round().to("cpu").numpy().astype("<i4")
+        digest.update(len(speeds).to_bytes(8, "little") + speeds.tobytes())
+    return digest.hexdigest()
+
+
+def about(who: Scored) -> dict[str, Any]:
+    """Return who is scored, the hash of its file, and versions."""
+    file = who.file()
+    found: dict[str, str | None] = {}
+    for name in ("lcc_rl", *PACKAGES):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    digest = None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+    versions = {"python": platform.python_version(), **found}
+    return {"name": who.label, "sha256": digest, "versions": versions}
+
+
+def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
+    """Play all tasks that fit and write the scores; return them."""
+    who = scored(options.who, tuple(options.trust))
+    name = re.sub(r"\W+", "_", who.label)
+    default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}"
+    folder = own_folder(options.out or default, "--out", lambda names: False)
+    own = dict(map(_source, options.source))
+    given, wanted = {**SOURCES, **own}, {*options.on, *own} if options.on else None
+    found: list[dict[str, Any]] = []
+    left_out: list[str] = []
+    for task in options.task or choices("task"):
+        sources: dict[str, EvaluateConfig] = {}
+        with leaving_out(task, left_out):
+            sources = roads(who, task, given, further)
+        for source in [name for name in sources if name in (wanted or [name])]:
+            with leaving_out(f"{task}, {source}", left_out):
+                found.append(play(who, source, sources[source], folder / task / source))
+    why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"
+    require(bool(found), f"nothing could be played: {why}")
+    document = {**about(who), "results": found, "left_out": left_out}
+    with atomic_path(folder / FILE) as temporary:
+        temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    log.info("scores in %s", folder / FILE)
+    played = {row["source"] for row in found}
+    for name in own:
+        require(name in played, f"--source {name} could not be played: {'; '.join(left_out)}")
+    return document
+
+
+@contextmanager
+def leaving_out(what: str, left_out: list[str]) -> Iterator[None]:
+    """Note why a task or a source of it cannot be played, instead of ending the command."""
+    try:
+        yield
+    except (ConfigError, DataError, ResultsError, Diverged) as error:
+        left_out.append(f"{what}: {error}")
+
+
+def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+    """Return name and settings of a source that the command line names."""
+    name, *words = given
+    require(
+        re.fullmatch(r"\w[\w-]*", name) is not None and name not in SOURCES,
+        f"--source {name}: expected a new name of letters, digits, - and _",
+    )
+    for word in words:
+        require(
+            "=" in word and root_key(word) in OF_A_SOURCE,
+            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; others "
+            "stand before it",
+        )
+    people = () if any(root_key(word) == "drivers" for word in words) else ("drivers=highway",)
+    return name, (*people, *words)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Score and print the table."""
+    parser = Arguments(prog="lcc-rl score", description=__doc__)
+    parser.add_argument("who", help="program.onnx, run folder, policy or controller")
+    parser.add_argument("--task", action="append", help="only this task; repeat for several")
+    parser.add_argument("--on", action="append", default=[], help="only this source")
+    parser.add_argument(
+        "--source",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("NAME", "SETTING"),
+        help="a further source of leaders, such as i24 leader=i24 leader.path=…",
+    )
+    parser.add_argument("--out", type=Path, help="folder, by default below outputs/score")
+    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    options, further = parser.parse_known_args(arguments)
+    check_overrides(further, GIVEN, "each task has its own; --task and --source choose")
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    document = run(options, further)
+    show(as_rich(document["name"], document["results"]))
+    for line in document["left_out"]:
+        Console().print(f"left out: {line}", highlight=False, markup=False)
+    return 0

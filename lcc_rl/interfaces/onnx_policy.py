@@ -1,0 +1,196 @@
+"""A policy as an ONNX program that anybody can write: it runs in onnxruntime and nowhere else.
+
+A program has the input ``state``, ``[batch, inputs]``, and the output ``acceleration``,
+``[batch, 1]`` [m/s²], in single precision for any batch. Its metadata hold under ``lcc_rl`` a JSON
+text with the name and the unit of every input, in order (:data:`MEASURED`), and the output's unit::
+
+    {"inputs": [{"name": "self.gap", "unit": "m"}], "output": "acceleration [m/s²]"}
+
+A program that remembers has a further input ``memory`` and output ``next_memory``, ``[batch, n]``:
+zeros at first, then what it returned in the step before.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torchrl.data import Unbounded
+
+from lcc_rl.errors import ConfigError, ResultsError, how_to_install, require
+from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.entries import ENTRIES
+from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import Positive, Settings, given_as, parse
+
+ABOUT = "lcc_rl"  # key of the metadata
+STATE, MEMORY = TAKES = ("state", "memory")
+MAKES = ("acceleration", "next_memory")
+# What a program may read, and its unit: entries of a vehicle and of its neighbours.
+MEASURED = {
+    f"{view}.{entry}": unit
+    for view in (SELF, AHEAD, BEHIND)
+    for (space, entry), (unit, _) in ((key, ENTRIES[key]) for key in ENTRIES if len(key) == 2)
+    if space == VEHICLES
+} | {f"{BEHIND}.present": "–"}
+Short = Annotated[str, Field(max_length=100)]
+
+
+class ProgramInput(Settings):
+    """A column of a program's input."""
+
+    name: Short
+    unit: Short
+    meaning: str = ""
+
+    def __post_init__(self) -> None:
+        if self.name not in MEASURED:
+            raise ValueError(
+                f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
+                "a vehicle, such as ahead.speed; what a program remembers is its input memory"
+            )
+        if self.unit != MEASURED[self.name]:
+            raise ValueError(f"{self.name} is in {MEASURED[self.name]}, got {self.unit!r}")
+
+
+class ProgramFacts(Settings):
+    """What the metadata of a program say."""
+
+    inputs: Annotated[tuple[given_as(ProgramInput), ...], Field(strict=False, min_length=1)]  # type: ignore[valid-type]
+    output: Literal["acceleration [m/s²]"]
+
+
+class Program:
+    """An ONNX program in onnxruntime, on the processor.
+
+    Args:
+        path: its file, which must hold its weights itself.
+
+    Attributes:
+        names: what it reads, in order.
+        memory: how many numbers it remembers.
+
+    Raises:
+        ConfigError: if onnxruntime is not installed.
+        ResultsError: if the file cannot be read or is no program as described above.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        try:
+            import onnxruntime as ort
+        except ImportError as error:
+            raise ConfigError(
+                f"{path} needs onnxruntime: {how_to_install('interfaces')}"
+            ) from error
+        options = ort.SessionOptions()
+        options.intra_op_num_threads, options.log_severity_level = torch.get_num_threads(), 4
+        try:
+            # From memory: a program can then name no other files for its weights.
+            content = Path(path).read_bytes()
+            self.session = ort.InferenceSession(content, options, ["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's errors have no common class
+            raise ResultsError(f"{path}: {_line(error)}") from error
+        given = self.session.get_modelmeta().custom_metadata_map.get(ABOUT, "{}")
+        self.names = tuple(one.name for one in _facts(given, path).inputs)
+        self.memory = self._check_shapes()
+
+    def __reduce__(self) -> Any:
+        return Program, (self.path,)  # onnxruntime's own object cannot be copied
+
+    def _check_shapes(self) -> int:
+        """Check names, types and widths of inputs and outputs; return the width of the memory."""
+        takes, makes = self.session.get_inputs(), self.session.get_outputs()
+        names = [[one.name for one in side] for side in (takes, makes)]
+        count = 1 + (MEMORY in names[0])
+        wanted = [list(TAKES[:count]), list(MAKES[:count])]
+        shapes = {one.name: one.shape for one in takes}
+        state, memory = shapes.get(STATE, []), shapes.get(MEMORY, ["batch", 0])
+        right = names == wanted and len(memory) == 2 and isinstance(memory[1], int)
+        right = right and len(state) == 2 and state[1] == len(self.names)
+        if not right or any(one.type != "tensor(float)" for one in (*takes, *makes)):
+            raise ResultsError(
+                f"{self.path}: expected the input {STATE} [batch, {len(self.names)}], maybe "
+                f"{MEMORY} [batch, n], and the outputs {' and '.join(MAKES[:count])}, in single "
+                f"precision; got {names[0]} of {list(shapes.values())}, {names[1]}"
+            )
+        return int(memory[1])
+
+    def __call__(self, *given: Tensor) -> list[Tensor]:
+        """Return the accelerations, ``[batch, 1]``, and the memory if there is one.
+
+        Args:
+            *given: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
+        """
+        named = zip(TAKES, given, strict=False)
+        feed = {name: value.detach().cpu().float().numpy() for name, value in named}
+        try:
+            found = self.session.run(None, feed)
+        except Exception as error:
+            raise ResultsError(f"{self.path}: {_line(error)}") from error
+        widths = [1, self.memory][: len(found)]
+        for value, width in zip(found, widths, strict=True):
+            require(
+                value.shape == (len(given[0]), width),
+                f"{self.path}: it returned {list(value.shape)}, expected [batch, {width}]",
+            )
+        return [torch.as_tensor(value).to(given[0]) for value in found]
+
+
+def _facts(text: str, path: str) -> ProgramFacts:
+    """Read the metadata of a program."""
+    try:
+        about = json.loads(text)
+    except ValueError as error:
+        raise ResultsError(f"{path}: its metadata {ABOUT} are no JSON: {_line(error)}") from error
+    require(isinstance(about, dict), f"{path}: its metadata {ABOUT} must be a JSON object")
+    own = {key: about[key] for key in ("inputs", "output") if key in about}
+    return parse(ProgramFacts, own, f"{path}, metadata {ABOUT}")
+
+
+def _line(error: Exception) -> str:
+    """Return an error of somebody else as one line that is not too long."""
+    return " ".join(str(error).split())[:300]
+
+
+class OnnxPolicy(Controller):
+    """Commands what an ONNX program computes from what its metadata name; see the module.
+
+    A program that remembers keeps its memory in ``(role, "program")``, ``[*batch, n, width]``. It
+    passes no gradient.
+    """
+
+    path: str  # the program's file
+    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+
+    def settled(self) -> None:
+        """Read the program, so that a wrong one is refused before anything starts."""
+        super().settled()
+        self.program = Program(self.path)
+
+    def setup(self, world: World) -> None:
+        """Read what the program reads, and its memory."""
+        kept = [(self.name, "program")] if self.program.memory else []
+        self.drive(world, [*self.program.names, *map(".".join, kept)], kept)
+
+    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
+        specs = super().written_specs(batch, device)
+        if self.program.memory:
+            shape = (*batch, self.event_shape[0], self.program.memory)
+            specs[self.role, "program"] = Unbounded(shape=shape, device=device)
+        return specs
+
+    @torch.compiler.disable
+    def command(self, *entries: Tensor) -> tuple[Tensor, ...]:
+        """Return the commands, and the memory where there is one."""
+        count, rows = len(self.program.names), entries[0].shape[:-1]
+        given = [torch.cat(entries[:count], -1), *entries[count:]]
+        wanted, *memory = self.program(*(value.reshape(rows.numel(), -1) for value in given))
+        wanted = wanted.clamp(-self.max_acceleration, self.max_acceleration)
+        return tuple(value.view(*rows, -1) for value in (wanted, *memory))

@@ -1,0 +1,178 @@
+"""Rows of ``lcc-rl score``: one for each task and source of leaders, and tables of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.table import Table
+
+from lcc_rl.errors import require
+from lcc_rl.results import headline
+from lcc_rl.results.headline import Shown, in_words, saved
+from lcc_rl.results.intervals import LEAST_DRIVES
+from lcc_rl.results.savings import DRIVE
+from lcc_rl.results.scores import HEADINGS, LEAST, PER_DISTANCE, Task
+
+Row = Mapping[str, Any]
+COLUMNS = (
+    Shown("where", "task, leaders"),
+    Shown("score", "score"),
+    Shown("saved", "saved [%]\nagainst"),
+    Shown("distance", "dis-\ntance\n[%]"),
+    Shown("flow", "flow\n[1/h]"),
+    Shown("ratio", "string\nratio"),
+    Shown("drives", "dri-\nves"),
+    Shown("kept", "limits\nkept"),
+)
+SHARE = ("saving", "saving_low", "saving_high")
+COPIED = ("score", *SHARE, "distance_lost", "flow_vph", "string_ratio", "final_speed_spread_mps")
+
+
+def row_of(
+    table: pd.DataFrame, task: Task, source: str, strategy: str, episodes: pd.DataFrame
+) -> dict[str, Any]:
+    """Return the row of a strategy on a task behind the leaders of a source.
+
+    Args:
+        table: of :func:`lcc_rl.results.scores.scores`.
+        task: the task.
+        source: name of the leaders.
+        strategy: whose row.
+        episodes: the rows that the table was made of.
+
+    Returns:
+        Plain values, numbers that do not exist as None: ``limits`` holds bound and value of each,
+        ``windows`` and ``drives`` count what the interval is over.
+    """
+    by_name = table.set_index("strategy")
+    found = by_name.loc[strategy]
+    row: dict[str, Any] = {"task": task.name, "source": source}
+    row |= {"measure": task.score, "unit": task.unit if task.score in PER_DISTANCE else None}
+    row |= {"against": task.against, "baseline": _number(by_name.loc[task.against, "score"])}
+    row |= {name: _number(found.get(name, np.nan)) for name in COPIED}
+    row["limits"] = {
+        name: {"bound": bound, "value": _number(found[name])} for name, bound in task.limits.items()
+    }
+    row |= {
+        "collisions": int(episodes.loc[episodes["strategy"] == strategy, "collided"].sum()),
+        "kept": bool(found["kept"]),
+    }
+    counts = {"windows": "profile_id", "drives": DRIVE, "drivers": "driver_id"}
+    return row | {name: int(episodes[key].nunique()) for name, key in counts.items()}
+
+
+def _number(value: Any) -> float | None:
+    """Return a number with seven digits, all that single precision holds; None of NaN."""
+    return float(f"{value:.7g}") if np.isfinite(value) else None
+
+
+def as_rich(who: str, rows: Sequence[Row]) -> Table:
+    """Return rows as a table for the terminal, within 80 characters."""
+    lines: list[dict[str, str]] = []
+    for row in rows:
+        if not lines or row["task"] not in (line["where"] for line in lines):
+            lines.append(dict.fromkeys((column.key for column in COLUMNS), ""))
+            against = in_words(row["against"])
+            lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
+        lines.append({"where": f"  {row['source']}", **_cells(row)})
+    caption = (
+        "saved, distance: against the baseline; 95 % interval over drives, or over windows where "
+        "there are fewer than five drives; score.json has every limit and value."
+    )
+    return headline.as_rich(pd.DataFrame(lines), in_words(who), caption, COLUMNS)
+
+
+def unit_of(row: Row) -> str:
+    """Return the unit of a row's score."""
+    return str(row["unit"] or ("m/s" if row["measure"].endswith("_mps") else "–"))
+
+
+def _cells(row: Row) -> dict[str, str]:
+    """Return the cells of a row as text."""
+    share = [np.nan if row[key] is None else 100.0 * row[key] for key in SHARE]
+    ratio, flow = row["string_ratio"], row["flow_vph"]
+    return {
+        "score": f"{row['score']:.2f}",
+        "saved": saved(*share),
+        "distance": f"{-100.0 * row['distance_lost']:+.1f}".replace("-", "−"),
+        "flow": headline.MISSING if flow is None else f"{flow:,.0f}",
+        "ratio": headline.MISSING if ratio is None else f"{ratio:.2f}",
+        "drives": str(row["drives"]),
+        "kept": "yes" if row["kept"] else broken(row),
+    }
+
+
+def as_markdown(documents: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table for each task: who was scored, and what was saved on each source.
+
+    Args:
+        documents: contents of the files of ``lcc-rl score``.
+
+    Raises:
+        ConfigError: if two rows of one task and source are not comparable.
+    """
+    check_alike(documents)
+    every = [{**row, "who": one["name"]} for one in documents for row in one["results"]]
+    parts = []
+    for task in dict.fromkeys(row["task"] for row in every):
+        rows = [row for row in every if row["task"] == task]
+        sources = list(dict.fromkeys(row["source"] for row in rows))
+        head = [
+            "",
+            *(f"{x}, {next(_sample(r) for r in rows if r['source'] == x)}" for x in sources),
+        ]
+        lines = [head, ["---"] * len(head)]
+        for who in dict.fromkeys(row["who"] for row in rows):
+            own = {row["source"]: row for row in rows if row["who"] == who}
+            cells = (_markdown_cell(own[x]) if x in own else "" for x in sources)
+            lines.append([f"`{who}`", *cells])
+        text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        parts.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
+    return "\n".join(parts)
+
+
+def check_alike(documents: Sequence[Mapping[str, Any]]) -> None:
+    """Check that all rows of a task and source were measured on the same data and settings.
+
+    Raises:
+        ConfigError: naming the document, the row, and what differs.
+    """
+    first: dict[tuple[str, str], Row] = {}
+    for document in documents:
+        for row in document["results"]:
+            place = (row["task"], row["source"])
+            known = first.setdefault(place, row)
+            for key in ("data", "settings"):
+                require(
+                    row[key] == known[key],
+                    f"{document['name']}: {place[0]} behind {place[1]} was measured with other "
+                    f"{key} ({row[key][:8]}, not {known[key][:8]})",
+                )
+
+
+def _sample(row: Row) -> str:
+    return (
+        f"{row['drives']} drives" if row["drives"] >= LEAST_DRIVES else f"{row['windows']} windows"
+    )
+
+
+def _markdown_cell(row: Row) -> str:
+    """Return saving, flow, and either that all limits are kept, in bold, or which is not."""
+    cells = _cells(row)
+    share = f"{cells['saved']} %" if cells["saved"] != headline.MISSING else "baseline"
+    share = f"**{share}**" if row["kept"] else f"{share}, not kept: {cells['kept']}"
+    return f"{share}; {cells['flow']}/h"
+
+
+def broken(row: Row) -> str:
+    """Return the limits that are not kept, by their first words, or that there are collisions."""
+    if row["collisions"]:
+        return f"{row['collisions']} coll."
+    for name, limit in row["limits"].items():
+        value, low = limit["value"], name.startswith(LEAST)
+        if value is not None and (value < limit["bound"] if low else value > limit["bound"]):
+            return HEADINGS[name].partition("≥" if low else "≤")[0].replace("\n", " ").strip()
+    return "no"

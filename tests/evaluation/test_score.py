@@ -1,0 +1,82 @@
+"""``lcc-rl score``: rows of whoever drives, comparable by their hashes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import lcc_rl
+from lcc_rl.commands.score import main
+from lcc_rl.errors import ConfigError
+from lcc_rl.results import board
+
+SMALL = ("scenario.horizon=60", "evaluation.profiles=3")
+ON = ("--task", "i80-follow", "--on", "everyday", "evaluation.drivers=2", *SMALL)
+
+
+def scores(folder: Path, who: str, *words: str) -> dict:
+    assert main([who, "--out", str(folder), *words]) == 0
+    return json.loads((folder / "score.json").read_text())
+
+
+def numbers(document: dict) -> list[tuple]:
+    """Return everything but names and hashes of a document's rows."""
+    return [
+        tuple(value for value in row.values() if isinstance(value, float))
+        for row in document["results"]
+    ]
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_an_exported_policy_scores_as_the_policy_itself(tmp_path, capsys) -> None:
+    for name in ("onnxscript", "onnxruntime"):
+        pytest.importorskip(name, reason="extra interfaces")
+    who = "pretrained/i80-follow"
+    # A file's name is never that of a baseline, whatever it is.
+    lcc_rl.export(who, tmp_path / "human.onnx")
+    one = scores(tmp_path / "a", who, *ON)
+    other = scores(tmp_path / "b", str(tmp_path / "human.onnx"), *ON)
+    (row,), (same,) = numbers(one), numbers(other)
+    assert same == pytest.approx(row, rel=1e-4, abs=1e-6)
+    for key in ("data", "settings"):  # of what was played, not of who played
+        assert one["results"][0][key] == other["results"][0][key]
+    assert one["sha256"] != other["sha256"]
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
+def test_a_controller_is_played_where_it_fits_and_the_rest_is_named(tmp_path, capsys) -> None:
+    tasks = ("--task", "i80-follow", "--task", "platoon-highway")
+    source = ("--source", "mine", "leader=everyday", "leader.evaluation_share=0.6")
+    found = scores(tmp_path / "a", "deadbeat", *tasks, "--on", "everyday", *SMALL, *source)
+    places = [(row["task"], row["source"]) for row in found["results"]]
+    assert places == [("platoon-highway", "everyday"), ("platoon-highway", "mine")]
+    one, other = found["results"]
+    assert (one["data"], one["settings"]) != (other["data"], other["settings"])
+    assert "left out: i80-follow: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["idm_ac"], "'idm_acc'"),
+        (["direct"], "no controller that could be scored"),
+        (["idm", "--task", "i80"], "nothing could be played: i80: .*i80-follow"),
+        (["idm", "--task", "i80-follow", "--on", "moon"], "no such source, only stream, "),
+        (["idm", "--source", "../x", "leader=i24"], "expected a new name"),
+        (["idm", "--source", "x", "agent=ddpg"], "expected settings of data, "),
+        (["idm", "data=stream"], "each task has its own"),
+    ],
+)
+def test_mistakes_are_named(words, message, tmp_path) -> None:
+    with pytest.raises(ConfigError, match=message):
+        main([*words, "--out", str(tmp_path / "a")])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_table_of_scores_refuses_those_of_other_windows_or_settings() -> None:
+    row = {"task": "t", "source": "s", "data": "1", "settings": "2"}
+    other = {"name": "b", "results": [{**row, "data": "3"}]}
+    with pytest.raises(ConfigError, match=r"b: t behind s .* other data"):
+        board.check_alike([{"name": "a", "results": [row]}, other])

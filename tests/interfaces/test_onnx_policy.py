@@ -1,0 +1,141 @@
+"""ONNX programs that others made: the page's example, what they may hold, and what they command."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import POPULATION, wavy_profiles
+from pages import ROOT, blocks
+
+from lcc_rl.config import load
+from lcc_rl.envs import build_env
+from lcc_rl.errors import LccError
+from lcc_rl.evaluation.named import controller_of, is_policy
+from lcc_rl.evaluation.strategies import driven_by
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.interfaces.driver import Driver, Measured, entries
+from lcc_rl.interfaces.onnx_policy import OnnxPolicy
+from lcc_rl.pieces.base import SEED, STEP
+
+onnx = pytest.importorskip("onnx", reason="extra interfaces")
+pytest.importorskip("onnxruntime", reason="extra interfaces")
+GAP = {"name": "self.gap", "unit": "m"}
+ABOUT = {"inputs": [GAP], "output": "acceleration [m/s²]"}
+# An import of the package fails, and no test's settings are inherited.
+ALONE = "import sys; sys.modules['lcc_rl'] = None; exec(open('example.py').read())"
+
+
+def written(path: Path, nodes, takes, makes, about=ABOUT, more=()) -> str:
+    """Write a program; takes and makes are (name, width) of inputs and outputs."""
+    kind = onnx.TensorProto.FLOAT
+    sides = [
+        [onnx.helper.make_tensor_value_info(name, kind, ["batch", width]) for name, width in side]
+        for side in (takes, makes)
+    ]
+    graph = onnx.helper.make_graph(nodes, "g", *sides, list(more))
+    opsets = [onnx.helper.make_opsetid("", 18)]
+    model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=10)
+    text = about if isinstance(about, str) else json.dumps(about)
+    onnx.helper.set_model_props(model, {"lcc_rl": text})
+    path.write_bytes(model.SerializeToString())
+    return str(path)
+
+
+def tenth(path: Path, about=ABOUT, takes=(("state", 1),)) -> str:
+    """Write a program whose acceleration is a tenth of what it reads."""
+    number = onnx.helper.make_tensor("c", onnx.TensorProto.FLOAT, [1], [0.1])
+    node = onnx.helper.make_node("Mul", [takes[0][0], "c"], ["acceleration"])
+    return written(path, [node], takes, [("acceleration", 1)], about, [number])
+
+
+def test_the_example_of_the_page_needs_no_lcc_rl_and_drives(tmp_path) -> None:
+    pytest.importorskip("onnxscript", reason="extra interfaces")
+    page = blocks(ROOT / "docs" / "interfaces.md")
+    (text,) = (block.text for block in page if "torch.onnx.export" in block.text)
+    assert len([line for line in text.splitlines() if line.strip()]) <= 24
+    (tmp_path / "example.py").write_text(text)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", ALONE], cwd=tmp_path, check=True)
+    bound = OnnxPolicy(path=str(tmp_path / "follow.onnx")).bind(name=AUTOMATED)
+    assert bound.names == ("self.gap", "self.speed", "ahead.speed")
+    gap, speed, ahead = (torch.rand(5, 1, 1) * 20.0 for _ in range(3))
+    expected = (0.2 * (gap - 2.0 - 1.3 * speed) + 0.8 * (ahead - speed)).clamp(-3.0, 3.0)
+    torch.testing.assert_close(bound.command(gap, speed, ahead)[0], expected)
+
+
+def test_commands_are_held_within_the_largest_acceleration(tmp_path) -> None:
+    path = tenth(tmp_path / "a.onnx")
+    assert not is_policy(path)  # a file of weights
+    bound = OnnxPolicy(path=controller_of(path)["path"]).bind()
+    found = bound.command(torch.tensor([[[20.0], [400.0]]]))[0]
+    assert found.flatten().tolist() == [pytest.approx(2.0), 3.0]
+
+
+def test_a_program_remembers_what_it_returned(tmp_path) -> None:
+    takes, makes = [("state", 1), ("memory", 1)], [("acceleration", 1), ("next_memory", 1)]
+    nodes = [
+        onnx.helper.make_node("Add", ["memory", "state"], ["next_memory"]),
+        onnx.helper.make_node("Identity", ["next_memory"], ["acceleration"]),
+    ]
+    path = written(tmp_path / "sum.onnx", nodes, takes, makes)
+    cfg = load("evaluate", ["variant=idm", "scenario.horizon=3"])
+    env = build_env(driven_by(cfg, controller_of(path)), wavy_profiles(), POPULATION, 4)
+    data = env.rollout(3, break_when_any_done=False)
+    gaps = data["vehicles", "gap"][:, :, :1].cumsum(1).clamp(max=3.0)
+    kept = data["next", "automated", "program"]
+    torch.testing.assert_close(kept, data["vehicles", "gap"][:, :, :1].cumsum(1))
+    torch.testing.assert_close(data["next", "command", "automated"], gaps)
+    # Alike where another simulator measures, such as SUMO.
+    driver, measured = Driver(path, 0.1), entries([Measured(*[1.0] * 9)] * 2)
+    measured |= {key: torch.zeros(2, 1, dtype=torch.int64) for key in (SEED, STEP)}
+    kept = driver.begin(measured)
+    for step in range(1, 4):
+        command, kept = driver(measured, kept)
+        assert command.tolist() == [float(step)] * 2
+
+
+FOREIGN = [
+    ({**ABOUT, "inputs": [{**GAP, "name": "leader.next_speed"}]}, "'leader.next_speed' is not"),
+    ({**ABOUT, "inputs": [{**GAP, "name": "../../etc/passwd"}]}, "is not measured"),
+    ({**ABOUT, "inputs": [{**GAP, "unit": "ft"}]}, "self.gap is in m, got 'ft'"),
+    ({**ABOUT, "inputs": [GAP, GAP]}, r"expected the input state \[batch, 2\]"),
+    ({**ABOUT, "inputs": []}, "inputs"),
+    ({**ABOUT, "output": "acceleration [g]"}, "output"),
+    ({"inputs": [GAP]}, "output is required"),
+    ("[1]", "must be a JSON object"),
+    ("{", "are no JSON"),
+]
+
+
+@pytest.mark.parametrize(("about", "words"), FOREIGN, ids=[words for _, words in FOREIGN])
+def test_metadata_that_are_refused(about, words, tmp_path) -> None:
+    with pytest.raises(LccError, match=words):
+        controller_of(tenth(tmp_path / "a.onnx", about))
+
+
+def test_files_that_are_refused(tmp_path) -> None:
+    for name, content in (("none.onnx", None), ("text.onnx", b"text"), ("empty.onnx", b"")):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(LccError, match=name):
+            controller_of(str(tmp_path / name))
+    with pytest.raises(LccError, match=r"got \['other'\]"):
+        controller_of(tenth(tmp_path / "a.onnx", takes=[("other", 1)]))
+
+
+def test_a_program_names_no_other_file(tmp_path) -> None:
+    (tmp_path / "weights").write_bytes(np.float32(0.1).tobytes())
+    path = tenth(tmp_path / "a.onnx")
+    model = onnx.load(path)
+    (weight,) = model.graph.initializer
+    weight.ClearField("float_data")
+    weight.data_location = onnx.TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value="weights")
+    Path(path).write_bytes(model.SerializeToString())
+    with pytest.raises(LccError, match=r"a\.onnx"):
+        controller_of(path)
