@@ -28,7 +28,7 @@ NAMES = {"i24-mixed": "fleets", "ring-22": "fleets_ring"}
 PERCENT = ("saving", "distance_lost")
 SHOWN = {
     "i24-mixed": {"saving": "fuel saved per km [%]", "distance_lost": "distance lost [%]"},
-    "ring-22": {"saving": "fuel of all saved per km [%]", "mean_speed_mps": "mean speed [m/s]"},
+    "ring-22": {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"},
 }
 HUMAN = "human"
 SHOWN_AS = {
@@ -65,12 +65,13 @@ def drawn(table: pd.DataFrame, task: str) -> Figure:
             if rows.empty:
                 continue
             x = 100.0 * rows[SHARE]
-            axis.plot(x, scale * rows[column], color=colour, label=words)
+            above = 5 if name == LEARNED else 3
+            axis.plot(x, scale * rows[column], color=colour, label=words, zorder=above)
             face = [colour if kept else "white" for kept in rows["kept"]]
-            axis.scatter(x, scale * rows[column], c=face, edgecolors=colour, zorder=3, s=16)
+            axis.scatter(x, scale * rows[column], c=face, edgecolors=colour, s=16, zorder=above)
             if name == LEARNED and column == "saving":
                 ends = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
-                axis.vlines(x, *ends, color=colour, lw=1.5, alpha=0.5)
+                axis.vlines(x, *ends, color=colour, lw=1.5, alpha=0.5, zorder=above)
         # Of a saving and a loss zero; what is left are draws of the noise, alike at every share.
         axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls="--", lw=0.8)
         axis.set_xscale("log")
