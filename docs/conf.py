@@ -18,7 +18,7 @@ project, author, release = "lcc_rl", "The lcc_rl developers", lcc_rl.__version__
 html_title, html_theme = f"lcc_rl {release}", "furo"
 html_logo = html_favicon = "assets/logo.svg"
 html_static_path, html_css_files = ["assets"], ["site.css"]
-html_copy_source = html_show_sourcelink = False
+html_copy_source = html_show_sourcelink = html_show_copyright = False
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 exclude_patterns = ["_build"]
 
