@@ -36,12 +36,12 @@ class Run:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row per strategy: energies, savings with intervals, safety."""
+        """A row per strategy, with energies, savings with intervals, safety."""
         return summary(self.rows)
 
     @cached_property
     def headline(self) -> pd.DataFrame:
-        """The table that commands print: energy per vehicle and km, saved, distance, safety."""
+        """The table that commands print, with energy per vehicle and km, distance and safety."""
         return headline(self.table)
 
     @cached_property

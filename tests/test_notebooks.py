@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 
-FOLDER = Path(__file__).parents[1] / "notebooks"
+FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
 TRY = (
     *("scenario.horizon=60", "training.episodes=24", "training.environments=8"),
     *("training.segment=60", "evaluation.profiles=2", "evaluation.drivers=3"),

@@ -103,7 +103,9 @@ class Reader:
                 for words in commands(block):
                     self.note(block.line, self.command, words, error and error[0])
             else:
-                assert block.language == "text", f"{page}:{block.line}: {block.language}"
+                assert block.language in ("text", "{eval-rst}"), (
+                    f"{page}:{block.line}: {block.language}"
+                )
         self.end(page)
         assert not self.failures, f"{page}:" + f"\n\n{page}:".join(self.failures)
 

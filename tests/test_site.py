@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mkdocs", reason="extra docs")
-pytest.importorskip("mkdocstrings", reason="extra docs")
+pytest.importorskip("myst_nb", reason="extra docs")
+pytest.importorskip("furo", reason="extra docs")
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("site")]
 ROOT = Path(__file__).parents[1]
@@ -25,11 +25,14 @@ NOT_LOADED = {"canonical", "next", "prev", "alternate"}  # relations that are li
 def site(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "site"
     nowhere = dict.fromkeys(("http_proxy", "https_proxy"), "http://127.0.0.1:9")
-    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    environment = {**os.environ, **nowhere, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True)
+    words = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
+    words += ["-d", str(tmp_path_factory.mktemp("trees")), "docs", str(folder)]
+    settings = ["-D", "nb_execution_mode=off"]  # tests/test_notebooks.py runs them
+    environment = os.environ | nowhere
+    done = subprocess.run(
+        words + settings, cwd=ROOT, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stderr
     return folder
 
 
@@ -58,3 +61,22 @@ def test_no_page_loads_anything_from_another_host(site) -> None:
         assert not foreign, f"{page.name} loads {foreign}"
     for style in site.rglob("*.css"):
         assert not re.search(r"(url\(|@import )[\"']?(https?:)?//", style.read_text()), style.name
+
+
+def test_every_page_is_reached_and_links_read_as_words(site) -> None:
+    start = (site / "index.html").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").rglob("*.md"):
+        address = page.relative_to(ROOT / "docs").with_suffix(".html").as_posix()
+        assert address == "index.html" or f'href="{address}"' in start, address
+        text = (site / address).read_text(encoding="utf-8")
+        assert not re.search(r"<a [^>]*>(<[^>]+>)*[\w/]+\.md<", text), address
+    assert (site / "ring.html").exists()
+    assert (site / "reports" / "alcc.html").exists()
+
+
+def test_signatures_are_not_cut_off(site) -> None:
+    text = (site / "reference" / "api.html").read_text(encoding="utf-8")
+    for name in ("make_env", "compare"):
+        signature = re.search(rf'<dt class="[^"]*" id="[\w.]+\.{name}">(.*?)</dt>', text, re.S)
+        assert signature, name
+        assert signature[1].count("<dd>") == signature[1].count('class="sig-param"') > 2, name

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import require
-from lcc_rl.figures.drawing import legend_above, new_figure, save, style
+from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, save, style
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 
@@ -28,17 +28,17 @@ NAMES = {"i24-mixed": "fleets", "ring-22": "fleets_ring"}
 PERCENT = ("saving", "distance_lost")
 SHOWN = {
     "i24-mixed": {"saving": "fuel saved per km [%]", "distance_lost": "distance lost [%]"},
-    "ring-22": {"score": "fuel of all [g/km]", "mean_speed_mps": "mean speed [m/s]"},
+    "ring-22": {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"},
 }
+HUMAN = "human"
 SHOWN_AS = {
-    LEARNED: (LEARNED, "#0072b2"),
-    "idm_acc": ("IDM as cruise control, tuned", "#009e73"),
-    "idm_acc_filtered": ("IDM as cruise control, tuned, filtered", "#56b4e9"),
-    "acc": ("linear ACC, tuned", "#e69f00"),
+    LEARNED: ("learned", "#0072b2"),
+    "idm_acc": ("tuned IDM", "#009e73"),
+    "idm_acc_filtered": ("tuned IDM behind the safety filter", "#56b4e9"),
+    "acc": ("tuned linear ACC", "#e69f00"),
     "follower_stopper": ("FollowerStopper", "#cc79a7"),
     "pi_saturation": ("PI with saturation", "#d55e00"),
-    "idm": ("one human driver (IDM)", "#6b6b6b"),
-    "human": ("humans only", "#222222"),
+    "idm": ("simulated driver (IDM)", "#6b6b6b"),
 }
 
 
@@ -52,33 +52,39 @@ def scored(run: Path) -> pd.DataFrame:
     return found
 
 
+@paper
 def drawn(table: pd.DataFrame, task: str) -> Figure:
     """Draw what a task shows over the share; hollow where a limit is missed."""
-    figure = new_figure(10.0, 4.0)
+    figure = new_figure(PAGE, 3.2)
     axes = figure.subplots(1, len(SHOWN[task]))
+    humans = table[table["strategy"] == HUMAN]
     for axis, (column, label) in zip(axes, SHOWN[task].items(), strict=True):
         scale = 100.0 if column in PERCENT else 1.0
         for name, (words, colour) in SHOWN_AS.items():
             rows = table[table["strategy"] == name].sort_values(SHARE)
-            if rows.empty or (name == "human" and column in PERCENT):  # compared with itself
+            if rows.empty:
                 continue
-            x, y = 100.0 * rows[SHARE], scale * rows[column]
-            axis.plot(x, y, color=colour, lw=1.3, label=words)
+            x = 100.0 * rows[SHARE]
+            above = 5 if name == LEARNED else 3
+            axis.plot(x, scale * rows[column], color=colour, label=words, zorder=above)
             face = [colour if kept else "white" for kept in rows["kept"]]
-            axis.scatter(x, y, c=face, edgecolors=colour, zorder=3, s=28)
+            axis.scatter(x, scale * rows[column], c=face, edgecolors=colour, s=16, zorder=above)
             if name == LEARNED and column == "saving":
-                low, high = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
-                axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
-        if column in PERCENT:
-            axis.axhline(0.0, color="#222222", lw=0.8)
+                ends = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
+                axis.vlines(x, *ends, color=colour, lw=1.5, alpha=0.5, zorder=above)
+        # Of a saving and a loss zero; what is left are draws of the noise, alike at every share.
+        axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls="--", lw=0.8)
         axis.set_xscale("log")
         shares = sorted(100.0 * table[SHARE].unique())
-        axis.set_xticks(shares, [f"{share:.3g}" for share in shares])
+        axis.set_xticks(shares, [f"{float(f'{share:.2g}'):g}" for share in shares])
         axis.minorticks_off()
         style(axis, "automated vehicles [%]", label)
-    legend_above(axes[0], 2)
-    band = "; band: 95 % of learned" * ("saving" in SHOWN[task])
-    figure.suptitle(f"{task}; filled: keeps all limits{band}", fontsize=10)
+    axes[0].plot([], [], color=INK, ls="--", lw=0.8, label="human drivers only")
+    handles = axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
+    footnote(
+        figure, "filled: keeps all limits of the task; vertical lines: 95 % interval of learned"
+    )
     return figure
 
 

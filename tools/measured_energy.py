@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel
-from lcc_rl.figures.drawing import INK, grid, new_figure, save, style
+from lcc_rl.figures.drawing import INK, PAGE, grid, legend_above, new_figure, paper, save, style
 from lcc_rl.io.files import read_parquet, write_parquet
 
 KEPT, DRAWN = Path("outputs/reference/measured_energy.parquet"), Path("docs/figures/measured.png")
@@ -109,10 +109,11 @@ def along(bench: pd.DataFrame, column: str) -> float:
     return float(per_km.iloc[-1] / per_km.iloc[0])
 
 
+@paper
 def figure_of(table: pd.DataFrame) -> Figure:
     """Draw modelled over measured energy per km, a dot for each run."""
     bench, trips = (table[table["kind"] == kind] for kind in ("bench", "battery"))
-    figure = new_figure(9.0, 4.2)
+    figure = new_figure(PAGE, 3.4)
     left, right = figure.subplots(1, 2)
     for model, colour in FUELS.items():
         _dots(left, bench, model, colour, 1e3)
@@ -120,14 +121,12 @@ def figure_of(table: pd.DataFrame) -> Figure:
         part = trips[trips["setting"] == season]
         model = ELECTRIC if season == "winter" else f"{ELECTRIC}_bare"
         _dots(right, part, model, colour, 1e6, label=LABELS[season])
-    style(left, "measured fuel [g/km]", "modelled fuel [g/km]")
-    style(right, "measured energy [Wh/km]", "modelled energy [Wh/km]")
-    left.set_title("Renault 1.3 TCe on an engine bench", fontsize=10, color=INK)
-    right.set_title("BMW i3 on the road", fontsize=10, color=INK)
+    style(left, "measured, Renault 1.3 TCe on a bench [g/km]", "modelled fuel [g/km]")
+    style(right, "measured, BMW i3 on the road [Wh/km]", "modelled energy [Wh/km]")
     for axis in (left, right):
         ends = [*axis.get_xlim(), *axis.get_ylim()]
-        axis.plot([min(ends), max(ends)], [min(ends), max(ends)], color=INK, linewidth=0.8)
-        axis.legend(fontsize=8, frameon=False)
+        axis.plot([min(ends), max(ends)], [min(ends), max(ends)], color=INK, lw=0.8, label="equal")
+        legend_above(axis, 1)
         grid(axis)
     return figure
 
@@ -136,7 +135,7 @@ def _dots(
     axis: Axes, rows: pd.DataFrame, model: str, colour: str, scale: float, label: str | None = None
 ) -> None:
     level, together = agreement(rows, model)
-    text = f"{label or model}: level {level:.2f}, r = {together:.2f}"
+    text = f"{label or model}: modelled/measured {level:.2f}, r = {together:.2f}"
     per_km = scale * rows[["measured", model]].div(rows["distance_m"], axis=0)
     axis.plot(per_km["measured"], per_km[model], ".", color=colour, label=text)
 

@@ -1,8 +1,8 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
 The tables of docs/{alcc,hcfs,tasks}.md, docs/reports, and of docs/figures: fleets.png,
-fleets_ring.png, limits.png, measured.png, record.png, ring.png and twins.png. The other figures
-need runs that were not kept, recorded data, or tools of earlier commits.
+fleets_ring.png, limits.png, measured.png, record.png, ring.png and twins.png. The commands that
+the pages name draw the other figures.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import fleets
 import leaderboard
@@ -25,28 +26,31 @@ from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.data.leaders import stretch
 from lcc_rl.figures.calibration import twins_figure
-from lcc_rl.figures.drawing import legend_above, new_figure, save, style
+from lcc_rl.figures.drawing import COLUMN, footnote, new_figure, paper, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.results.headline import in_words
 from lcc_rl.studies.reproduce import REPORTS
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 MEASURED = measured_energy.KEPT.name
 RING = "tasks/ring_steps.parquet"
-SHOWN = ("human", "pi_saturation", "alcc")
+SHOWN = {
+    "human": "all cars: human drivers",
+    "pi_saturation": "one car: PI with saturation",
+    "alcc": "one car: learned",
+}
 EVERY = 10  # steps between the rows kept
 COLUMNS = ("strategy", "training_seed", "profile", "driver_id", "time_s")
-POLICIES = {
-    "network": ("network", "#0072b2"),
-    "memory": ("network with memory", "#56b4e9"),
-    "preview": ("network with preview", "#009e73"),
-    "idm": ("IDM, by search", "#d55e00"),
-    "idm_gradient": ("IDM, by gradient", "#cc79a7"),
+KINDS_SHOWN = {  # variant and policy, how it is named, its colour and whether its dots are filled
+    ("alcc", "idm"): ("IDM, tuned by search", "#d55e00", True),
+    ("alcc", "idm_gradient"): ("IDM, tuned by gradient", "#cc79a7", True),
+    ("own_energy", "network"): ("network, its own energy", "#0072b2", False),
+    ("alcc", "network"): ("network", "#0072b2", True),
+    ("alcc", "memory"): ("network with memory", "#56b4e9", True),
+    ("alcc", "preview"): ("network with preview", "#009e73", True),
 }
-LINES = {"alcc": "-", "own_energy": "--", "reference": ":"}
 
 
 def keep_ring(run: Path, path: Path) -> None:
@@ -71,24 +75,26 @@ def figure_of_record() -> Figure:
     return record_figure(record, used["from_s"], leaders.cases)
 
 
+@paper
 def figure_of_limits(windows: pd.DataFrame) -> Figure:
     """Draw path energy over the share of long time gaps: a dot per training, a line per kind.
 
     Args:
         windows: one row per training and held-out window.
     """
-    figure = new_figure(6.4, 4.2)
+    figure = new_figure(COLUMN, 3.2)
     axes = figure.subplots()
-    for kind, rows in windows.groupby(KINDS, sort=False):
-        variant, policy = map(str, kind)
-        name, hue = POLICIES[policy]
-        line = points(rows).sort_values(SHARE)
-        label = f"{in_words(variant)}, {name}"
-        axes.plot(100.0 * line[SHARE], line[ENERGY], ls=LINES[variant], color=hue, label=label)
-        each = rows.groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
-        axes.plot(100.0 * each[SHARE], each[ENERGY], ".", color=hue, alpha=0.6)
-    legend_above(axes, 2)
-    style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy\n[kJ per episode]")
+    kinds = dict(list(windows.groupby(KINDS)))
+    for kind, (label, hue, filled) in KINDS_SHOWN.items():
+        line = points(kinds[kind]).sort_values(SHARE)
+        look: dict[str, Any] = {"color": hue, "mfc": hue if filled else "white", "ms": 3.0}
+        axes.plot(100.0 * line[SHARE], line[ENERGY], "-" if filled else "--", color=hue)
+        each = kinds[kind].groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
+        axes.plot(100.0 * each[SHARE], each[ENERGY], "o", **look)
+        axes.plot([], [], "o-" if filled else "o--", label=label, **look)
+    figure.legend(loc="outside upper left", ncols=2, frameon=False)
+    style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy [kJ per episode]")
+    footnote(figure, "dot: one training; line: means at limits of 0.5, 1 and 2 %")
     return figure
 
 
@@ -99,9 +105,10 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
         where = ["--reference", str(reference / "tasks"), "--figures", str(figures)]
         fleets.main([task, *where])
     cfg = load("evaluate", ["task=ring-22"])
-    ring = space_time(read_parquet(reference / RING), SHOWN, as_plain(cfg), every=1)
+    steps = read_parquet(reference / RING).replace({"strategy": SHOWN})
+    ring = space_time(steps, list(SHOWN.values()), as_plain(cfg), every=1)
     assert ring is not None
-    save(ring, figures / "ring.png", dpi=100)  # thousands of lines: larger is over a megabyte
+    save(ring, figures / "ring.png", dpi=150)  # thousands of lines: larger is over a megabyte
     drawn = {
         "limits.png": figure_of_limits(read_parquet(reference / "limits" / "windows.parquet")),
         "measured.png": measured_energy.figure_of(read_parquet(reference / MEASURED)),

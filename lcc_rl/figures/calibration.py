@@ -11,7 +11,19 @@ from matplotlib.figure import Figure
 
 from lcc_rl.drivers.twins import REACTING, RECORDED, TWINS, densities, ratios
 from lcc_rl.errors import DataError
-from lcc_rl.figures.drawing import INK, SOFT, footnote, grid, new_figure, style, unbox
+from lcc_rl.figures.drawing import (
+    COLUMN,
+    INK,
+    PAGE,
+    SOFT,
+    footnote,
+    grid,
+    new_figure,
+    paper,
+    signed,
+    style,
+    unbox,
+)
 from lcc_rl.functional.laws import LAWS
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
@@ -30,6 +42,7 @@ PARAMETERS = {
 }
 
 
+@paper
 def calibration_figure(drivers: pd.DataFrame) -> Figure:
     """Box plots of the error and the parameters by mode (Fig. 4 of the ALCC paper).
 
@@ -49,29 +62,30 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
         if pair[0] in drivers and drivers[pair[0]].nunique() > 1
     }
     rows = 1 + len(shown) // 3
-    figure = new_figure(10.0, 0.4 + 2.7 * rows)
+    figure = new_figure(PAGE, 0.4 + 1.9 * rows)
     first, *others = figure.subplots(rows, 3).ravel()
     for axis in others[len(shown) :]:
         axis.remove()
     _boxes(first, {mode: 100.0 * part["rmspe"] for mode, part in modes.items()})
-    first.set_title("speed error RMSPE [%]", fontsize=10, color=INK)
+    first.set_title("speed error RMSPE [%]")
     for axis, (name, (column, label)) in zip(others, shown.items(), strict=False):
         _boxes(axis, {mode: part[column] for mode, part in modes.items()})
-        axis.set_title(label, fontsize=10, color=INK)
+        axis.set_title(label)
         # The share of drivers whose parameter lies on a bound of the search.
         flags = {mode: part[f"{name}_at_bound"].mean() for mode, part in modes.items()}
         texts = [f"{mode} {100 * share:.0f} %" for mode, share in flags.items() if share > 0.0]
         if texts:
-            axis.set_xlabel(f"on a bound: {', '.join(texts)}", fontsize=8, color=SOFT)
+            axis.set_xlabel(f"on a bound: {', '.join(texts)}", fontsize=7)
     means = ", ".join(f"{mode} {100 * part['rmspe'].mean():.1f} %" for mode, part in modes.items())
     model = ", ".join(drivers["model"].unique()).upper() if "model" in drivers else "IDM"
-    figure.suptitle(f"{model} calibration: mean RMSPE {means}", fontsize=12, color=INK)
+    figure.suptitle(f"{model} calibration: mean RMSPE {means}")
     footnote(
         figure, "box: quartiles; whiskers: 5th to 95th percentile; line: median; diamond: mean"
     )
     return figure
 
 
+@paper
 def joint_figure(drivers: pd.DataFrame) -> Figure:
     """Joint distribution of (v0, T) with its marginals (Fig. 5 of the ALCC paper).
 
@@ -85,32 +99,31 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
     speed, gap = (table[name].to_numpy(float) for name in ("desired_speed_mps", "time_gap_s"))
     bound = table["desired_speed_at_bound"].to_numpy(bool)
     colour = COLOURS.get(mode, INK)
-    figure = new_figure(6.6, 6.2)
+    figure = new_figure(COLUMN, 3.6)
     spec = figure.add_gridspec(2, 2, width_ratios=(4, 1), height_ratios=(1, 4))
     centre = figure.add_subplot(spec[1, 0])
     top = figure.add_subplot(spec[0, 0], sharex=centre)
     side = figure.add_subplot(spec[1, 1], sharey=centre)
     _scatter(centre, speed, gap, bound, colour)
+    figure.legend(loc="outside lower left", ncols=2, frameon=False)
     look: dict[str, Any] = {"bins": 24, "stacked": True, "color": [colour, "#c8c8c8"]}
     top.hist([speed[~bound], speed[bound]], **look)
     side.hist([gap[~bound], gap[bound]], orientation="horizontal", **look)
     for axis in (top, side):
         unbox(axis)
-        axis.tick_params(labelsize=9)
     top.tick_params(labelbottom=False)
     side.tick_params(labelleft=False)
     top.set_ylabel("drivers")
     side.set_xlabel("drivers")
     figure.suptitle(
-        f"Desired speed and time gap of {len(table)} drivers ({mode} calibration)\n"
-        f"correlation of ($v_0$, $T$): {_pearson(speed, gap)} of all, "
-        f"{_pearson(speed[~bound], gap[~bound])} of those with $v_0$ identified",
-        fontsize=11,
-        color=INK,
+        f"{len(table)} drivers, {mode} calibration; correlation of $v_0$ and $T$:\n"
+        f"{_pearson(speed, gap)} of all, "
+        f"{_pearson(speed[~bound], gap[~bound])} of those with $v_0$ identified"
     )
     return figure
 
 
+@paper
 def twins_figure(twins: pd.DataFrame) -> Figure:
     """Calibrated drivers beside the recorded ones whose leaders they follow, a row per mode.
 
@@ -118,13 +131,13 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
         twins: what was measured, see :class:`lcc_rl.drivers.calibrator.Calibration`.
     """
     modes = list(dict.fromkeys(twins["mode"]))
-    figure = new_figure(10.0, 0.5 + 3.1 * len(modes))
+    figure = new_figure(PAGE, 0.3 + 2.2 * len(modes))
     for mode, row in zip(modes, np.atleast_2d(figure.subplots(len(modes), 3)), strict=True):
         part = twins[twins["mode"] == mode]
         found = {who: part[part["driver"] == who] for who in dict.fromkeys(part["driver"])}
         spectra, share, gaps = row
         for who, one in found.items():
-            look: dict[str, Any] = {"color": DRIVERS[who], "label": who, "linewidth": 1.6}
+            look: dict[str, Any] = {"color": DRIVERS[who], "label": who, "linewidth": 1.3}
             density = densities(one).mean()
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
@@ -139,11 +152,11 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
         style(spectra, "frequency [Hz]", "acceleration [m²/s⁴/Hz]")
         style(share, "difference from recorded [%]", "")
         style(gaps, "mean gap [m]", "share of drivers")
-        spectra.set_title(f"spectrum ({mode} calibration)", fontsize=10, color=INK)
-        share.set_title("sums over all drivers", fontsize=10, color=INK)
-        gaps.set_title("distribution of gaps", fontsize=10, color=INK)
+        spectra.set_title(f"spectrum ({mode} calibration)")
+        share.set_title("sums over all drivers")
+        gaps.set_title("distribution of gaps")
         gaps.set_xlim(left=0.0)
-        spectra.legend(fontsize=8, frameon=False)
+        spectra.legend(frameon=False)
         for axis in row:
             grid(axis)
     return figure
@@ -170,7 +183,7 @@ def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
         numbers = series.to_numpy(float)
         if len(numbers) > 1 and np.ptp(numbers) == 0.0:
             axis.plot([place - 0.25, place + 0.25], numbers[[0, 0]], color=colour, linewidth=2)
-            look: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour}
+            look: dict[str, Any] = {"ha": "center", "fontsize": 7, "color": colour}
             look |= {"xytext": (0, 5), "textcoords": "offset points"}
             axis.annotate(f"held at {numbers[0]:g}", (place, numbers[0]), **look)
             continue
@@ -184,14 +197,13 @@ def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
             boxprops={"facecolor": colour, "alpha": 0.35, "edgecolor": colour},
             medianprops={"color": colour, "linewidth": 2},
             meanprops={"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
-            | {"markersize": 4},
+            | {"markersize": 3},
             whiskerprops={"color": colour},
             capprops={"color": colour},
             flierprops={"marker": ".", "markersize": 3, "markeredgecolor": SOFT},
         )
     labels = [f"{mode}\nn = {len(series)}" for mode, series in values.items()]
     axis.set_xticks(range(len(values)), labels)
-    axis.tick_params(labelsize=9)
     axis.set_xlim(-0.6, len(values) - 0.4)
     axis.set_ylim(bottom=0.0)
     grid(axis, "y")
@@ -211,13 +223,10 @@ def _scatter(
         axis.scatter(speed[bound], gap[bound], 16, clip_on=False, label=label, **hollow)
     style(axis, "desired speed $v_0$ [m/s]", "time gap $T$ [s]")
     grid(axis)
-    axis.tick_params(labelsize=9)
     axis.set_ylim(bottom=0.0)
-    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.5, 1.0)}
-    axis.legend(fontsize=8, frameon=True, framealpha=0.9, edgecolor="none", **place)
 
 
 def _pearson(first: np.ndarray, second: np.ndarray) -> str:
     if len(first) < 3 or first.std() == 0.0 or second.std() == 0.0:
         return "undefined"
-    return f"{np.corrcoef(first, second)[0, 1]:.2f}"
+    return signed(np.corrcoef(first, second)[0, 1], ".2f")

@@ -14,28 +14,35 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lcc_rl.figures.drawing import (
+    COLUMN,
     INK,
+    PAGE,
+    SOFT,
     colour,
+    dots,
     in_file,
     legend_above,
     new_figure,
+    paper,
     rows_of,
     save,
+    signed,
     style,
 )
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import baseline_of, in_words
+from lcc_rl.results.headline import headline, in_words
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, savings
+from lcc_rl.results.tables import summary
 
 VEHICLES = {
     "leader": ("leader", INK),
     "cav": ("controlled car", "#0072b2"),
-    "hdv": ("human follower", "#d55e00"),
+    "hdv": ("human behind", "#d55e00"),
 }
 
 
@@ -97,11 +104,12 @@ def study_figures(
                 yield f"improvement {name} vs {baseline}", figure
 
 
+@paper
 def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     """Speeds, accelerations and gaps of one held-out episode (Fig. 7)."""
     rows = _one_episode(steps, strategy)
     first = rows.iloc[0]
-    figure = new_figure(7.0, 6.5)
+    figure = new_figure(COLUMN, 4.4)
     axes = figure.subplots(3, 1, sharex=True)
     for axis, entry in zip(axes, ("speed", "acceleration", "gap"), strict=True):
         _over_time(axis, rows, entry)
@@ -110,22 +118,36 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     style(axes[2], "time [s]", "gap ahead [m]")
     legend_above(axes[0])
     figure.suptitle(
-        f"{in_words(strategy)}: profile {first['profile']}, driver "
-        f"v0 {first['desired_speed_mps']:.1f} m/s, T {first['time_gap_s']:.2f} s",
-        fontsize=10,
+        f"{in_words(strategy)}; human driver behind: desired\n"
+        f"speed {first['desired_speed_mps']:.1f} m/s, time gap {first['time_gap_s']:.2f} s"
     )
     return figure
 
 
+@paper
 def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
-    """Speeds of one episode, and the mean energies per vehicle and km by strategy."""
-    figure = new_figure(10.0, 3.8)
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    """Speeds of one episode, and the energy per vehicle and km that each strategy saves."""
+    figure = new_figure(PAGE, 2.7)
+    left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
-    left.set_title(f"One held-out episode of {in_words(strategy)}", fontsize=10, pad=22)
+    left.set_title(f"one held-out episode: {in_words(strategy)}", loc="left", pad=16)
     legend_above(left)
-    _mean_energies(right, episodes[episodes["strategy"] != "direct"])
+    table = headline(summary(episodes))
+    against = str(table.attrs["against"])
+    dots(right, range(len(table)), table.fillna({"saved_pct": 0.0}), "saved_pct", INK)
+    right.axvline(0.0, color=SOFT, lw=0.8, zorder=0)
+    rows_of(right, list(table["strategy"]))
+    for place, energy in enumerate(table["energy_kj_per_km"]):
+        look: dict[str, Any] = {"va": "center", "ha": "right", "fontsize": 7}
+        transform = right.get_yaxis_transform()
+        right.annotate(f"{energy:.0f} kJ/km", (1.0, place), xycoords=transform, **look)
+    low, high = right.get_xlim()
+    right.set_xlim(low, high + 0.3 * (high - low))
+    sizes = (episodes[name].nunique() for name in ("profile_id", "driver_id"))
+    style(right, f"path energy per km saved\nagainst {in_words(against)} [%]")
+    title = "{} windows × {} drivers; lines: 95 % intervals".format(*sizes)
+    right.set_title(title, loc="right", pad=16)
     return figure
 
 
@@ -135,36 +157,6 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
         column = f"{vehicle}_{entry}"
         if column in rows and rows[column].notna().any():
             axis.plot(rows["time_s"], rows[column], color=hue, label=name, lw=1.3)
-
-
-def _mean_energies(axis: Axes, cars: pd.DataFrame) -> None:
-    """Draw a bar per strategy: the mean energies of car and human driver, one after the other."""
-    present = [vehicle for vehicle in ("cav", "hdv") if f"{vehicle}_path_energy_kj" in cars]
-    columns = [f"{x}_{end}" for x in present for end in ("path_energy_kj", "distance_m")]
-    means = cars.groupby("strategy", sort=False)[columns].mean()
-    kilometres = means[[f"{x}_distance_m" for x in present]].sum(axis=1) / 1e3
-    baseline = baseline_of(means.index)
-    totals, places = pd.Series(0.0, means.index), np.arange(len(means))
-    for vehicle in present:
-        name, hue = VEHICLES[vehicle]
-        value = means[f"{vehicle}_path_energy_kj"] / kilometres
-        axis.barh(places, value, left=totals, color=hue, label=name)
-        totals = totals + value
-    for place, (label, total) in enumerate(totals.items()):
-        saved = ""
-        if baseline not in (None, label):
-            saved = f" ({100 * (1.0 - total / totals[baseline]):+.1f} %)".replace("-", "−")
-        axis.annotate(f" {total:.0f}{saved}", (total, place), va="center", fontsize=8)
-    rows_of(axis, list(totals.index))
-    axis.tick_params(axis="y", labelsize=9)
-    axis.set_xlim(0.0, 1.4 * totals.max())
-    against = f"\nin brackets: saved against {in_words(baseline)}" if baseline else ""
-    style(axis, f"path energy [kJ per vehicle and km]{against}")
-    legend_above(axis)
-    title = (
-        f"{cars['profile_id'].nunique()} held-out profiles × {cars['driver_id'].nunique()} drivers"
-    )
-    axis.set_title(f"Mean over {title}", fontsize=10, pad=22)
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
@@ -182,34 +174,18 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
 
 def human_energy(means: Means, strategy: str) -> Figure:
     """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
-    names = {"direct": "B: direct", strategy: f"A: behind {in_words(strategy)}"}
-    column = "hdv_path_energy_kj"
-    figure, saving, share = _by_driver(means, column, names, "the human driver")
-    figure.suptitle(
-        f"Human driver's path energy with and without the controlled car ahead "
-        f"(n = {len(saving)} drivers)\nmean saving {share}",
-        fontsize=10,
-    )
-    return figure
+    names = {"direct": "directly behind the leader", strategy: f"behind {in_words(strategy)}"}
+    return _by_driver(means, "hdv_path_energy_kj", names, "the human driver")
 
 
 def paired_improvement(means: Means, strategy: str, baseline: str) -> Figure:
     """Path energy of all vehicles by driver and its saving against a baseline (Fig. 10)."""
     names = {name: in_words(name) for name in (baseline, strategy)}
-    column = "total_path_energy_kj"
-    figure, saving, share = _by_driver(means, column, names, "all vehicles")
-    figure.suptitle(
-        f"{names[strategy]} against {names[baseline]}: saving of path energy {share}\n"
-        f"best driver {100 * saving.max():+.1f} %, worst {100 * saving.min():+.1f} %; worse off: "
-        f"{int((saving < 0).sum())} of {len(saving)} drivers",
-        fontsize=10,
-    )
-    return figure
+    return _by_driver(means, "total_path_energy_kj", names, "all vehicles")
 
 
-def _by_driver(
-    means: Means, column: str, names: dict[str, str], whose: str
-) -> tuple[Figure, pd.Series, str]:
+@paper
+def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> Figure:
     """Draw the energies of all drivers under a baseline and a strategy, and what each saves.
 
     Args:
@@ -217,46 +193,45 @@ def _by_driver(
         column: the energy.
         names: labels of the baseline and of the strategy, in this order.
         whose: energy, for the label of the axis.
-
-    Returns:
-        The figure, the share that each driver saves, and the mean saving in words.
     """
     baseline, strategy = names
     energy = by_driver(means.drivers, column)[[baseline, strategy]].dropna()
-    figure = new_figure(9.0, 3.8)
+    figure = new_figure(PAGE, 2.7)
     left, right = figure.subplots(1, 2)
     bins = np.histogram_bin_edges(energy.to_numpy(), 30)
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
-        mean = f"{label}, mean {energy[name].mean():.1f}"
+        mean = f"{label}, mean {energy[name].mean():.1f} kJ"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
     style(left, f"path energy of {whose} [kJ per episode]", "drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
-    legend_above(left)
+    legend_above(left, 1)
     saving = share_saved(energy[strategy], energy[baseline])
-    against = " against ".join(label.split(":")[0] for label in (names[strategy], names[baseline]))
     _sorted_bars(right, saving, colour(strategy))
-    style(right, "drivers, sorted", f"path energy saved\n{against} [%]")
     found = savings(means.windows, column, strategy, baseline)
-    return figure, saving, _with_interval(found, means.windows, strategy)
-
-
-def _with_interval(found: Estimate, episodes: pd.DataFrame, strategy: str) -> str:
-    """Return a share and its interval, in words."""
-    seeds = episodes.loc[episodes["strategy"] == strategy, "training_seed"].nunique()
-    if np.isnan(found.low):
-        return f"{100 * found.value:+.1f} % (1 window, 1 training seed: no interval)"
-    bounds = f"{100 * found.low:+.1f} … {100 * found.high:+.1f} %"
-    over = "windows; 1 training seed" if seeds == 1 else "windows and seeds"
-    return f"{100 * found.value:+.1f} % (95 % interval over {over}: {bounds})"
+    _mean_line(right, found, means.windows.loc[means.windows["strategy"] == strategy])
+    worse = f"{int((saving < 0).sum())} of {len(saving)} drivers worse off"
+    style(right, f"drivers, sorted ({worse})", "path energy saved [%]")
+    return figure
 
 
 def _sorted_bars(axis: Axes, saving: pd.Series, hue: str) -> None:
     """Draw one bar per driver, sorted; below zero means worse off."""
     ordered = 100 * np.sort(saving.to_numpy())
     axis.bar(np.arange(len(ordered)), ordered, width=1.0, color=hue, alpha=0.8)
-    axis.axhline(0.0, color=INK, lw=0.8)
-    mean = ordered.mean()
-    axis.axhline(mean, color=INK, lw=0.8, ls="--", label=f"mean of drivers {mean:+.1f} %")
+    axis.axhline(0.0, color=INK, lw=0.6)
     axis.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
-    legend_above(axis)
+
+
+def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
+    """Draw the mean saving and its interval, and write both above."""
+    value, low, high = (100 * x for x in (found.value, found.low, found.high))
+    text = f"mean {signed(value)} %"
+    if np.isfinite(low):
+        over = "windows, 1 seed" if rows["training_seed"].nunique() == 1 else "windows and seeds"
+        axis.axhspan(low, high, color=SOFT, alpha=0.3, lw=0)
+        text += f" ({signed(low)} … {signed(high)})\nband: 95 % interval over {over}"
+    else:
+        text += " (1 window, 1 training seed: no interval)"
+    axis.axhline(value, color=INK, lw=0.8, ls="--")
+    axis.set_title(text, loc="left", fontsize=7)

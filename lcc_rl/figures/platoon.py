@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.figures.drawing import INK, legend_above, new_figure, style, unbox
+from lcc_rl.figures.drawing import INK, PAGE, legend_above, new_figure, paper, style, unbox
 from lcc_rl.results.headline import in_words
 
 SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
@@ -39,6 +39,7 @@ def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Fi
                 yield f"{case} switching {strategy}", switching(steps, case, strategy)
 
 
+@paper
 def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Figure:
     """Draw the leader's record with the part for training, and the cases' windows (Fig. 3).
 
@@ -47,20 +48,27 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
         from_s: where that part begins [s].
         cases: the windows for tests.
     """
-    figure = new_figure(7.2, 4.6)
+    figure = new_figure(PAGE, 3.6)
     grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
     axis, windows = grid.pop("record"), list(grid.values())
     seconds = _speeds(axis, record)
     axis.axvspan(from_s, seconds[-1], color=PARENTS["DDPG"], alpha=0.15, lw=0, label="training")
-    axis.set_title(_in_record(record), fontsize=10, loc="right")
+    axis.set_title(_in_record(record), loc="right")
     legend_above(axis)
     for window, case in zip(windows, cases, strict=True):
         ends = _speeds(window, case.profile)[[0, -1]]
         window.set_ylim(-0.5, 13.0)
-        window.set_title(f"{case.name}\n{_in_record(case.profile)}", fontsize=10)
+        window.set_title(f"{case.name}\n{_in_record(case.profile)}")
         if case.name in PAPER:
-            window.plot(ends, PAPER[case.name], "o", color=BOUND, label="paper", clip_on=False)
-            window.legend(frameon=False, fontsize=8, loc="upper left")
+            window.plot(
+                ends,
+                PAPER[case.name],
+                "o",
+                color=BOUND,
+                label="first and last speed\nin the paper",
+                clip_on=False,
+            )
+            window.legend(frameon=False, loc="upper left")
     for left in (axis, windows[0]):
         left.set_ylabel("speed [m/s]")
     return figure
@@ -82,6 +90,7 @@ def _in_record(profile: Profiles) -> str:
     return name if start == "0s" else f"{name} from {in_words(start)} on"
 
 
+@paper
 def velocities(steps: pd.DataFrame, case: str) -> Figure:
     """Speeds of leader and followers, a panel per strategy (Figs. 4, 7, 10)."""
     figure, panels = _panels(steps[steps["case"] == case], f"{case}: speed [m/s]")
@@ -93,23 +102,21 @@ def velocities(steps: pd.DataFrame, case: str) -> Figure:
     return figure
 
 
+@paper
 def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
     """Jerk of the followers, a panel per strategy, and its bound where they come near it.
 
-    The scale is that of the data (Figs. 5, 8, 11).
+    The scale of each panel is that of its data (Figs. 5, 8, 11).
     """
-    rows = steps[steps["case"] == case]
-    own = rows[rows["strategy"].isin(shown(rows)) & (rows["follower"] > 0)]
-    top = 1.1 * max(float(own["jerk_mps3"].abs().max()), 0.1)
-    near = top > 0.5 * bound
-    where = f"dotted: bound ±{bound:g}" if near else f"bound ±{bound:g}, beyond the scale"
-    figure, panels = _panels(rows, f"{case}: jerk [m/s³]; {where}")
-    for axis, part in panels:
-        _lines(axis, part, "jerk_mps3")
-        for side in (-bound, bound) if near else ():
+    title = f"{case}: jerk [m/s³]; scales differ; bound ±{bound:g}, dotted where it is near"
+    figure, panels = _panels(steps[steps["case"] == case], title, sharey=False)
+    for axis, rows in panels:
+        _lines(axis, rows, "jerk_mps3")
+        top = max(float(rows["jerk_mps3"].abs().max()), 0.1)
+        for side in (-bound, bound) if top > 0.5 * bound else ():
             axis.axhline(side, color=BOUND, lw=0.8, ls=":")
-    scale = max(top, 1.1 * bound) if near else top
-    panels[0][0].set_ylim(-scale, scale)
+            top = max(top, bound)
+        axis.set_ylim(-1.1 * top, 1.1 * top)
     legend_above(panels[0][0])
     return figure
 
@@ -120,16 +127,18 @@ def shown(steps: pd.DataFrame) -> list[str]:
     return [name for name in SHOWN if name in names] or names
 
 
-def _panels(rows: pd.DataFrame, title: str) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
+def _panels(
+    rows: pd.DataFrame, title: str, sharey: bool = True
+) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Return a figure with a panel per strategy, and each panel with its rows."""
     names = shown(rows)
-    figure = new_figure(8.0, 1.2 + 2.0 * len(names))
-    axes = figure.subplots(len(names), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    figure = new_figure(PAGE, 0.8 + 1.3 * len(names))
+    axes = figure.subplots(len(names), 1, sharex=True, sharey=sharey, squeeze=False)[:, 0]
     for axis, name in zip(axes, names, strict=True):
-        axis.set_title(in_words(name), fontsize=10, loc="right")
+        axis.set_title(in_words(name), loc="right")
         unbox(axis)
     axes[-1].set_xlabel("time [s]")
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(title)
     parts = (rows[rows["strategy"] == name] for name in names)
     return figure, list(zip(axes, parts, strict=True))
 
@@ -145,6 +154,7 @@ def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
         axis.plot(own["time_s"], own[column], color=hue, lw=1.0, label=label)
 
 
+@paper
 def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     """The controller that drives each follower over time, CACC or DDPG (Figs. 6, 9, 12).
 
@@ -156,7 +166,7 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     rows = steps[(steps["case"] == case) & (steps["strategy"] == strategy)]
     rows = rows[rows["follower"] > 0]
     raster = rows.pivot_table(index="follower", columns="time_s", values="winner")
-    figure = new_figure(8.0, 1.4 + 0.25 * len(raster))
+    figure = new_figure(PAGE, 0.9 + 0.16 * len(raster))
     axis = figure.subplots()
     step = float(raster.columns[0])
     edges = np.append(raster.columns.to_numpy(float) - step, raster.columns[-1])
@@ -168,6 +178,6 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     style(axis, "time [s]", "follower")
     share = float(np.nanmean(raster.to_numpy()))
     title = f"{case}: who drives in {in_words(strategy)} (DDPG {100 * share:.0f} %)"
-    axis.set_title(title, fontsize=10, loc="right")
+    axis.set_title(title, loc="right")
     legend_above(axis)
     return figure

@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull, QhullError
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import INK, legend_above, new_figure, unbox
+from lcc_rl.figures.drawing import INK, footnote, legend_above, new_figure, paper, unbox
 from lcc_rl.figures.platoon import PARENTS, WHO_DRIVES
 from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import motion_of, sample_episodes, visited
 
 NEAR = 1.0  # of a map's speed: what an outline shows [m/s]
-NOTE = f"""Vehicles ahead at constant speed, those behind following steadily, no past.
-Black line: no acceleration; dashed: sample episodes within {NEAR:g} m/s."""
+NOTE = f"black line: no acceleration; dashed: what the sample episodes visit within {NEAR:g} m/s"
+LEVELS = 24  # of the accelerations
 
 
 def policy_maps(
@@ -37,6 +37,7 @@ def policy_maps(
         yield "policy_map_switching", winners(rows)
 
 
+@paper
 def accelerations(rows: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any]) -> Figure:
     """Acceleration over gap and relative speed, a row per strategy, a column per speed.
 
@@ -46,21 +47,25 @@ def accelerations(rows: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any
         cfg: the evaluation's configuration.
     """
     limit = float(rows["acceleration_mps2"].abs().max())
+    levels = np.linspace(-limit, limit, LEVELS + 1)
     figure, panels = _panels(rows)
     for axis, name, speed, part in panels:
         x, y, z = _grid(part, "acceleration_mps2")
-        mesh = axis.pcolormesh(x, y, z, cmap="RdBu", vmin=-limit, vmax=limit, rasterized=True)
+        filled = axis.contourf(x, y, z, levels, cmap="RdBu")
+        filled.set_edgecolor("face")  # no seams in vector formats
         if np.nanmin(z) < 0.0 < np.nanmax(z):
             axis.contour(x, y, z, [0.0], colors=INK, linewidths=1.0)
         outline = _outline(steps, name, speed, cfg)
         if outline is not None:
             axis.plot(outline[:, 0], outline[:, 1], color=INK, ls="--", lw=1.0)
             axis.set(xlim=(x.min(), x.max()), ylim=(0.0, y.max()))
-    figure.colorbar(mesh, ax=figure.axes, label="acceleration [m/s²]; red brakes")
-    figure.supxlabel(NOTE, fontsize=8)
+    ticks = np.linspace(-limit, limit, 7)
+    figure.colorbar(filled, ax=figure.axes, label="acceleration [m/s²]", ticks=ticks)
+    footnote(figure, NOTE)
     return figure
 
 
+@paper
 def winners(rows: pd.DataFrame) -> Figure:
     """Draw which controller drives in a hybrid strategy over gap and relative speed.
 
@@ -82,18 +87,18 @@ def _panels(rows: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, float, pd
     """Return a figure, and panel, strategy, speed and rows of each map."""
     names = list(dict.fromkeys(rows["strategy"]))
     speeds = sorted(rows["speed_mps"].unique())
-    figure = new_figure(1.8 + 3.4 * len(speeds), 1.0 + 2.5 * len(names))
+    figure = new_figure(1.0 + 3.1 * len(speeds), 0.7 + 1.6 * len(names))
     axes = figure.subplots(len(names), len(speeds), sharex=True, sharey=True, squeeze=False)
     panels = []
     for line, name in zip(axes, names, strict=True):
         for axis, speed in zip(line, speeds, strict=True):
             own = (rows["strategy"] == name) & (rows["speed_mps"] == speed)
-            axis.set_title(f"{in_words(name)}: {speed:g} m/s", fontsize=10, loc="right")
+            axis.set_title(f"{in_words(name)}, at {speed:g} m/s", loc="left")
             unbox(axis)
             panels.append((axis, name, float(speed), rows[own]))
         line[0].set_ylabel("gap [m]")
     for axis in axes[-1]:
-        axis.set_xlabel("relative speed [m/s]; left: closing")
+        axis.set_xlabel("speed ahead − own speed [m/s]")
     return figure, panels
 
 

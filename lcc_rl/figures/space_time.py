@@ -13,7 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import new_figure
+from lcc_rl.figures.drawing import COLUMN, PAGE, new_figure, paper, unbox
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
@@ -25,6 +25,7 @@ WIDEST = 3  # panels
 COLOURS = LinearSegmentedColormap.from_list("speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"])
 
 
+@paper
 def space_time(
     steps: pd.DataFrame, names: Sequence[str], cfg: Mapping[str, Any], every: int = EVERY
 ) -> Figure | None:
@@ -56,14 +57,15 @@ def space_time(
     if not whole:
         return None
     top = max(float(found[name].speed.max()) for name in whole)
-    figure = new_figure(1.5 + 4.0 * len(whole), 4.2)
+    figure = new_figure(COLUMN if len(whole) == 1 else PAGE, 2.6)
     axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
     for axis, name in zip(axes, whole, strict=True):
         lines = _panel(axis, found[name], top)
-        axis.set_title(in_words(name), fontsize=10)
+        axis.set_title(in_words(name))
+        unbox(axis)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
-    figure.colorbar(lines, ax=axes, label="speed [m/s]; framed in black: automated")
+    figure.colorbar(lines, ax=axes, label="speed [m/s]; black rim: controlled")
     return figure
 
 
@@ -77,9 +79,9 @@ def _panel(axis: Axes, motion: Motion, top: float) -> LineCollection:
         whole = np.abs(parts[:, 1, 1] - parts[:, 0, 1]) < 0.5 * around
         above = 3 if role == AUTOMATED else 2  # no other line hides the frame
         if role == AUTOMATED:
-            frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.6, zorder=above)
+            frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.0, zorder=above)
             axis.add_collection(frame)
-        lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=1.1, zorder=above)
+        lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=0.8, zorder=above)
         lines.set_array(motion.speed[:-1, vehicle][whole])
         lines.set_clim(0.0, top)
         axis.add_collection(lines)

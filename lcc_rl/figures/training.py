@@ -6,11 +6,22 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.figures.drawing import INK, colour, legend_above, new_figure, style
+from lcc_rl.figures.drawing import (
+    COLUMN,
+    INK,
+    PAGE,
+    colour,
+    footnote,
+    legend_above,
+    new_figure,
+    paper,
+    style,
+)
 from lcc_rl.results.headline import in_words
 from lcc_rl.results.intervals import band
 
 WINDOW = 10  # iterations of the rolling mean
+BAND = f"band: 95 % interval over seeds;\nof one seed 5th to 95th percentile of {WINDOW} batches"
 SHARE = "share_"  # prefix of the columns of limits
 # What a limit's share of the time is spent in.
 LIMITS = {
@@ -21,6 +32,7 @@ LIMITS = {
 }
 
 
+@paper
 def training_figure(training: pd.DataFrame) -> Figure:
     """What a training minimises, and how it keeps its limits; without limits the reward.
 
@@ -32,7 +44,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
     limits = [name for name in limits if training[name].fillna(0.0).any()]
     if not limits:
         return learning_curve(training)
-    figure = new_figure(9.0, 3.8)
+    figure = new_figure(PAGE, 2.7)
     first, *others = figure.subplots(1, 1 + len(limits))
     draw_curves(first, training, "loss_actor")
     style(first, "training episodes", "objective, less is better")
@@ -49,23 +61,24 @@ def training_figure(training: pd.DataFrame) -> Figure:
             axis.set_ylim(0.0, max(4.0 * percent, 1e-3))  # the first batches would set the scale
             legend_above(axis)
         style(axis, "training episodes", f"{LIMITS.get(what, what)} [% of the time]")
+    footnote(figure, BAND.replace("\n", " "))
     return figure
 
 
+@paper
 def learning_curve(training: pd.DataFrame) -> Figure:
     """Episode reward over episodes, see :func:`draw_curves` (Fig. 6).
 
     Args:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
     """
-    figure = new_figure(7.0, 4.0)
+    figure = new_figure(COLUMN, 2.7)
     axis = figure.subplots()
     floor, _ = draw_curves(axis, training, "episode_reward")
     axis.set_ylim(bottom=1.6 * floor - 1.0)
-    style(axis, "training episodes", "mean reward per episode")
-    title = f"Learning curve, rolling mean of {WINDOW} batches, exploration noise included"
-    figure.suptitle(title, fontsize=10)
-    legend_above(axis, 2)
+    style(axis, "training episodes", f"mean reward per episode\n(rolling mean of {WINDOW} batches)")
+    legend_above(axis, 1)
+    footnote(figure, BAND)
     return figure
 
 
@@ -86,12 +99,12 @@ def draw_curves(axis: Axes, training: pd.DataFrame, column: str) -> tuple[float,
         curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
         smooth = curves.rolling(WINDOW, min_periods=1)
         line = smooth.mean().mean(axis=1)
-        if curves.shape[1] > 1:
+        count = curves.shape[1]
+        if count > 1:
             low, high = band(smooth.mean().to_numpy(float))
-            label = f"{in_words(str(variant))} (n = {curves.shape[1]} seeds, 95 % band)"
         else:
             low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
-            label = f"{in_words(str(variant))} (1 seed; band: 5–95 % of {WINDOW} batches)"
+        label = f"{in_words(str(variant))} ({count} seed{'s' * (count > 1)})"
         axis.fill_between(line.index, low, high, color=colour(str(variant)), alpha=0.2, lw=0)
         axis.plot(line.index, line, color=colour(str(variant)), label=label)
         floor = min(floor, float(line.iloc[len(line) // 5 :].min()))

@@ -91,7 +91,7 @@ class FollowerStopper(Averaging):
 
     @property
     def averages(self) -> bool:
-        """Whether the mean is kept: of use without a desired speed."""
+        """Whether the mean is kept, which is of use without a desired speed."""
         return self.desired_speed is None
 
     def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *kept: Tensor) -> Any:

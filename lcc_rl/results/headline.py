@@ -28,6 +28,11 @@ WHO = {
     "rule": "IDM, tuned on these data",
     "reference": "network, for itself",
     NETWORK: "network, for both",
+    "follower_stopper": "FollowerStopper",
+    "pi_saturation": "PI with saturation",
+    "cacc": "CACC",
+    "ddpg": "DDPG",
+    "hcfs": "HCFS",
     "direct": "no automated car",
 }
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
@@ -71,7 +76,7 @@ def in_words(name: str) -> str:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"
     first, _, rest = name.partition(" ")
     if name in WHO or first in WHO:
-        return WHO.get(name) or f"{WHO[first]} ({rest})"
+        return WHO.get(name) or f"{WHO[first]} ({rest.replace('_', ' ')})"
     return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +25,17 @@ from lcc_rl.evaluation.responses import responses
 from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
-from lcc_rl.figures.drawing import colour, save
+from lcc_rl.figures.drawing import COLUMN, PAGE, colour, save
 from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
 from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.headline import headline
 from lcc_rl.results.means import Means
 from lcc_rl.results.motion import RESPONSES
 from lcc_rl.results.policies import load_policy
+from lcc_rl.results.tables import summary
 from lcc_rl.studies.alcc import figures as alcc
 
 
@@ -73,12 +77,15 @@ def drivers() -> pd.DataFrame:
 
 FIGURES = {
     "power_map": (alcc.power_map, ["kW", "speed [m/s]"]),
-    "learning_curve": (lambda: learning_curve(training()), ["n = 2 seeds, 95 %"]),
-    "reward_terms": (lambda: alcc.reward_terms(training()), ["HDV energy", "n = 2 seeds"]),
+    "learning_curve": (lambda: learning_curve(training()), ["for both (2 seeds)", "95 % interval"]),
+    "reward_terms": (
+        lambda: alcc.reward_terms(training()),
+        ["energy of the human driver", "(2 seeds)"],
+    ),
     "sample_episode": (lambda: run_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
     "human_energy": (
         lambda: run_figures.human_energy(Means.of(episodes()), "reference"),
-        ["n = 3 drivers", "+17.5 %", "kJ"],
+        ["of 3 drivers", "+17.5 %", "kJ"],
     ),
     "improvement": (
         lambda: run_figures.paired_improvement(Means.of(episodes()), "alcc", "reference"),
@@ -97,20 +104,37 @@ FIGURES = {
         lambda: calibration_figure(drivers()),
         ["local\nn = 6", "global\nn = 6", "RMSPE [%]", "held at 1.5", "on a bound"],
     ),
-    "joint": (lambda: joint_figure(drivers()), ["6 drivers (local calibration)", "correlation"]),
+    "joint": (lambda: joint_figure(drivers()), ["6 drivers, local calibration", "correlation"]),
 }
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_figure_draws_and_says_what_it_shows(name, tmp_path) -> None:
+def test_a_figure_fits_a_paper_and_says_what_it_shows(name, tmp_path) -> None:
     draw, expected = FIGURES[name]
     figure = draw()
+    save(figure, tmp_path / f"{name}.png", formats=["svg", "pdf"])
     written = texts(figure)
     for words in expected:
         assert words in written, written
-    save(figure, tmp_path / f"{name}.png", formats=["svg"])
-    assert (tmp_path / f"{name}.png").stat().st_size > 5000
-    assert b"<svg" in (tmp_path / f"{name}.svg").read_bytes()[:1000]
+    assert figure.get_size_inches()[0] in (COLUMN, PAGE)
+    assert not re.search(r"(^|[^\w.])-\d", written), "a minus is no hyphen"
+    ticks = {
+        label
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for tick in axis.get_major_ticks()
+        for label in (tick.label1, tick.label2)
+    }
+    for item in set(figure.findobj(Text)) - ticks:
+        if item.get_visible() and item.get_text().strip():
+            box = item.get_window_extent()
+            left, low, right, high = *box.min, *(figure.bbox.max - box.max)
+            assert min(left, low, right, high) > -1.0, f"{item.get_text()!r} is cut off"
+    # Letters stay letters in vector formats, for a search and for a journal's fonts.
+    drawn = (tmp_path / f"{name}.svg").read_text()
+    for line in "\n".join(expected).splitlines():
+        assert line in html.unescape(drawn)
+    assert b"/FontFile2" in (tmp_path / f"{name}.pdf").read_bytes()
 
 
 def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
@@ -125,19 +149,23 @@ def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
         assert "95 %" not in found
 
 
-def test_the_overview_has_a_bar_per_strategy_and_the_colours_are_on_the_image(tmp_path) -> None:
+def test_the_overview_has_the_savings_of_the_table_and_colours_are_on_the_image(tmp_path) -> None:
     frame = episodes().assign(strategy=lambda x: x["strategy"].replace("alcc", "own_energy"))
     figure = run_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
     right = figure.axes[1]
-    assert [x.get_text() for x in right.get_yticklabels()] == [
-        "one driver (IDM)",
-        "own energy",
-        "network, for itself",
-    ]
+    table = headline(summary(frame))
+    assert [x.get_text() for x in right.get_yticklabels()] == list(table["who"])
+    shown = right.lines[0].get_xdata()
+    np.testing.assert_allclose(shown, table["saved_pct"].fillna(0.0))
+    ends = [line[:, 0] for line in right.collections[0].get_segments() if len(line)]
+    bounds = table[["saved_pct_low", "saved_pct_high"]].dropna()
+    np.testing.assert_allclose(ends, bounds)
+    for energy in table["energy_kj_per_km"]:
+        assert f"{energy:.0f} kJ/km" in texts(figure)
     image = pixels(figure, tmp_path / "x.png")
-    assert all(count(image, run_figures.VEHICLES[name][1]) > 500 for name in ("cav", "hdv"))
-    for axis in figure.axes:  # the legend covers no data
-        assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0
+    assert all(count(image, run_figures.VEHICLES[name][1]) > 50 for name in ("cav", "hdv"))
+    legend = figure.axes[0].get_legend()  # it covers no data
+    assert legend.get_window_extent().y0 >= figure.axes[0].get_window_extent().y1 - 1.0
     image = pixels(
         run_figures.paired_improvement(Means.of(episodes()), "alcc", "reference"),
         tmp_path / "y.png",
@@ -158,13 +186,13 @@ def platoon(jerk: float) -> pd.DataFrame:
 
 
 def test_jerk_has_its_own_scale_and_followers_their_own_colours() -> None:
-    for jerk, dotted, said in ((2.0, 0, "beyond the scale"), (29.0, 2, "dotted: bound ±30")):
+    for jerk, dotted in ((2.0, 0), (29.0, 2)):
         figure = jerks(platoon(jerk), "case 1", 30.0)
         assert (figure.axes[0].get_ylim()[1] > 30.0) == (dotted > 0)
         assert [x.get_linestyle() for x in figure.axes[0].lines].count(":") == dotted
-        assert said in texts(figure)
+        assert "bound ±30" in texts(figure)
     figure = velocities(platoon(1.0), "case 1")
-    assert "cacc paper like" in texts(figure)
+    assert "CACC (paper like)" in texts(figure)
     assert len({line.get_color() for line in figure.axes[0].lines}) == 4  # with the leader
 
 
@@ -253,9 +281,9 @@ def grid() -> pd.DataFrame:
 
 def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
     figure = accelerations(grid(), pd.DataFrame(columns=steps().columns), {"scenario": {}})
-    titles = [axis.get_title(loc="right") for axis in figure.axes[:4]]
+    titles = [axis.get_title(loc="left") for axis in figure.axes[:4]]
     names = ("network, for both", "IDM, tuned on I-80")
-    assert titles == [f"{name}: {speed} m/s" for name in names for speed in (2, 6)]
+    assert titles == [f"{name}, at {speed} m/s" for name in names for speed in (2, 6)]
     image = pixels(figure, tmp_path / "map.png")
     for axis in figure.axes[:4]:
         box = axis.get_window_extent()

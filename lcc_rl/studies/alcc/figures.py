@@ -11,18 +11,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcc_rl.figures.drawing import (
+    COLUMN,
     INK,
+    PAGE,
     SOFT,
     colour,
+    dots,
     footnote,
     grid,
     legend_above,
     new_figure,
+    paper,
     rows_of,
+    signed,
     style,
-    whiskers,
 )
-from lcc_rl.figures.training import draw_curves
+from lcc_rl.figures.training import BAND, draw_curves
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.headline import in_words
 from lcc_rl.results.savings import by_driver, savings
@@ -33,34 +37,38 @@ TERMS = {
     "episode_reward": "total reward",
     "reward_safety": "safety (TTC)",
     "reward_efficiency": "efficiency (time gap)",
-    "reward_cav_energy": "CAV energy",
-    "reward_hdv_energy": "HDV energy",
+    "reward_cav_energy": "energy of the car",
+    "reward_hdv_energy": "energy of the human driver",
     "reward_collision": "collision",
 }
 PANELS = {
-    "path_saving_against_idm_pct": ("path energy saved\nagainst idm [%]", 0.0),
+    "path_saving_against_idm_pct": ("path energy saved against\none driver (IDM) [%]", 0.0),
     "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
     "long_time_gap_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
 }
 
 
+@paper
 def power_map() -> Figure:
     """Electric power of the motor over speed and acceleration (A2; Fig. 2)."""
     speed, acceleration = np.linspace(0.0, 30.0, 151), np.linspace(-3.0, 3.0, 121)
     power = motor_power(torch.tensor(speed), torch.tensor(acceleration)[:, None]).numpy() / 1e3
-    figure = new_figure(6.6, 4.2)
+    figure = new_figure(COLUMN, 2.7)
     axis = figure.subplots()
     limit = float(np.abs(power).max())
-    look: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "rasterized": True}
-    mesh = axis.pcolormesh(speed, acceleration, power, **look)
+    shades = np.linspace(-limit, limit, 61)
+    filled = axis.contourf(speed, acceleration, power, shades, cmap="RdBu_r")
+    filled.set_edgecolor("face")  # no seams in vector formats
     levels = [-150, -100, -50, -20, 0, 20, 50, 100, 150, 200]
     lines = axis.contour(speed, acceleration, power, levels, colors=INK, linewidths=0.7)
-    axis.clabel(lines, fmt="%d kW", fontsize=8)
-    figure.colorbar(mesh, label="electric power [kW]; below zero: recuperation")
+    axis.clabel(lines, fmt=lambda kw: f"{kw:.0f}".replace("-", "−"), fontsize=6)
+    ticks = [-200, -100, 0, 100, 200]
+    figure.colorbar(filled, label="electric power [kW]\n(below 0: recuperated)", ticks=ticks)
     style(axis, "speed [m/s]", "acceleration [m/s²]")
     return figure
 
 
+@paper
 def reward_terms(training: pd.DataFrame) -> Figure:
     """Learning curves of every reward term (no counterpart; Fig. 6 shows their sum).
 
@@ -69,27 +77,27 @@ def reward_terms(training: pd.DataFrame) -> Figure:
     """
     shown = {name: label for name, label in TERMS.items() if name in training}
     lines = -(-len(shown) // 3)
-    figure = new_figure(10.0, 0.5 + 2.7 * lines)
+    figure = new_figure(PAGE, 0.5 + 1.9 * lines)
     axes = figure.subplots(lines, 3, sharex=True, squeeze=False).ravel()
     for axis, (name, label) in zip(axes, shown.items(), strict=False):
         floor, top = draw_curves(axis, training, name)
         axis.set_ylim(1.5 * floor - 0.2, top + 0.05 * (top - floor) + 0.05)
         style(axis)
-        axis.set_title(label, fontsize=10)
+        axis.set_title(label)
     for axis in axes[len(shown) :]:
         axis.remove()
     look: dict[str, Any] = {
         "loc": "outside upper center",
         "ncols": 2,
         "frameon": False,
-        "fontsize": 9,
     }
     figure.legend(handles=axes[0].get_lines(), **look)
-    figure.supxlabel("training episodes", fontsize=10)
-    figure.supylabel("sum per episode", fontsize=10)
+    figure.supxlabel(f"training episodes\n{BAND}", fontsize=8)
+    figure.supylabel("sum per episode", fontsize=8)
     return figure
 
 
+@paper
 def distributions(drivers: pd.DataFrame) -> Figure:
     """Path energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
 
@@ -97,7 +105,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
     whiskers the 5th to 95th percentile; a diamond marks the mean.
     """
     names = list(dict.fromkeys(drivers["strategy"]))
-    figure = new_figure(9.0, 0.9 + 0.62 * len(names))
+    figure = new_figure(PAGE, 0.8 + 0.42 * len(names))
     axes = figure.subplots(1, 2)
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
     for axis, (vehicle, title) in zip(axes, titles.items(), strict=True):
@@ -108,7 +116,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
         rows_of(axis, names if vehicle == "cav" else [""] * len(names))
         axis.margins(x=0.12)
         style(axis, "path energy [kJ per episode]")
-        axis.set_title(f"{title}, n = {len(energy)} drivers", fontsize=10)
+        axis.set_title(f"{title}, n = {len(energy)} drivers")
     footnote(figure, "box: quartiles; whiskers: 5th to 95th percentile; diamond and number: mean")
     return figure
 
@@ -120,39 +128,37 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
     axis.barh(place, high - low, 0.5, low, color=hue, alpha=0.35, edgecolor=hue)
     axis.vlines(median, place - 0.25, place + 0.25, color=hue, lw=2.0)
     mean = values.mean()
-    above: dict[str, Any] = {"xytext": (0, 13), "textcoords": "offset points"}
-    axis.plot(mean, place, marker="D", color=INK, markersize=4)
-    axis.annotate(f"{mean:.1f}", (mean, place), ha="center", fontsize=8, **above)
+    above: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points"}
+    axis.plot(mean, place, marker="D", color=INK, markersize=3)
+    axis.annotate(f"{mean:.1f}", (mean, place), ha="center", fontsize=6, **above)
 
 
+@paper
 def generalization_figure(
     windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> Figure:
     """Path energy of both vehicles on every held-out profile, and its saving (Fig. 12)."""
     table = generalization(windows, strategy, baseline).sort_values("path_saving_pct")
-    figure = new_figure(9.0, 6.5)
+    figure = new_figure(PAGE, 4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
     _energies_by_profile(above, windows, table["profile_id"].tolist(), (baseline, strategy))
     values, places = table["path_saving_pct"].to_numpy(float), np.arange(len(table))
-    whiskers(below, places, table, "path_saving_pct", colour(strategy), upright=True)
     seeds = windows.loc[windows["strategy"] == strategy, "training_seed"].nunique()
     sure = f"mean of {seeds} seeds, 95 % interval" if seeds > 1 else "1 seed (no interval)"
-    below.plot(places, values, "o", color=colour(strategy), label=f"this study, {sure}")
+    look: dict[str, Any] = {"upright": True, "ms": 2.5, "label": f"this study, {sure}"}
+    dots(below, places, table, "path_saving_pct", colour(strategy), **look)
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
     label = "paper, 4 profiles, energy as drawn"
     below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
     below.axhline(0.0, color=INK, lw=0.8)
     together = 100 * savings(windows, "total_path_energy_kj", strategy, baseline).value
-    line = f"all profiles together {together:+.1f} %"
+    line = f"all profiles together {signed(together)} %"
     below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
     below.set_xticks([])
-    style(
-        below,
-        f"held-out profiles, sorted by the saving (n = {len(table)}); right: the paper's",
-        f"path energy saved by {in_words(strategy)}\nagainst {in_words(baseline)} [%]",
-    )
-    legend_above(below)
+    words = f"held-out profiles, sorted by the saving (n = {len(table)}); right: the paper's"
+    style(below, words, f"saved by {in_words(strategy)}\nagainst {in_words(baseline)} [%]")
+    legend_above(below, 2)
     return figure
 
 
@@ -168,7 +174,7 @@ def _energies_by_profile(
         axis.bar(places + offset, car, 0.4, color=colour(name), label=f"{in_words(name)}: car")
         label = f"{in_words(name)}: human driver"
         axis.bar(places + offset, human, 0.4, car, color=colour(name), alpha=0.45, label=label)
-    legend_above(axis, 4)
+    legend_above(axis, 2)
     style(axis, "", "path energy\n[kJ per episode]")
 
 
@@ -180,14 +186,15 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
         "xytext": (-4, 0),
         "textcoords": "offset points",
         "ha": "right",
-        "fontsize": 8,
+        "fontsize": 7,
     }
     for place, value in zip(places, values, strict=True):
         if abs(value) > limit:
             mark, end, side = ("▲", limit, "top") if value > 0 else ("▼", -limit, "bottom")
-            axis.annotate(f"{value:+.0f} % {mark}", (place, end), va=side, **look)
+            axis.annotate(f"{signed(value, '+.0f')} % {mark}", (place, end), va=side, **look)
 
 
+@paper
 def comparison_figure(windows: pd.DataFrame) -> Figure:
     """Energy, safety and efficiency under each change of the study (no counterpart).
 
@@ -196,14 +203,13 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
     """
     table = comparison(windows)
     names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
-    figure = new_figure(10.0, 1.3 + 0.42 * len(names))
+    figure = new_figure(PAGE, 1.0 + 0.32 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
             part, hue = table[table["strategy"] == strategy], colour(strategy)
             rows = [names.index(name) + offset for name in part["ablation"]]
-            whiskers(axis, rows, part, column, hue)
-            axis.plot(part[column], rows, "o", color=hue, ms=5, label=in_words(strategy))
+            dots(axis, rows, part, column, hue, label=in_words(strategy))
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
         axis.axhline(0.5, color=SOFT, lw=0.6)
         grid(axis, "x")
