@@ -19,7 +19,7 @@ from lcc_rl.io.files import write_parquet
 
 FOLDER = Path(lcc_rl.assets.__file__).parent / "recorded"
 GAPS = (1.0, 120.0)  # between them, a driver follows [m]
-EPISODE, BLOCK = 602, 2  # samples of an episode, two windows of 30 s; episodes of a recording
+EPISODE = 602  # samples of an episode: two windows of 30 s
 SHORTEST = 301  # samples of an episode, one window
 DRIVE = 9000  # samples of a drive: 15 min
 STANDING, MOST = 0.5, 0.3  # speed below which a car stands [m/s], largest share of a drive
@@ -33,7 +33,7 @@ def platoons(table: pd.DataFrame) -> pd.DataFrame:
         table: campaign, file, car, time_s, speed_mps, gap_m and driver, at 10 Hz.
 
     Returns:
-        A table of pairs; a recording is two minutes of a file.
+        A table of pairs; a recording is a file: minutes of one trip are alike.
     """
     parts: list[pd.DataFrame] = []
     for (campaign, file), one in table.groupby(["campaign", "file"], observed=True):
@@ -50,11 +50,10 @@ def platoons(table: pd.DataFrame) -> pd.DataFrame:
             for _, run in own.groupby([number, place // EPISODE]):
                 if len(run) < SHORTEST:
                     continue
-                start = int(run.index[0]) // EPISODE
                 episode = pd.DataFrame(
                     {
                         "episode": len(parts),
-                        "recording": f"{campaign} {file} {start // BLOCK:02d}",
+                        "recording": f"{campaign} {file}",
                         "follower_id": car,
                         "leader_id": car - 1,
                         "time_s": run.index / 10,
