@@ -252,6 +252,8 @@ class DriveLeaders(Settings):
     # Regular expression; drives whose names begin with the same match are on the same side.
     together: str | None = None
     tuning: bool = False  # leave the evaluation's part out and divide the rest again
+    # Mean speeds that divide the drives into classes; training draws all classes alike [m/s].
+    classes: Sequence[Positive] = ()
     least_variation: NonNegative = 2.0  # see RecordLeaders
     fastest: Positive | None = None  # highest mean speed of the leader in held-out windows [m/s]
     plausible: Plausible | None = None  # None for the defaults
@@ -280,7 +282,7 @@ class DriveLeaders(Settings):
             training, held_out = divide(profiles)
             if self.tuning:
                 training, held_out = divide(training, again=True)
-            training = training.at_least(horizon)
+            training = by_speed(training.at_least(horizon), self.classes)
         windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
         if not single:  # what is on one side together is one drive in intervals, too
             windows = replace(windows, recordings=tuple(map(self._family, windows.recordings)))
@@ -331,6 +333,15 @@ class DriveLeaders(Settings):
         return first, last
 
 
+def by_speed(profiles: Profiles, bounds: Sequence[float]) -> Profiles:
+    """Return records of which training draws all classes of mean speed [m/s] alike."""
+    if not bounds:
+        return profiles
+    means = [float(profiles.record(index).mean()) for index in range(len(profiles))]
+    place = np.searchsorted(sorted(bounds), means)
+    return replace(profiles, weights=torch.from_numpy(1.0 / np.bincount(place)[place]))
+
+
 def varying(profiles: Profiles, least: float, fastest: float | None = None) -> Profiles:
     """Return the records whose speed changes by at least so much in total.
 
@@ -370,7 +381,7 @@ def hashed(name: str) -> float:
 class Mixture:
     """Leaders from several sources side by side.
 
-    Training draws a source by its weight, then one of its records, all alike. Evaluation takes
+    Training draws a source by its weight, then one of its records. Evaluation takes
     the windows of every source.
 
     Args:
@@ -409,10 +420,11 @@ class Mixture:
         learned = {name: one for name, one in found.items() if len(one.training)}
         parts = [one.training.at_least(horizon) for one in learned.values()]
         training = join(parts) if parts else next(iter(found.values())).training
-        each = [
-            torch.full((len(part),), self.weights.get(name, 1.0) / len(part), dtype=torch.float64)
-            for name, part in zip(learned, parts, strict=True)
-        ]
+        each = []
+        for name, part in zip(learned, parts, strict=True):
+            own = torch.ones(len(part), dtype=torch.float64)
+            own = own if part.weights is None else part.weights
+            each.append(self.weights.get(name, 1.0) * own / own.sum())
         windows = join([one.windows for one in found.values()])
         names = tuple(name for name, one in found.items() for _ in range(len(one.windows)))
         return Leaders(
