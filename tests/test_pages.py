@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from functools import cache, partial
 from pathlib import Path
+from types import ModuleType
 
 import matplotlib as mpl
 import pytest
@@ -163,7 +164,9 @@ class Runner(Reader):
 
     def __init__(self, folder: Path, run: Path) -> None:
         super().__init__(folder)
-        self.run, self.count, self.space = run, 0, dict[str, object]()
+        self.run, self.count, page = run, 0, ModuleType("read_page")
+        sys.modules[page.__name__] = page  # what a program defines has a module
+        self.space = vars(page)
 
     def program(self, block: Block) -> None:
         """Run a program in the state that those before it left."""
