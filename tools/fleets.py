@@ -25,9 +25,9 @@ from lcc_rl.io.files import read_parquet, write_parquet
 SHARE, LEARNED = "penetration", "learned"
 REFERENCE, FIGURES = Path("outputs/reference/tasks"), Path("docs/figures")
 NAMES = {"i24-mixed": "fleets", "ring-22": "fleets_ring"}
-PERCENT = ("saving", "distance_lost")
+PERCENT = ("saving",)
 SHOWN = {
-    "i24-mixed": {"saving": "fuel saved per km [%]", "distance_lost": "distance lost [%]"},
+    "i24-mixed": {"saving": "fuel saved per km [%]", "flow_vph": "flow [vehicles/h]"},
     "ring-22": {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"},
 }
 HUMAN = "human"
@@ -72,7 +72,7 @@ def drawn(table: pd.DataFrame, task: str) -> Figure:
             if name == LEARNED and column == "saving":
                 ends = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
                 axis.vlines(x, *ends, color=colour, lw=1.5, alpha=0.5, zorder=above)
-        # Of a saving and a loss zero; what is left are draws of the noise, alike at every share.
+        # Of a saving zero; what is left are draws of the noise, alike at every share.
         axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls="--", lw=0.8)
         axis.set_xscale("log")
         shares = sorted(100.0 * table[SHARE].unique())
