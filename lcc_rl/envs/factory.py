@@ -115,7 +115,7 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     require(cfg.scenario.road == RING, "humans_first needs a ring: a leader's record would end")
     steps = round(seconds / cfg.scenario.time_step)
     cfg = deepcopy(cfg)
-    drivers = cfg.scenario.controllers
+    drivers, filters = cfg.scenario.controllers, cfg.scenario.filters
     if drivers[AUTOMATED] != drivers[HUMAN]:
         drivers[AUTOMATED] = {
             TARGET: "lcc_rl.pieces.Handover",
@@ -123,6 +123,8 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
             "after": drivers[AUTOMATED],
             "from_s": seconds,
         }
+    if filters.get(AUTOMATED) is not None:
+        filters[AUTOMATED] = {**filters[AUTOMATED], "from_s": seconds}
     cfg.scenario.horizon += steps
     return cfg
 
