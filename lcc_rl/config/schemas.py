@@ -18,7 +18,6 @@ from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.settings import (
     Count,
-    Factors,
     Million,
     NonNegative,
     Parallel,
@@ -65,7 +64,8 @@ class ScenarioConfig(Settings):
     string: str | dict[str, Any]  # roles from front to back, see docs/strings.md
     road: Literal["open", "ring"]
     circumference: Positive | None = None  # of a ring [m]
-    circumference_range: Factors = (1.0, 1.0)  # factor of it in training; evaluation takes 1
+    # Least and largest factor of it in training; evaluation takes 1.
+    circumference_range: list[Positive] = Field(default_factory=lambda: [1.0, 1.0])
     vehicle_length: Positive  # [m]
     initial_speed: NonNegative  # on a ring [m/s]
     controllers: Nodes
