@@ -160,7 +160,8 @@ class StringMotion(StepTransform):
         shape = (*start.batch_size, len(self.string), 1)
         if self.ring_gaps is not None:
             speed = torch.full(shape, self.initial_speed, device=start.device)
-            gap = between(self.ring_gaps, start.get(SEED).unsqueeze(-2), RING_GAP).expand(shape)
+            gap = between(self.ring_gaps, start.get(SEED).unsqueeze(-2), RING_GAP)
+            gap = gap.to(speed.dtype).expand(shape)
             relative = torch.zeros_like(speed)
         else:
             leader = start.get(LEADER_SPEED)

@@ -34,7 +34,7 @@ def test_changes_are_against_the_humans() -> None:
     """Energy is divided by the distance of all cars; who never damps is counted."""
     rows = pd.DataFrame(
         {
-            "strategy": ["human", "human", "rule", "rule"],
+            "strategy": ["human", "human", "pi_saturation", "pi_saturation"],
             "total_net_energy_kj": [40.0, 60.0, 30.0, 30.0],
             "cav_distance_m": [10.0, 10.0, 20.0, 20.0],
             "hdv_distance_m": [90.0, 90.0, 80.0, 80.0],
@@ -44,7 +44,7 @@ def test_changes_are_against_the_humans() -> None:
             "min_gap_m": [1.0, 2.0, 3.0, 2.5],
         }
     )
-    found = ring.table(rows).set_index("driven by").loc["rule"]
+    found = ring.table(rows).set_index("driven by").loc["pi saturation"]
     assert found["speeds against humans"] == "-80.0 %"
     assert found["fuel"] == "-40.0 %"
     assert (found["damped after"], found["smallest gap [m]"]) == ("25 s", 2.5)
