@@ -36,6 +36,7 @@ from lcc_rl.studies.reproduce import REPORTS
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 MEASURED = measured_energy.KEPT.name
 RING = "tasks/ring_steps.parquet"
+STUDIES = ("alcc", "hcfs")  # whose rows are kept
 SHOWN = ("human", "pi_saturation", "alcc")
 EVERY = 10  # steps between the rows kept
 COLUMNS = ("strategy", "training_seed", "profile", "driver_id", "time_s")
@@ -133,7 +134,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.ring is not None:
         keep_ring(options.ring, options.reference / RING)
     print(*redraw(options.reference, options.figures, Path(options.page)), sep="\n")
-    for name in REPORTS:
+    for name in STUDIES:
         print(*redraw_study(name, options.reference, Path(options.page).parent), sep="\n")
     return 0
 
