@@ -22,7 +22,14 @@ from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, validate_call
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    validate_call,
+)
 from pydantic.dataclasses import dataclass
 
 from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
@@ -37,6 +44,16 @@ Whole = Annotated[int, Field(ge=0)]
 Million = Annotated[int, Field(ge=1, le=1_000_000)]
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
+
+
+def _increasing(factors: tuple[float, float]) -> tuple[float, float]:
+    if factors[0] > factors[1]:
+        raise ValueError(f"expected two increasing positive factors, got {list(factors)}")
+    return factors
+
+
+# Least and largest factor that a training episode draws by its seed; an evaluation takes 1.
+Factors = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(_increasing)]
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 

@@ -36,6 +36,7 @@ from lcc_rl.studies.reproduce import REPORTS
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 MEASURED = measured_energy.KEPT.name
 RING = "tasks/ring_steps.parquet"
+STUDIES = ("alcc", "hcfs")  # whose rows are kept
 SHOWN = {
     "human": "all cars: human drivers",
     "pi_saturation": "one car: PI with saturation",
@@ -140,7 +141,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.ring is not None:
         keep_ring(options.ring, options.reference / RING)
     print(*redraw(options.reference, options.figures, Path(options.page)), sep="\n")
-    for name in REPORTS:
+    for name in STUDIES:
         print(*redraw_study(name, options.reference, Path(options.page).parent), sep="\n")
     return 0
 

@@ -19,7 +19,7 @@ from lcc_rl.agents.actor import seeded_mlp
 from lcc_rl.agents.agent import Fraction, Scene, anneal
 from lcc_rl.agents.simulated import SimulatedAgent
 from lcc_rl.errors import require
-from lcc_rl.settings import Count, Positive
+from lcc_rl.settings import Count, NonNegative, Positive
 
 
 class Analytic(SimulatedAgent):
@@ -40,6 +40,9 @@ class Analytic(SimulatedAgent):
     # hardly more than one of them. 1 takes all.
     value_every: Count = 5
     tau: Fraction = 0.05  # share by which the value's target network follows at every update
+    # Time in which humans drive before every episode, without gradient: the policy takes over in
+    # developed traffic [s].
+    humans_first: NonNegative = 0.0
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
 
@@ -49,6 +52,7 @@ class Analytic(SimulatedAgent):
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
         size, seed = scene.observation_size, scene.seed + 1
+        self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
         self.value = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
         self.target = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
         self.optimizer = torch.optim.Adam(

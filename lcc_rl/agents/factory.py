@@ -16,7 +16,7 @@ from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import world_of
+from lcc_rl.envs.factory import after_humans, world_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
@@ -61,7 +61,8 @@ def make_trainer(
     Raises:
         ConfigError: naming the option at fault.
     """
-    env = build_env(cfg, profiles, population, cfg.training.environments, 0, cfg.device)
+    own = after_humans(cfg, cfg.agent.get("humans_first", 0.0))
+    env = build_env(own, profiles, population, cfg.training.environments, 0, cfg.device)
     loops: dict[type, Any] = {Analytic: GradientTrainer, Tuned: SearchLoop}
     loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))

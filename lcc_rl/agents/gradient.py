@@ -36,6 +36,7 @@ class GradientTrainer(SimulatedLoop[Analytic]):
 
     def _prepare(self) -> None:
         super()._prepare()
+        self.horizon -= self.agent.burn_in
         if not self.agent.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
@@ -56,7 +57,7 @@ class GradientTrainer(SimulatedLoop[Analytic]):
         """Play one batch of episodes, with a gradient step after every segment of them."""
         rate = self.agent.anneal(self.iteration / self.iterations)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
-        state = source.start()
+        state = source.skip(source.start(), self.agent.burn_in)
         running = torch.ones(self.env.batch_size[0], 1, 1, device=self.env.device)
         played, losses, spent = [], [], [0.0, 0.0]
         missed: list[dict[str, float]] = []

@@ -27,7 +27,7 @@ EXAMPLES = {
     ),
     "train": (
         ("lcc-rl train variant=alcc experiment=limits", "a minute"),
-        ("lcc-rl train task=ring-22 scenario.horizon=3000", "a task with limits"),
+        ("lcc-rl train task=ring-22 scenario.horizon=2000", "a task with limits"),
         ("lcc-rl train -m variant=alcc,reference 'seed=range(8)'", "a sweep; it resumes"),
     ),
     "evaluate": (

@@ -13,6 +13,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, TARGET, build, find_target, settings_at
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, build_env
+from lcc_rl.envs.factory import after_humans
 from lcc_rl.envs.inputs import (
     build_drivers,
     build_source,
@@ -112,7 +113,8 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
 
 def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
     """Return the bytes of the largest block of an evaluation; arguments as above."""
-    settings, steps, count = cfg.evaluation, cfg.scenario.horizon, len(inputs.evaluation)
+    settings, count = cfg.evaluation, len(inputs.evaluation)
+    steps = after_humans(cfg, settings.humans_first).scenario.horizon
     if settings.rows == "episodes":
         count = plan_of(cfg, inputs).size
     longest = max((case.horizon for case in inputs.full_length), default=0)

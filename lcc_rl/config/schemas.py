@@ -16,7 +16,16 @@ from pydantic import AfterValidator, Field
 from lcc_rl.config.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
 from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.functional.pattern import VehicleString, parse_string
-from lcc_rl.settings import Count, Million, Parallel, Positive, Settings, Speed, parse
+from lcc_rl.settings import (
+    Count,
+    Million,
+    NonNegative,
+    Parallel,
+    Positive,
+    Settings,
+    Speed,
+    parse,
+)
 
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
@@ -56,6 +65,8 @@ class ScenarioConfig(Settings):
     string: str | dict[str, Any]  # roles from front to back, see docs/strings.md
     road: Literal["open", "ring"]
     circumference: Positive | None = None  # of a ring [m]
+    # Least and largest factor of it in training; evaluation takes 1.
+    circumference_range: list[Positive] = Field(default_factory=lambda: [1.0, 1.0])
     vehicle_length: Positive  # [m]
     initial_speed: Speed  # on a ring [m/s]
     controllers: Nodes
@@ -109,6 +120,7 @@ class EvaluationConfig(Settings):
     shard: Annotated[int, Field(ge=0)]
     compiled: bool | None = None
     full_length: bool = False
+    humans_first: NonNegative = 0.0  # on a ring: before what is measured [s]
 
     def settled(self) -> None:
         if self.shard >= self.shards:

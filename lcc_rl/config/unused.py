@@ -43,7 +43,7 @@ def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         for key in ("data", "split", "leader"):
             yield key, "a ring road has no leader"
     else:
-        for key in ("circumference", "initial_speed"):
+        for key in ("circumference", "circumference_range", "initial_speed"):
             yield f"scenario.{key}", "it belongs to scenario.road=ring"
         if leader is not None and not _plays_data(leader):
             # A pipeline calibrates drivers on the data.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
-from lcc_rl.config.nodes import CALLED, build
+from lcc_rl.config.nodes import CALLED, TARGET, build
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
@@ -20,8 +21,8 @@ from lcc_rl.envs.finite import ACTION
 from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
-from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.functional.pattern import AUTOMATED, RING
+from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.memory import require_memory, torch_device
 from lcc_rl.pieces import (
     Action,
@@ -101,6 +102,31 @@ def world_of(
         _by_role(scenario, "actuators", Actuation),
         _by_role(scenario, "sensors", Sensors),
     )
+
+
+def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
+    """Return a configuration whose episodes begin with some seconds in which humans drive all.
+
+    Raises:
+        ConfigError: if that is no number of steps, or the road is open.
+    """
+    if not seconds:
+        return cfg
+    require(cfg.scenario.road == RING, "humans_first needs a ring: a leader's record would end")
+    steps = round(seconds / cfg.scenario.time_step)
+    cfg = deepcopy(cfg)
+    drivers, filters = cfg.scenario.controllers, cfg.scenario.filters
+    if drivers[AUTOMATED] != drivers[HUMAN]:
+        drivers[AUTOMATED] = {
+            TARGET: "lcc_rl.pieces.Handover",
+            "before": drivers[HUMAN],
+            "after": drivers[AUTOMATED],
+            "from_s": seconds,
+        }
+    if filters.get(AUTOMATED) is not None:
+        filters[AUTOMATED] = {**filters[AUTOMATED], "from_s": seconds}
+    cfg.scenario.horizon += steps
+    return cfg
 
 
 def _by_role(scenario: Any, group: str, kind: type[Piece]) -> dict[str, Any]:
@@ -222,7 +248,7 @@ def _motion(scenario: Any, world: World) -> StringMotion:
     }
     if not string.ring and scenario.circumference is not None:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
-    names = ("circumference", "vehicle_length", "initial_speed")
+    names = ("circumference", "circumference_range", "vehicle_length", "initial_speed")
     of_ring = {name: getattr(scenario, name) for name in names} if string.ring else {}
     return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 

@@ -68,6 +68,14 @@ class DifferentiableRollout:
         reached = self.step({**state, ACTION: action})
         return {key: reached[key] for key in state}
 
+    @torch.no_grad()
+    def skip(self, state: State, steps: int) -> State:
+        """Return the moment some steps later; the action is zero, and no gradient is kept."""
+        action = self.env.full_action_spec[ACTION].zero()
+        for _ in range(steps):
+            state = self.advance(state, action)
+        return state
+
     def play(
         self, state: State, network: Network, steps: int, shifts: Tensor | None = None
     ) -> tuple[State, list[list[Tensor]]]:

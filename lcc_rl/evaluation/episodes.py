@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import build_env
+from lcc_rl.envs.factory import after_humans
 from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
@@ -159,7 +160,8 @@ class Episodes:
         compiled: bool | None = None,
     ) -> None:
         self.strategy, self.inputs, self.plan, self.seed = strategy, inputs, plan, seed
-        self.cfg = any_leader(strategy.cfg)
+        self.cfg = after_humans(any_leader(strategy.cfg), strategy.cfg.evaluation.humans_first)
+        self.begun = self.cfg.scenario.horizon - strategy.cfg.scenario.horizon
         if compiled is None:
             compiled = len(plan) * self.cfg.scenario.horizon >= WORTH_COMPILING
         env = build_env(
@@ -183,6 +185,7 @@ class Episodes:
             self.player.env, profile, driver, self.seed, plan.population, repeat
         )
         record, alive = self.player.play(options)
+        record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         groups = grouped(record, self.cfg.scenario.vehicles)
         described = describe(
             self.strategy,
@@ -197,7 +200,7 @@ class Episodes:
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy)
         measured = measures(groups, alive, time_step, self.energy)
-        measured |= traffic(record, alive, self.cfg.scenario.vehicle_length)
+        measured |= traffic(record, alive, self.cfg.scenario.vehicle_length, time_step)
         rows = pd.concat([described, leader, as_frame(measured)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]

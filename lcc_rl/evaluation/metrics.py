@@ -13,6 +13,7 @@ from lcc_rl.functional.safety import NEVER
 KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
 LONG_TIME_GAP = 2.5  # [s] (A13)
+CALM = 0.5  # spread of the speeds at which a wave counts as damped [m/s]
 PACE = 1.0  # below it a long time gap is a matter of metres [m/s]
 
 
@@ -126,7 +127,12 @@ def safety_measures(
 
 
 def string_measures(
-    speed: Tensor, gap: Tensor, alive: Tensor, length: float, leader: Tensor | None = None
+    speed: Tensor,
+    gap: Tensor,
+    alive: Tensor,
+    length: float,
+    time_step: float,
+    leader: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Traffic of a string, front to back.
 
@@ -135,14 +141,17 @@ def string_measures(
         gap: to the vehicle ahead, likewise [m].
         alive: whether the episode was still running, ``[time, *batch, 1]``.
         length: of a vehicle [m].
+        time_step: duration of a step [s].
         leader: speed of the vehicle ahead of the string, ``[time, *batch, 1]`` [m/s].
 
     Returns:
         Each ``[*batch, 1]``: mean speed; standard deviation of a vehicle's speed in time, averaged
         over vehicles (``speed_std_mps``), and over the vehicles at a time, averaged over the
         episode and over its last tenth (``speed_spread_mps``, ``final_speed_spread_mps``);
-        vehicles per hour by the mean speed and spacing (``flow_vph``); and, behind a leader, that
-        deviation in time of the last vehicle over the leader's (``string_ratio``).
+        vehicles per hour by the mean speed and spacing (``flow_vph``); behind a leader, that
+        deviation in time of the last vehicle over the leader's (``string_ratio``); and, on a ring,
+        how long the deviation over the vehicles takes to stay below 0.5 m/s (``damping_time_s``;
+        NaN: it does not).
     """
     here, steps = alive.unsqueeze(-2), alive.sum(0).clamp(min=1)
 
@@ -166,7 +175,10 @@ def string_measures(
         "final_speed_spread_mps": torch.where(last, spread, 0.0).sum(0) / last.sum(0).clamp(min=1),
     }
     found["flow_vph"] = 3600.0 * found["mean_speed_mps"] / (average(gap).mean(-2) + length)
-    if leader is not None:
+    if leader is None:
+        time = (torch.where(spread > CALM, late + 1, 0) * alive).amax(0)
+        found["damping_time_s"] = torch.where(time < steps, time * time_step, torch.nan)
+    else:
         own = deviation(speed[..., -1, :])
         found["string_ratio"] = own / deviation(leader).clamp(min=1e-3)
     return found

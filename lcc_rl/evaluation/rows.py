@@ -139,7 +139,7 @@ def as_frame(columns: dict[str, Tensor]) -> pd.DataFrame:
     return frame
 
 
-def traffic(record: Record, alive: Tensor, length: float) -> dict[str, Tensor]:
+def traffic(record: Record, alive: Tensor, length: float, time_step: float) -> dict[str, Tensor]:
     """Return what the whole string did, each ``[batch, 1]``; see :func:`string_measures`."""
     steps, leader = len(alive), record.get(("leader", "speed"))
     return string_measures(
@@ -147,6 +147,7 @@ def traffic(record: Record, alive: Tensor, length: float) -> dict[str, Tensor]:
         record["vehicles", "gap"],
         alive,
         length,
+        time_step,
         None if leader is None else leader[-steps:],
     )
 

@@ -53,6 +53,11 @@ def normal(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tensor
     return torch.special.ndtri(middle)
 
 
+def between(bounds: tuple[float, float], seed: Tensor, stream: Tensor | int) -> Tensor:
+    """Draw evenly between two bounds, once in an episode; float32 of the broadcast shape."""
+    return bounds[0] + (bounds[1] - bounds[0]) * uniform(seed, 0, stream)
+
+
 def choose(seed: Tensor, count: Tensor | int, stream: Tensor | int = 0) -> Tensor:
     """Draw an index from 0 … count − 1 by counter; int64 of the broadcast shape."""
     bits = hash_bits(seed + stream * STREAM)

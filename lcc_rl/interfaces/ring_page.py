@@ -82,10 +82,10 @@ def page_data(policy: str | Path, trust: Sequence[str] = ()) -> dict[str, Any]:
 def _human(cfg: StudyConfig) -> dict[str, float]:
     """Return what drives the human drivers."""
     inputs = load_inputs(cfg)
-    pieces = pieces_of(build_env(cfg, inputs.evaluation, inputs.population))
+    pieces = pieces_of(build_env(cfg, inputs.evaluation, inputs.population, nominal=True))
     (human,) = (piece for piece in pieces if isinstance(piece, DriverModel))
     own = {"desired_speed": human.desired_speeds, "time_gap": human.time_gaps}
-    noise = {name: getattr(human, name) for name in ("noise", "wiener", "spread")}
+    noise = {"noise": human.noise, "wiener": human.wiener, "spread": human.spreads[0]}
     return {**{name: float(x) for name, x in own.items()}, **vars(human.drivers), **noise}
 
 

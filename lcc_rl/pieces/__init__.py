@@ -40,6 +40,7 @@ from lcc_rl.pieces.surrogates import (
     SmoothEfficiency,
     Smoothness,
     SmoothSafety,
+    SpeedSpread,
 )
 from lcc_rl.pieces.termination import Collision
 
@@ -99,6 +100,7 @@ __all__ = [
     "SmoothSafety",
     "Smoothness",
     "SpacingReward",
+    "SpeedSpread",
     "StepTransform",
     "StringMotion",
     "TimeGap",

@@ -88,6 +88,7 @@ class CBFFilter(StepTransform):
     # Speed below which the longest time gap falls in proportion; 0: it does not [m/s].
     full_speed: NonNegative = 0.0
     least_gap: NonNegative = 2.0  # gap that the limit of the time gap always allows [m]
+    from_s: NonNegative = 0.0  # moment of the episode from which on it acts, see Handover [s]
 
     name = AUTOMATED
 
@@ -112,6 +113,8 @@ class CBFFilter(StepTransform):
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
         seen = world.sensed(self.role, STATE)
         seen = [f"next.command.{self.role}", *seen, *self.memories]
+        self.from_step = world.steps(self.from_s, "from_s")
+        seen += ["episode.step"] * (self.from_step > 0)
         self.see(world, seen, [("command", self.role)], self.role)
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
@@ -121,7 +124,11 @@ class CBFFilter(StepTransform):
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
-        return self.filtered(*self.views(*entries))
+        wanted, *more = self.views(*entries)
+        if not self.from_step:
+            return self.filtered(wanted, *more)
+        *more, step = more
+        return torch.where(step < self.from_step, wanted, self.filtered(wanted, *more))
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""

@@ -17,14 +17,16 @@ from lcc_rl.functional.gipps import GIPPS_LAW
 from lcc_rl.functional.idm import IDM_LAW
 from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.functional.random import choose, normal, stream_id, uniform
+from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Key, as_key, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Positive, Share
+from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
 LEADER_SPEED = ("leader", "speed")
 MOTION = ("self.speed", "self.gap", "self.relative_speed")
+# Draws that all drivers of an episode share.
+SPREAD, TIME_GAP = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
 LONGEST = 1000.0  # time gap up to which an equilibrium gap is written [s]
 MOST_DELAY = 1000  # steps that a driver may be late; each is kept per vehicle
 
@@ -45,6 +47,9 @@ class Drivers(Controller):
     # U(0, noise) (A18).
     noise: Share = 0.05
     wiener: NonNegative = 0.0  # standard deviation of a random walk of the speed [m/s per √s]
+    # Factors of it and of every driver's T in an episode of training; evaluation takes 1.
+    wiener_range: Factors = (1.0, 1.0)
+    time_gap_range: Factors = (1.0, 1.0)
     # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
     # those at the start of the episode. None: the reaction delay of the population.
     delay: Annotated[int, Field(ge=0, le=MOST_DELAY)] | None = None
@@ -79,7 +84,9 @@ class Drivers(Controller):
         names += [".".join(key) for key in history]
         options = constants[:1]
         self.drive(world, names, history, constants=constants, reset_options=options)
-        self.spread = self.wiener / world.time_step**0.5
+        walk = self.wiener / world.time_step**0.5
+        self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
+        self.time_gap_factors = world.deviations(self.time_gap_range)
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
         self.stray_streams = [
@@ -133,8 +140,9 @@ class Drivers(Controller):
         if self.noise:
             draw = uniform(seed, step, self.noise_stream + self.index)
             command = command * (1.0 + self.noise * draw)
-        if self.spread:
-            command = command + self.spread * normal(seed, step, self.wiener_stream + self.index)
+        if self.wiener:
+            spread = between(self.spreads, seed, SPREAD)
+            command = command + spread * normal(seed, step, self.wiener_stream + self.index)
         if self.strays:
             command = command + kept[-1][..., :1]
         return (command, *kept) if kept else command
@@ -191,7 +199,8 @@ class Drivers(Controller):
             driver = choose(seed, count, self.driver_stream + self.index)
         else:
             require_option(self.reset_options[0], driver, count)
-        values = [driver, self.desired_speeds[driver], self.time_gaps[driver]]
+        factor = between(self.time_gap_factors, start.get(SEED).unsqueeze(-2), TIME_GAP)
+        values = [driver, self.desired_speeds[driver], factor * self.time_gaps[driver]]
         if self.starts:
             speed = start.get(LEADER_SPEED).unsqueeze(-2).expand_as(values[1])
             values.append(self.equilibrium_gap(speed, values[1], values[2], driver))

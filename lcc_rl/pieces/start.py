@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
-from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -17,7 +14,7 @@ from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.world import Part, World
-from lcc_rl.settings import NonNegative, Positive
+from lcc_rl.settings import Factors, NonNegative, Positive
 
 GAP, SPEED = stream_id("platoon.gap"), stream_id("platoon.speed")
 
@@ -35,20 +32,14 @@ class TimeGapStart(Part):
     time_gap: NonNegative = 1.5  # further time gap; the ALCC paper is silent on it [s]
     # The gap is that times a factor drawn evenly from this range by the episode's seed, so that
     # training meets what good driving never does; evaluation takes 1.
-    gap_range: Annotated[tuple[Positive, Positive], Field(strict=False)] = (0.1, 1.5)
+    gap_range: Factors = (0.1, 1.5)
 
     name = AUTOMATED
-
-    def __post_init__(self) -> None:
-        if self.gap_range[0] > self.gap_range[1]:
-            raise ValueError(
-                f"gap_range must be two increasing positive factors, got {list(self.gap_range)}"
-            )
 
     def setup(self, world: World) -> None:
         """Choose the range, and the random numbers of the role."""
         self.stream = stream_id(f"{stream_name(self.name)}.gap_factor")
-        self.lowest, self.highest = (1.0, 1.0) if world.nominal else map(float, self.gap_range)
+        self.lowest, self.highest = world.deviations(self.gap_range)
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""

@@ -13,13 +13,14 @@ from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.functional.random import stream_id, uniform
+from lcc_rl.functional.random import between, stream_id, uniform
 from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
 from lcc_rl.pieces.base import SEED, Key, StepTransform, next_key
 from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import Part, World
-from lcc_rl.settings import Positive, Speed
+from lcc_rl.settings import Factors, Positive, Speed
 
+RING_GAP = stream_id("string.ring_gap")
 COMMAND, OBEYED = "command", "obeyed"
 LEADER_SPEED = (LEADER, "speed")
 
@@ -91,6 +92,7 @@ class StringMotion(StepTransform):
 
     start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
     circumference: Positive | None = None  # of a ring road [m]
+    circumference_range: Factors = (1.0, 1.0)  # factor of it in training; evaluation takes 1
     vehicle_length: Positive = 5.0  # of every vehicle, of use on a ring road only [m]
     # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
     initial_speed: Speed = 0.0
@@ -116,25 +118,26 @@ class StringMotion(StepTransform):
             role: start.bind(world, role) if isinstance(start, Part) else start
             for role, start in self.start.items()
         }
-        self.ring_start = self._ring_start() if string.ring else None
+        self.ring_gaps = self._ring_gaps(world) if string.ring else None
         missing = [role for role in string.names if role not in self.start]
         if missing and not string.ring:
             raise ConfigError(f"scenario.start lacks {', '.join(missing)}: how do they start?")
         order = [place for role in string.names for place in string.places(role)]
         self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
 
-    def _ring_start(self) -> tuple[float, float]:
-        """Return speed and gap at which vehicles begin, evenly spread over a ring."""
+    def _ring_gaps(self, world: World) -> tuple[float, float]:
+        """Return the least and the largest gap at which vehicles spread evenly over a ring [m]."""
         if self.circumference is None:
             raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
         count, length = len(self.string), self.vehicle_length
-        gap = self.circumference / count - length
-        if gap <= 0:
+        factors = world.deviations(self.circumference_range)
+        least, largest = (self.circumference * factor / count - length for factor in factors)
+        if least <= 0:
             raise ConfigError(
-                f"scenario.circumference={self.circumference} is too short for {count} vehicles "
-                f"of {length} m: it must exceed {count * length} m"
+                f"scenario.circumference={self.circumference} (times {factors[0]:g}) is too short "
+                f"for {count} vehicles of {length} m: it must exceed {count * length} m"
             )
-        return self.initial_speed, gap
+        return least, largest
 
     def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
         """Return the motion after the step, and the commands that led there."""
@@ -155,9 +158,10 @@ class StringMotion(StepTransform):
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         shape = (*start.batch_size, len(self.string), 1)
-        if self.ring_start is not None:
-            speed = torch.full(shape, self.ring_start[0], device=start.device)
-            gap = torch.full(shape, self.ring_start[1], device=start.device)
+        if self.ring_gaps is not None:
+            speed = torch.full(shape, self.initial_speed, device=start.device)
+            gap = between(self.ring_gaps, start.get(SEED).unsqueeze(-2), RING_GAP)
+            gap = gap.to(speed.dtype).expand(shape)
             relative = torch.zeros_like(speed)
         else:
             leader = start.get(LEADER_SPEED)

@@ -99,6 +99,20 @@ class Smoothness(RewardTerm):
         return -jerk.square()
 
 
+class SpeedSpread(RewardTerm):
+    """Minus the standard deviation of the speeds of all vehicles: how much of a wave there is."""
+
+    weight: NonNegative = 0.2  # price of 1 m/s in a step
+    floor: Positive = 0.05  # spread of no wave, where the slope ends [m/s]
+
+    reads = ("vehicles.speed",)
+
+    def reward(self, speed: Tensor) -> Tensor:
+        """Return the unweighted term."""
+        variance = speed.var(-2, correction=0, keepdim=True)
+        return -(variance + self.floor**2).sqrt().expand(*speed.shape[:-2], *self.event_shape)
+
+
 class Correction(RewardTerm):
     """Minus the square of what the safety filter changes: draws a policy to the filter's limits.
 

@@ -47,6 +47,10 @@ class World:
     actuators: Mapping[str, Any] = field(default_factory=dict)
     sensors: Mapping[str, Any] = field(default_factory=dict)
 
+    def deviations(self, factors: tuple[float, float]) -> tuple[float, float]:
+        """Return the range of a factor from which episodes draw: 1 in an evaluation."""
+        return (1.0, 1.0) if self.nominal else factors
+
     def steps(self, seconds: float, what: str) -> int:
         """Return a duration in steps.
 

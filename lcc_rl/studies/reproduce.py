@@ -6,6 +6,7 @@
   lcc-rl reproduce alcc --parts main agent=analytic   # another agent, its settings
   lcc-rl reproduce alcc --recipe smoke --seeds 1   # everything once, in seconds
   lcc-rl reproduce hcfs                            # platoon: 8 DDPG parents, hybrids
+  lcc-rl reproduce ring                            # one automated car in a wave on a ring
   lcc-rl reproduce report outputs/alcc             # tables, figures and page, from parquet
 
 The same command resumes where it stopped: finished runs are skipped, interrupted trainings are
@@ -26,6 +27,7 @@ from lcc_rl.config.schemas import FORMATS
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.states import claim
+from lcc_rl.studies import ring
 from lcc_rl.studies.alcc import report as alcc_report
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import report as hcfs_report
@@ -40,7 +42,11 @@ OWN = (
     "choose the variants"
 )
 OTHERS = "further formats of figures: " + ",".join(FORMATS[1:])
-REPORTS = {"alcc": alcc_report.write_results, "hcfs": hcfs_report.write_results}
+REPORTS = {
+    "alcc": alcc_report.write_results,
+    "hcfs": hcfs_report.write_results,
+    "ring": ring.write_results,
+}
 
 
 def reproduce_alcc(arguments: Namespace, command: str) -> int:
@@ -60,6 +66,14 @@ def reproduce_hcfs(arguments: Namespace, command: str) -> int:
     study = hcfs.Study(**common(arguments, "paper_hcfs"))
     with claim(study.folder):
         return concluded(hcfs.run(study, command), study.folder, "hcfs", arguments.formats)
+
+
+def reproduce_ring(arguments: Namespace, command: str) -> int:
+    """Evaluate controllers on a ring after a handover and write the page."""
+    folder = own_folder(arguments.out, "--out", lambda names: NOTES in names)
+    ring.run(folder, arguments.overrides, command)
+    log.info("wrote %s", ring.write_results(folder, arguments.formats))
+    return 0
 
 
 def common(arguments: Namespace, recipe: str | None) -> dict[str, Any]:
@@ -104,6 +118,10 @@ def parser() -> ArgumentParser:
     listing(one, "--ablations", (), f"which ablations; {names}")
     two = study_parser(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     two.set_defaults(run=reproduce_hcfs)
+    three = commands.add_parser("ring", help="field experiment on a ring (Stern et al. 2018)")
+    three.add_argument("--out", type=Path, default=Path("outputs/ring"), help="the study's folder")
+    listing(three, "--formats", (), OTHERS)
+    three.set_defaults(run=reproduce_ring)
     again = commands.add_parser("report", help="write a study's page anew, from parquet alone")
     again.set_defaults(run=rewrite, overrides=[])
     again.add_argument("folder", type=Path)

@@ -16,15 +16,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.evaluation.rollout import play
 
-DRIVERS = (
-    "drivers=fixed",
-    "drivers.desired_speed=30",
-    "drivers.time_gap=1",
-    "drivers.acceleration=1.3",
-    "drivers.deceleration=2",
-    "drivers.min_gap=2",
-)
-RING = ("variant=reference", "scenario=ring", "agent=none", *DRIVERS)
+RING = ("variant=reference", "scenario=ring", "agent=none", "drivers=ring")
 SPEED = ("vehicles", "speed")
 # The one vehicle: a human driver like all others until 300 s.
 HANDOVER = (

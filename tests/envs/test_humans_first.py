@@ -1,0 +1,100 @@
+"""Humans first: what is learned and measured on a ring begins in the wave that they made."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from helpers import compose, make_agent
+
+from lcc_rl.agents.factory import make_trainer
+from lcc_rl.config import load
+from lcc_rl.envs import build_env, load_inputs
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.episodes import Episodes, evaluate, plan_of
+from lcc_rl.evaluation.strategies import baseline
+
+RING = ("variant=alcc", "task=ring-22", "scenario.string=automated human*5")
+SHORT = ("scenario.circumference=72", "scenario.horizon=30")
+MOTION = [("vehicles", name) for name in ("speed", "gap", "acceleration")]
+RANGES = {
+    "scenario.circumference_range": "[0.8, 1.25]",
+    "scenario.controllers.human.wiener_range": "[0.5, 2]",
+    "scenario.controllers.human.time_gap_range": "[0.8, 1.2]",
+}
+
+
+def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
+    """Its first moment is that of an environment in which a human drives the automated car."""
+    sizes = ("agent.humans_first=20", "training.segment=30", "training.environments=3")
+    cfg = load("train", [*RING, *SHORT, *sizes])
+    inputs = load_inputs(cfg)
+    trainer = make_trainer(cfg, make_agent(cfg), inputs.training, inputs.population, tmp_path)
+    source = trainer._rollout()
+    trainer.env.set_seed(3)
+    begun = source.skip(source.start(), trainer.agent.burn_in)
+    cfg.scenario.controllers["automated"] = cfg.scenario.controllers["human"]
+    cfg.scenario.filters, cfg.scenario.horizon = {}, 200
+    people = build_env(cfg, inputs.training, inputs.population, 3, 3)
+    reached = people.rollout(200)["next"]
+    for key in MOTION:
+        assert torch.equal(begun[key], reached[key][:, -1]), key
+    # The episode is as long as the scenario says, and the policy drives in it.
+    assert (trainer.horizon, trainer.env.base_env.horizon) == (30, 230)
+    after, _ = source.play(begun, lambda seen: -torch.ones_like(seen[..., :1]), 1)
+    torch.testing.assert_close(
+        after["command", "automated"], torch.full((3, 1, 1), -3.0), atol=0, rtol=0
+    )
+
+
+def test_an_evaluation_measures_what_follows() -> None:
+    """Against the same episodes played as one, the first part cut off by hand."""
+    sizes = ("evaluation.profiles=2", "scenario.circumference=72")
+    cfg = load("evaluate", [*RING, *sizes, "scenario.horizon=30", "evaluation.humans_first=20"])
+    inputs = load_inputs(cfg)
+    rows, steps = evaluate(baseline(cfg, "follower_stopper"), inputs, None, 8, 0, 1)
+    whole = baseline(load("evaluate", [*RING, *sizes, "scenario.horizon=230"]), "handover")
+    people = {"from_s": 20.0, "before": cfg.scenario.controllers["human"]}
+    whole.cfg.scenario.controllers["automated"].update(people)
+    _, played = evaluate(whole, inputs, None, 8, 0, 1)
+    assert rows["duration_s"].tolist() == pytest.approx([3.0, 3.0])
+    for name in ("cav_speed", "cav_gap", "hdv1_speed"):
+        assert steps[name].tolist() == played[name].tolist()[200:], name
+
+
+@pytest.mark.parametrize("nominal", [False, True])
+def test_rings_differ_in_training_and_not_in_an_evaluation(nominal) -> None:
+    cfg = compose("alcc", "task=ring-22", *(f"{key}={value}" for key, value in RANGES.items()))
+    inputs = load_inputs(cfg)
+    start = build_env(cfg, inputs.training, inputs.population, 64, 0, nominal=nominal).reset()
+    time_gaps = start["human", "desired_time_gap"]
+    factors = {
+        "[0.8, 1.25]": (start["vehicles", "gap"].sum(-2) + 22 * 5.0) / 260.0,
+        "[0.8, 1.2]": time_gaps[:, 0] / 1.0,
+    }
+    assert time_gaps.std(-2).max() < 1e-6  # the drivers of an episode share the factor
+    for name, drawn in factors.items():
+        low, high = (1.0, 1.0) if nominal else json.loads(name)
+        assert drawn.min().item() == pytest.approx(low, abs=0.05)
+        assert drawn.max().item() == pytest.approx(high, abs=0.05)
+        assert bool(((drawn > low - 1e-5) & (drawn < high + 1e-5)).all())
+
+
+@pytest.mark.parametrize("nominal", [False, True])
+def test_noise_differs_in_training(nominal) -> None:
+    """The first step of equal drivers differs by the noise alone; its size by the episode."""
+    words = [f"{key}={value}" for key, value in RANGES.items() if "wiener" in key]
+    cfg = compose("alcc", "task=ring-22", *words, "scenario.controllers.human.wiener=1")
+    inputs = load_inputs(cfg)
+    env = build_env(cfg, inputs.training, inputs.population, 256, 0, nominal=nominal)
+    moved = env.step(env.rand_action(env.reset()))["next", "command", "human"]
+    size = moved.std(-2).flatten() * 0.1**0.5
+    ends = size.quantile(torch.tensor([0.05, 0.95])).tolist()
+    assert ends == pytest.approx([0.74, 1.26] if nominal else [0.5, 2.0], rel=0.15)
+
+
+def test_an_open_road_is_refused() -> None:
+    cfg = load("evaluate", ["variant=idm", "evaluation.humans_first=20"])
+    with pytest.raises(ConfigError, match="humans_first needs a ring"):
+        Episodes(baseline(cfg, "idm"), load_inputs(cfg), plan_of(cfg, load_inputs(cfg)), 0)
