@@ -31,6 +31,7 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
+from lcc_rl.functional.pattern import AUTOMATED, parse_string
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.headline import headline, in_words
 from lcc_rl.results.intervals import Estimate, share_saved
@@ -87,6 +88,10 @@ def study_figures(
         cfg: the evaluation's configuration.
     """
     means, names = Means.of(episodes), list(dict.fromkeys(episodes["strategy"]))
+    string = parse_string(cfg["scenario"]["string"], cfg["scenario"]["road"])
+    if not string.drawn and AUTOMATED in string.names:
+        steps = steps.assign(cav_place=string.places(AUTOMATED)[0])
+    several = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
     diagram = space_time(steps, [*names[:1], *names[-2:]], cfg) if len(steps) else None
     if diagram is not None:
@@ -98,7 +103,7 @@ def study_figures(
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
             yield f"human_energy {name}", human_energy(means, name)
-        for baseline in BASELINES:
+        for baseline in BASELINES if several else ():
             if baseline in names and baseline != name and name not in UNTRAINED:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure
@@ -168,8 +173,10 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     spread = rows.groupby(["profile", "driver_id"])[first_speed].transform("std")
     first = rows.iloc[int(spread.to_numpy().argmax())]
     rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
-    # The first of several vehicles of a kind is shown.
-    return rows.rename(columns=lambda name: re.sub(r"^(cav|hdv)1_", r"\1_", name))
+    # Of several vehicles the first automated one, and the human after those ahead of it.
+    rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
+    behind = 1 + int(rows.get("cav_place", pd.Series([0])).iloc[0])
+    return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 
 def human_energy(means: Means, strategy: str) -> Figure:

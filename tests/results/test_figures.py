@@ -321,3 +321,11 @@ def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     assert stems["png"] == stems["svg"]
     assert [path.name for path in maps.run(tmp_path)] == ["policy_map.png"]
     assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm tuned"}
+
+
+def test_the_human_behind_is_behind_the_car_at_its_place() -> None:
+    table = steps().drop(columns=["hdv_speed", "hdv_acceleration", "hdv_gap"])
+    table = table.assign(cav_place=1, hdv1_speed=6.0, hdv2_speed=4.0, hdv2_gap=8.0)
+    axis = run_figures.sample_episode(table, "alcc").axes[0]
+    drawn = {line.get_label(): line.get_ydata() for line in axis.get_lines()}
+    assert (drawn["human behind"] == 4.0).all()
