@@ -70,7 +70,9 @@ def run(
             label, rows = _episode(steps, strategy, episode)
             scenario = stored_config(folder)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)
-            motions[words or f"{in_words(strategy)}: {label}"] = motion
+            # Side by side, there is room for little more than a name.
+            name = in_words(strategy) + (f": {label}" if len(named) == 1 else "")
+            motions[words or name] = motion
     default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
     return animate(motions, out or default)
 

@@ -40,6 +40,7 @@ NOT_IDENTITY = (
 )
 # Launchers and sweepers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
+NAMED = re.compile(r"""(?:(?<=[\[,])|^)([^\[\],"'{}]*=[^\[\],"'{}]*)""")  # text with =
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -109,12 +110,17 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
     Examples:
         >>> as_meant(["variant=ALCC,HCFS", "reward.terms.safety.margin=0", "agent=td3"])
         ['variant=alcc,hcfs', '++reward.terms.safety.margin=0', 'agent=td3']
+        >>> as_meant(["compare=[idm,outputs/seed=0_1f]"])
+        ['++compare=[idm,"outputs/seed=0_1f"]']
     """
     found = []
     for item in overrides:
         key, equals, value = item.partition("=")
         if key.lstrip("+") in ("variant", "variants"):
             found.append(f"{key}{equals}{value.lower()}")
+        elif key in ("compare", "policy", "resume"):  # a sweep's folders are named seed=0_…
+            quoted = NAMED.sub(r'"\1"', value)
+            found.append(f"++{key}{equals}{quoted}")
         elif key[:1] in "+~" or not equals or not _is_setting(key):
             found.append(item)
         else:
