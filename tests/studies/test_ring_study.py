@@ -21,7 +21,7 @@ SMALL = (
 def test_one_command_writes_the_page(tmp_path) -> None:
     assert main(["ring", "--out", str(tmp_path / "ring"), *SMALL]) == 0
     table = read_parquet(tmp_path / "ring" / "tables" / "ring.parquet").set_index("driven by")
-    assert {"follower stopper", "pi saturation", "field experiment"} < set(table.index)
+    assert {"FollowerStopper", "PI with saturation", "field experiment"} < set(table.index)
     assert table.loc["simulated drivers", "speeds against humans"] == "+0.0 %"
     text = (tmp_path / "ring" / "report.html").read_text()
     assert "Humans drive all cars for 2 s" in " ".join(text.split())
@@ -44,7 +44,7 @@ def test_changes_are_against_the_humans() -> None:
             "min_gap_m": [1.0, 2.0, 3.0, 2.5],
         }
     )
-    found = ring.table(rows).set_index("driven by").loc["pi saturation"]
+    found = ring.table(rows).set_index("driven by").loc["PI with saturation"]
     assert found["speeds against humans"] == "-80.0 %"
     assert found["fuel"] == "-40.0 %"
     assert (found["damped after"], found["smallest gap [m]"]) == ("25 s", 2.5)
