@@ -73,6 +73,8 @@ def test_constants_tuned_behind_a_filter_need_its_longest_gap(longest: str, own:
         for name in ("idm_acc", "idm_acc_filtered")
     )
     assert (behind["desired_speed"] < plain["desired_speed"]) == own
+    alone = baseline(load("evaluate", words), "constant_filtered").cfg.scenario
+    assert alone.controllers["automated"]["acceleration"] == 3.0  # full throttle
 
 
 @pytest.mark.parametrize(
