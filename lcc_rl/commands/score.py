@@ -194,7 +194,10 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
         sources: dict[str, EvaluateConfig] = {}
         with leaving_out(task, left_out):
             sources = roads(who, task, given, further)
-        for source in [name for name in sources if name in (wanted or [name])]:
+        chosen = [name for name in sources if name in (wanted or [name])]
+        if sources and not chosen:
+            left_out.append(f"{task}: it has the sources {', '.join(sources)} only")
+        for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):
                 found.append(play(who, source, sources[source], folder / task / source))
     why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"

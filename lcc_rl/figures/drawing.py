@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -163,6 +164,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
         ResultsError: if a file cannot be written.
     """
     path = Path(path)
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells of every letter of a PDF
     for suffix in dict.fromkeys([path.suffix or ".png", *(f".{kind}" for kind in formats)]):
         with atomic_path(path if suffix == path.suffix else path.with_suffix(suffix)) as temporary:
             figure.savefig(temporary, dpi=dpi, format=suffix[1:])

@@ -103,7 +103,9 @@ def study_figures(
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
             yield f"human_energy {name}", human_energy(means, name)
-        for baseline in BASELINES if several else ():
+        # Who collides, and so drives less of an episode, saves nothing.
+        whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
+        for baseline in BASELINES if several and whole else ():
             if baseline in names and baseline != name and name not in UNTRAINED:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure

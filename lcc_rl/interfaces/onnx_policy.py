@@ -83,6 +83,8 @@ class Program:
 
     def __init__(self, path: str) -> None:
         self.path = path
+        if not Path(path).is_file():
+            raise ResultsError(f"{path}: no such file")
         try:
             import onnxruntime as ort
         except ImportError as error:
