@@ -196,7 +196,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
             sources = roads(who, task, given, further)
         chosen = [name for name in sources if name in (wanted or [name])]
         if sources and not chosen:
-            left_out.append(f"{task}: it has the sources {', '.join(sources)} only")
+            left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):
                 found.append(play(who, source, sources[source], folder / task / source))
