@@ -138,6 +138,8 @@ def open_folder() -> Iterator[Path]:
     if user == 0:
         os.seteuid(65534)
     try:
+        if not os.access(__file__, os.R_OK, effective_ids=True):
+            pytest.skip("a clone that only root can read")
         with TemporaryDirectory() as folder:
             yield Path(folder)
     finally:
