@@ -196,7 +196,8 @@ def main(words: Sequence[str] | None = None) -> int:
     figure = space_time(steps, [HUMAN, options.driver], as_plain(cfg))
     assert figure is not None
     figure.axes[1].axvline(options.from_s, color="black", linestyle=":", linewidth=1.0)
-    figure.axes[1].set_title(f"{options.driver}, from {options.from_s:g} s on")
+    title = f"{options.driver}, from {options.from_s:g} s on"
+    figure.axes[1].set_title(title, fontsize=figure.axes[0].title.get_fontsize())
     save(figure, options.folder / "space_time.png", dpi=150)
     rows = [measured(part, options.from_s) for part in parts]
     print(pd.DataFrame(rows, [HUMAN, options.driver]).round(2).to_string())

@@ -113,7 +113,7 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     if not seconds:
         return cfg
     require(cfg.scenario.road == RING, "humans_first needs a ring: a leader's record would end")
-    steps = round(seconds / cfg.scenario.time_step)
+    steps = World(time_step=cfg.scenario.time_step).steps(seconds, "humans_first")
     cfg = deepcopy(cfg)
     drivers, filters = cfg.scenario.controllers, cfg.scenario.filters
     if drivers[AUTOMATED] != drivers[HUMAN]:

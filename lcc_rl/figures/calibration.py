@@ -20,11 +20,11 @@ from lcc_rl.figures.drawing import (
     grid,
     new_figure,
     paper,
-    signed,
     style,
     unbox,
 )
 from lcc_rl.functional.laws import LAWS
+from lcc_rl.results.cells import signed
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
 DRIVERS = {RECORDED: INK, TWINS: "#d55e00", REACTING: "#0072b2"}

@@ -88,16 +88,6 @@ def footnote(figure: Figure, text: str) -> None:
     figure.supxlabel(text, fontsize=7, color=INK)
 
 
-def signed(value: float, form: str = "+.1f") -> str:
-    """Return a number with its sign, a minus as in print.
-
-    Examples:
-        >>> signed(-2.34), signed(2.34)
-        ('−2.3', '+2.3')
-    """
-    return f"{value:{form}}".replace("-", "−")
-
-
 def legend_above(axis: Axes, columns: int = 3) -> None:
     """Put the legend above the frame, where it covers no data."""
     axis.legend(

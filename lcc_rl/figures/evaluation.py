@@ -26,13 +26,13 @@ from lcc_rl.figures.drawing import (
     paper,
     rows_of,
     save,
-    signed,
     style,
 )
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.functional.pattern import AUTOMATED, parse_string
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import headline, in_words
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means

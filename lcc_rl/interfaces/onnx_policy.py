@@ -21,7 +21,7 @@ from pydantic import Field
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.errors import ConfigError, ResultsError, how_to_install, require
+from lcc_rl.errors import ConfigError, ResultsError, how_to_install, one_line, require
 from lcc_rl.pieces.base import Key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.entries import ENTRIES
@@ -158,7 +158,7 @@ def _facts(text: str, path: str) -> ProgramFacts:
 
 def _line(error: Exception) -> str:
     """Return an error of somebody else as one line that is not too long."""
-    return " ".join(str(error).split())[:300]
+    return one_line(str(error))[:300]
 
 
 class OnnxPolicy(Controller):

@@ -16,7 +16,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from pyarrow import fs
 
-from lcc_rl.errors import ResultsError
+from lcc_rl.errors import ResultsError, one_line
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.memory import require_memory
 from lcc_rl.version import __version__
@@ -180,7 +180,7 @@ def unified(schema: pa.Schema, other: pa.Schema, path: Path) -> pa.Schema:
     try:
         return pa.unify_schemas([schema, other], promote_options="permissive")
     except pa.ArrowException as error:
-        raise ResultsError(f"{path}: {_in_one_line(error)}") from error
+        raise ResultsError(f"{path}: {one_line(str(error))}") from error
 
 
 def texts_of(schema: pa.Schema) -> list[str]:
@@ -219,15 +219,11 @@ def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
             raise ResultsError(f"{path}: no such file")
         return reader(path)
     except (pa.ArrowException, OSError) as error:
-        raise ResultsError(f"{path}: not readable as parquet: {_in_one_line(error)}") from error
+        raise ResultsError(f"{path}: not readable as parquet: {one_line(str(error))}") from error
 
 
 def _no_frame(path: str | Path, error: Exception) -> ResultsError:
-    return ResultsError(f"{path}: damaged, no data frame: {_in_one_line(error)}")
-
-
-def _in_one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    return ResultsError(f"{path}: damaged, no data frame: {one_line(str(error))}")
 
 
 def _decoded(text: bytes) -> str:

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from lcc_rl.errors import require
 from lcc_rl.results import headline
+from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import Shown, in_words, saved
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import DRIVE
@@ -97,7 +98,7 @@ def _cells(row: Row) -> dict[str, str]:
     return {
         "score": f"{row['score']:.2f}",
         "saved": saved(*share),
-        "distance": f"{-100.0 * row['distance_lost']:+.1f}".replace("-", "−"),
+        "distance": signed(-100.0 * row["distance_lost"]),
         "flow": headline.MISSING if flow is None else f"{flow:,.0f}",
         "ratio": headline.MISSING if ratio is None else f"{ratio:.2f}",
         "drives": str(row["drives"]),

@@ -22,6 +22,16 @@ class Column(NamedTuple):
     number: bool
 
 
+def signed(value: float, form: str = "+.1f") -> str:
+    """Return a number with its sign, a minus as in print.
+
+    Examples:
+        >>> signed(-2.34), signed(2.34)
+        ('−2.3', '+2.3')
+    """
+    return f"{value:{form}}".replace("-", "−")
+
+
 def columns(frame: pd.DataFrame) -> list[Column]:
     """Return the columns of a table as text.
 
@@ -94,5 +104,5 @@ def _cell(value: object, places: int) -> str:
     if isinstance(value, (int, np.integer)):
         return f"{value:,}"
     if isinstance(value, (float, np.floating)) and np.isfinite(value):
-        return f"{value:,.{places}f}".replace("-", "−")
+        return signed(float(value), f",.{places}f")
     return value if isinstance(value, str) else MISSING

@@ -23,11 +23,11 @@ from lcc_rl.figures.drawing import (
     new_figure,
     paper,
     rows_of,
-    signed,
     style,
 )
 from lcc_rl.figures.training import BAND, draw_curves
 from lcc_rl.functional.power import motor_power
+from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import in_words
 from lcc_rl.results.savings import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
@@ -61,7 +61,7 @@ def power_map() -> Figure:
     filled.set_edgecolor("face")  # no seams in vector formats
     levels = [-150, -100, -50, -20, 0, 20, 50, 100, 150, 200]
     lines = axis.contour(speed, acceleration, power, levels, colors=INK, linewidths=0.7)
-    axis.clabel(lines, fmt=lambda kw: f"{kw:.0f}".replace("-", "−"), fontsize=6)
+    axis.clabel(lines, fmt=lambda kw: signed(kw, ".0f"), fontsize=6)
     ticks = [-200, -100, 0, 100, 200]
     figure.colorbar(filled, label="electric power [kW]\n(below 0: recuperated)", ticks=ticks)
     style(axis, "speed [m/s]", "acceleration [m/s²]")
