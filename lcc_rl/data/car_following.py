@@ -126,12 +126,25 @@ def extract(
         if not keep.any():
             raise DataError(f"no episode is left after the criterion {name!r}:\n{report}")
     entry = np.flatnonzero(np.repeat(keep, lengths))
-    follower, leader = follower[entry], leader[entry]
     report.kept, report.rows = int(keep.sum()), len(entry)
+    number = np.repeat(np.arange(report.kept, dtype=np.int32), lengths[keep])
+    follower, leader, gap = follower[entry], leader[entry], gap[entry]
     names = pd.Categorical.from_codes(recording.codes.to_numpy()[follower], recording.categories)
+    return _episodes(samples, pd.Series(names).astype(str), number, follower, leader, gap), report
+
+
+def _episodes(
+    samples: dict[str, NDArray],
+    recording: pd.Series,
+    number: NDArray[np.int32],
+    follower: NDArray[np.intp],
+    leader: NDArray[np.int64],
+    gap: NDArray,
+) -> pd.DataFrame:
+    """The episode table of rows of followers and of their leaders."""
     episodes = {
-        "episode": np.repeat(np.arange(report.kept, dtype=np.int32), lengths[keep]),
-        "recording": pd.Series(names).astype(str),
+        "episode": number,
+        "recording": recording,
         "follower_id": samples["vehicle"][follower],
         "leader_id": samples["vehicle"][leader],
         "time_s": samples["time_s"][follower],
@@ -140,10 +153,10 @@ def extract(
         "leader_position_m": samples["position_m"][leader],
         "leader_speed_mps": samples["speed_mps"][leader],
         "leader_length_m": samples["length_m"][leader],
-        "gap_m": gap[entry],
+        "gap_m": gap,
     }
     # The samples have the schema's types; a conversion would copy what may be millions of rows.
-    return pd.DataFrame(episodes, copy=False), report
+    return pd.DataFrame(episodes, copy=False)
 
 
 def _pairs(

@@ -130,12 +130,7 @@ def _table(
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read one file."""
     file = TableFile(path)
-    names: dict[str, str | None] = {key: own for key, own in OWN.items() if own in file.header}
-    names |= {new: old for old, new in ALIASES.items() if old in file.header and new not in names}
-    names |= columns
-    missing = [OWN[x.key] for x in FIELDS if x.required and x.key not in names]
-    if missing:
-        raise lacking(path, missing, file.header, "data.columns")
+    names = _names(file, columns)
     read = file.read(FIELDS, names, units, "data.columns")
     if not len(read["time"]):
         raise DataError(f"{path}: has no episodes; expected at least one row")
@@ -169,6 +164,17 @@ def _table(
         derive_positions(table)
         notes.append(DERIVED)
     return table, [*notes, *more]
+
+
+def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str | None]:
+    """What a file calls the columns, by the keys of ``FIELDS``."""
+    names: dict[str, str | None] = {key: own for key, own in OWN.items() if own in file.header}
+    names |= {new: old for old, new in ALIASES.items() if old in file.header and new not in names}
+    names |= columns
+    missing = [OWN[x.key] for x in FIELDS if x.required and x.key not in names]
+    if missing:
+        raise lacking(str(file.path), missing, file.header, "data.columns")
+    return names
 
 
 def _even(

@@ -55,17 +55,7 @@ class OpenAccSource(Settings):
 
 def _cars(table: TableFile, recording: int, driver: str | None, report: ReadReport) -> pd.DataFrame:
     """All cars of a file, one below the other; see :func:`to_trajectories`."""
-    numbers = [int(name[5:]) for name in table.header if re.fullmatch(r"Speed[1-9]\d?", name)]
-    if len(numbers) < 2:
-        raise DataError(f"{table.path}: lacks Speed1 and Speed2; expected a native OpenACC file")
-    speeds = {n: Column(f"Speed{n}", "speed", blank=True) for n in numbers}
-    gaps = {n: Column(f"IVS{n - 1}", "length", blank=True) for n in numbers if n - 1 in numbers}
-    gaps = {n: column for n, column in gaps.items() if column.key in table.header}
-    if not gaps:
-        raise DataError(f"{table.path}: lacks IVS1, IVS2 …; expected a native OpenACC file")
-    drivers = {n: Column(f"Driver{n}", "text", blank=True) for n in numbers}
-    drivers = {n: column for n, column in drivers.items() if column.key in table.header}
-    columns = [Column("Time", "time"), *speeds.values(), *gaps.values(), *drivers.values()]
+    numbers, followers, columns = _columns(table)
     read = table.read(columns, {column.key: column.key for column in columns})
     rows = len(read["Time"])
     blank = np.full(rows, np.nan)
@@ -87,7 +77,7 @@ def _cars(table: TableFile, recording: int, driver: str | None, report: ReadRepo
     order = table.preamble.get("Vehicle_order", "").strip(", ").split(",")
     named = ", ".join(order[n - 1] for n in numbers if n <= len(order) and order[n - 1])
     report.notes.append(f"{table.path}: {len(numbers)} cars{': ' if named else ''}{named}")
-    report.notes.append(f"{table.path}: {_marked(table, gaps, read)}")
+    report.notes.append(f"{table.path}: {_marked(table, followers, read)}")
     if unknown:
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow nobody")
     if driver is not None:
@@ -97,6 +87,23 @@ def _cars(table: TableFile, recording: int, driver: str | None, report: ReadRepo
         report.notes.append(f"{table.path}: {note}")
     cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
+
+
+def _columns(table: TableFile) -> tuple[list[int], list[int], list[Column]]:
+    """Numbers of the cars and of those whose gap there is, and the columns to be read."""
+    numbers = [int(name[5:]) for name in table.header if re.fullmatch(r"Speed[1-9]\d?", name)]
+    if len(numbers) < 2:
+        raise DataError(f"{table.path}: lacks Speed1 and Speed2; expected a native OpenACC file")
+    followers = [n for n in numbers if n - 1 in numbers and f"IVS{n - 1}" in table.header]
+    if not followers:
+        raise DataError(f"{table.path}: lacks IVS1, IVS2 …; expected a native OpenACC file")
+    columns = [
+        Column("Time", "time"),
+        *(Column(f"Speed{n}", "speed", blank=True) for n in numbers),
+        *(Column(f"IVS{n - 1}", "length", blank=True) for n in followers),
+        *(Column(f"Driver{n}", "text", blank=True) for n in numbers),
+    ]
+    return numbers, followers, [x for x in columns if x.key == "Time" or x.key in table.header]
 
 
 def _driven_by(driver: str, gap: pd.Series, who: NDArray) -> tuple[pd.Series, str]:

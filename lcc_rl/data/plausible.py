@@ -81,22 +81,7 @@ class Plausible(Settings):
                 gaps and speeds contradict each other.
         """
         starts = starts_of(table["episode"].to_numpy())
-        first = np.isin(np.arange(len(table)), starts)
-        wrong, lines, advice = np.zeros(len(table), dtype=bool), [], ""
-        for column, words, values, name, found in self._faults(table, first):
-            new = found & ~wrong
-            if name == "max_acceleration":  # not of the change from a sample that is left out
-                new[1:] &= ~wrong[:-1]
-            if not new.any():
-                continue
-            row = int(np.argmax(new))
-            limit = f"{setting}.{name}={getattr(self, name):g}"
-            said = f"{place(row, column)} {words.format(values[row])}, {limit}"
-            more = remedy if name == "max_acceleration" else ""
-            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {said}"
-            lines.append(f"{line}{more and '; to keep it'}{more}")
-            advice = advice or f"{said}; mend the file{more}, or raise that threshold"
-            wrong |= new
+        wrong, lines, advice = self._outside(table, starts, place, setting, remedy)
         kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST)
         lost = 1 - len(kept) / len(table)
         if lost > self.max_share or kept.empty:
@@ -116,6 +101,33 @@ class Plausible(Settings):
             lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
         return kept, [*lines, *more_lines, *self._check_units(kept, source, setting)]
+
+    def _outside(
+        self,
+        table: pd.DataFrame,
+        starts: NDArray[np.intp],
+        place: Callable[[int, str], str],
+        setting: str,
+        remedy: str,
+    ) -> tuple[Mask, list[str], str]:
+        """Samples outside of a threshold, a line for each kind, and what to do about the first."""
+        first = np.isin(np.arange(len(table)), starts)
+        wrong, lines, advice = np.zeros(len(table), dtype=bool), [], ""
+        for column, words, values, name, found in self._faults(table, first):
+            new = found & ~wrong
+            if name == "max_acceleration":  # not of the change from a sample that is left out
+                new[1:] &= ~wrong[:-1]
+            if not new.any():
+                continue
+            row = int(np.argmax(new))
+            limit = f"{setting}.{name}={getattr(self, name):g}"
+            said = f"{place(row, column)} {words.format(values[row])}, {limit}"
+            more = remedy if name == "max_acceleration" else ""
+            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {said}"
+            lines.append(f"{line}{more and '; to keep it'}{more}")
+            advice = advice or f"{said}; mend the file{more}, or raise that threshold"
+            wrong |= new
+        return wrong, lines, advice
 
     def _check_units(self, kept: pd.DataFrame, source: str, setting: str) -> list[str]:
         hard = hard_share(kept)

@@ -110,19 +110,7 @@ def _read(
     divide: bool = True,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Name, drive, time and speed of the plausible samples of one file, and the report."""
-    fields: Sequence[Column] = FIELDS
-    if table.preamble:
-        fields = FIELDS if columns["drive"] is None else NATIVE
-        native = {TIME: "Time", SPEED: "Speed1"}
-        columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
-    read = table.read(fields, columns, units, "leader.columns")
-    samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"]})
-    samples["drive"] = samples["name"] = read.get("drive", stem(table.path))
-    samples["row"] = samples.index
-    if samples.empty:
-        raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
-    samples = samples.sort_values("name", kind="stable", ignore_index=True)
-    samples["episode"] = samples["name"].ne(samples["name"].shift()).cumsum()
+    samples = _samples(table, columns, units)
     step = samples.groupby("episode")[TIME].diff()
     usual = step.groupby(samples["episode"]).transform("median")
     for wrong, words in (
@@ -148,6 +136,26 @@ def _read(
     if table.preamble:
         line += ": native OpenACC, its first car"
     return kept, [line, *table.notes, *said, *lines]
+
+
+def _samples(
+    table: TableFile, columns: Mapping[str, str | None], units: Mapping[str, str]
+) -> pd.DataFrame:
+    """Name, drive, time and speed of every row, by record, and the record's number as episode."""
+    fields: Sequence[Column] = FIELDS
+    if table.preamble:
+        fields = FIELDS if columns["drive"] is None else NATIVE
+        native = {TIME: "Time", SPEED: "Speed1"}
+        columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
+    read = table.read(fields, columns, units, "leader.columns")
+    samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"]})
+    samples["drive"] = samples["name"] = read.get("drive", stem(table.path))
+    samples["row"] = samples.index
+    if samples.empty:
+        raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
+    samples = samples.sort_values("name", kind="stable", ignore_index=True)
+    samples["episode"] = samples["name"].ne(samples["name"].shift()).cumsum()
+    return samples
 
 
 def _divided(

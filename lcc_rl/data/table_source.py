@@ -300,16 +300,13 @@ def _samples(
     if "gap" in columns:  # a vehicle without a gap follows nobody
         leader = np.where(np.isnan(gap), 0, leader)
     ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
-    seen = ahead >= 0
     length = np.nan_to_num(columns.get("length", zero))
     position = columns.get("position", zero)
-    if "gap" in columns:
-        headway = np.where(seen, gap + length[ahead], np.nan)
-        report.headways_given = int(seen.sum())
-    else:
-        headway = np.where(seen, position[ahead] - position, np.nan)
-        report.headways_derived = int(seen.sum())
-    report.headways_unknown = int(((leader > 0) & ~seen).sum())
+    to_leader = gap + length[ahead] if "gap" in columns else position[ahead] - position
+    headway = np.where(ahead >= 0, to_leader, np.nan)
+    seen = int((ahead >= 0).sum())
+    report.headways_given, report.headways_derived = (seen, 0) if "gap" in columns else (0, seen)
+    report.headways_unknown = int(((leader > 0) & (ahead < 0)).sum())
     speed = columns["speed"]
     rate = np.diff(speed, append=speed[-1]) / FRAME
     last = np.append(np.diff(segment) != 0, True)
