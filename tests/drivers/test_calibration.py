@@ -79,7 +79,7 @@ def reference_measures(observed, candidates, model, constants) -> dict[str, torc
     return found
 
 
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("model", "more"), [*((x, {}) for x in LAWS), ("idm", {"exponent": 2.5})])
 def test_errors_are_those_of_the_plain_simulation(model, more, compiled, uneven_lengths):
     observed, names = observe(uneven_lengths), fitted("global", model)

@@ -94,6 +94,7 @@ def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
     assert one_step_error(observed, known, delay) == pytest.approx(noise, abs=0.03)
 
 
+@pytest.mark.slow
 def test_calibration_smooths_drivers_and_the_reaction_restores_them() -> None:
     episodes, _ = followed(0.6, 0.25)
     result = Calibrator(reaction=True)(episodes)

@@ -47,11 +47,11 @@ def test_no_policy_passes_the_limits(action) -> None:
 @pytest.mark.parametrize(
     ("faults", "action"),
     slow_but(
-        [("all", 1.0)], [(x, y) for x in ("actuation", "sensors", "all") for y in (1.0, None)]
+        [("sensors", 1.0)], [(x, y) for x in ("actuation", "sensors", "all") for y in (1.0, None)]
     ),
 )
 def test_faults_need_a_filter_that_reckons_with_them(faults, action) -> None:
-    both = ["+filter=cbf", f"+faults={faults}"]
+    both = ["+filter=cbf", f"+faults={faults}", "scenario.horizon=150"]
     blind, knows = (driven(action, *both, f"{AUTO}.robust={x}") for x in ("false", "true"))
     assert blind["ttc"].min() < 4.0
     assert "promised" not in blind  # it answers for nothing

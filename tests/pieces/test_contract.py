@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from importlib.util import find_spec
+from itertools import product
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from helpers import (
     REWARD,
     TERMS,
     followed_profiles,
+    slow_but,
     small_env,
 )
 from tensordict import TensorDict, TensorDictBase
@@ -288,6 +290,10 @@ def made(road: str) -> dict[str, Piece]:
     return {name: make() for name, make in makers(road).items()}
 
 
+# Every piece is on the drawn road; make test-all drives them on the others, too.
+EACH_ROAD = pytest.mark.parametrize("road", slow_but(["drawn"], STRINGS))
+
+
 def each_piece(check: Callable[[str, str], None]) -> Callable[[str], None]:
     """Check every piece of a road; what the filter replaces is no piece's own any more."""
 
@@ -297,7 +303,7 @@ def each_piece(check: Callable[[str, str], None]) -> Callable[[str], None]:
                 check(road, name)
 
     check_all.__name__ = check.__name__
-    return pytest.mark.parametrize("road", list(STRINGS))(check_all)
+    return EACH_ROAD(check_all)
 
 
 def clock(batch_size: int | tuple[int, ...] = 3) -> Clock:
@@ -360,13 +366,15 @@ def test_every_exported_class_is_under_contract() -> None:
     assert {kind for kind in found if issubclass(kind, Piece)} <= exported
 
 
-@pytest.mark.parametrize("batch_size", [(), 3, (2, 2)])
-@pytest.mark.parametrize("road", list(STRINGS))
+@pytest.mark.parametrize(
+    ("road", "batch_size"),
+    slow_but([("drawn", 3), ("open", ()), ("ring", (2, 2))], product(STRINGS, [(), 3, (2, 2)])),
+)
 def test_environment_of_all_pieces_passes_torchrls_check(road, batch_size) -> None:
     check_env_specs(full_env(road, batch_size), break_when_any_done="both")
 
 
-@pytest.mark.parametrize("road", list(STRINGS))
+@EACH_ROAD
 def test_torchrls_compose_and_this_packages_give_the_same(road) -> None:
     data = played(road)
     env = Traffic(clock(), Pieces(*(make() for make in makers(road).values())))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
-from helpers import MIXED, POPULATION, compose, wavy_profiles
+from helpers import MIXED, POPULATION, compose, slow_but, wavy_profiles
 from torchrl.envs import check_env_specs
 
 from lcc_rl.data.profiles import from_records
@@ -40,8 +41,13 @@ def steady(speed: float = 4.0):
     return constant_profiles(speed, 400, 0.1, ["steady"])
 
 
-@pytest.mark.parametrize("controller", [*MODELS.values(), "calibrated"])
-@pytest.mark.parametrize("delay", [0, 4])
+@pytest.mark.parametrize(
+    ("controller", "delay"),
+    slow_but(
+        [("human", 0), *((x, 4) for x in MODELS.values()), ("calibrated", 4)],
+        product([*MODELS.values(), "calibrated"], [0, 4]),
+    ),
+)
 def test_every_model_passes_torchrls_check_in_any_role(controller, delay) -> None:
     late = f"scenario.controllers.human.delay={delay}"
     population = MIXED if controller == "calibrated" else POPULATION
@@ -90,7 +96,7 @@ def test_a_delay_makes_a_string_less_stable() -> None:
     assert lowest[1] < lowest[0] - 0.3
 
 
-@EACH
+@pytest.mark.parametrize("model", slow_but(["idm"], MODELS))
 def test_noise_is_that_of_the_paper_for_every_model(model) -> None:
     quiet = rolled(human(MODELS[model], QUIET), steps=1, batch=64)["next", "command", "human"]
     noisy = rolled(human(MODELS[model], QUIET.replace("=0", "=0.3")), steps=1, batch=64)
