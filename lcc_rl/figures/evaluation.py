@@ -87,7 +87,7 @@ def study_figures(
         steps: rows of steps.parquet; it may have none.
         cfg: the evaluation's configuration.
     """
-    means, names = Means.of(episodes), list(dict.fromkeys(episodes["strategy"]))
+    means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     string = parse_string(cfg["scenario"]["string"], cfg["scenario"]["road"])
     if not string.drawn and AUTOMATED in string.names:
         steps = steps.assign(cav_place=string.places(AUTOMATED)[0])
@@ -211,7 +211,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
         mean = f"{label}, mean {energy[name].mean():.1f} kJ"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
-    style(left, f"path energy of {whose} [kJ per episode]", "drivers")
+    style(left, f"path energy of {whose}\n[kJ per {means.per}]", "drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(left, 1)
@@ -220,7 +220,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     found = savings(means.windows, column, strategy, baseline)
     _mean_line(right, found, means.windows.loc[means.windows["strategy"] == strategy])
     worse = f"{int((saving < 0).sum())} of {len(saving)} drivers worse off"
-    style(right, f"drivers, sorted ({worse})", "path energy saved [%]")
+    style(right, f"drivers, sorted ({worse})", f"path energy saved\nper {means.per} [%]")
     return figure
 
 
