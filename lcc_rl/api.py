@@ -131,4 +131,4 @@ def _setting(who: Any) -> Any:
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:
     if folder is not None:
         return Path(folder)
-    return Path("outputs") / kind / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{variant}"
+    return Path("outputs") / kind / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{variant}"

@@ -40,7 +40,7 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
-from lcc_rl.results.runs import check_folder, load_config, save_config
+from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, save_config
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -54,7 +54,6 @@ log = logging.getLogger("lcc_rl")
 # all others are passed on to calibration and trainings.
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
-PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last one and its folder
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 NETWORKS, RULE = ("reference", "alcc"), "rule"  # trained by default; the rule by the gradient
 ANALYTIC = "lcc_rl.agents.Analytic"
