@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.savings import BASELINES, NOTHING, WAYS, savings
+from lcc_rl.results.savings import BASELINES, DRIVE, NOTHING, WAYS, savings
 from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
@@ -59,11 +59,13 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     ways = every[list(WAYS)].sum(axis=1).replace(0.0, np.nan)
     windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
     rows = []
-    counts = windows.groupby("strategy")["profile_id"].nunique()
+    kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": "training_seed"}
+    drives = windows.get(DRIVE, windows["profile_id"])
+    counts = windows.assign(**{DRIVE: drives}).groupby("strategy")[list(kinds.values())].nunique()
     for strategy in found.strategies:
         mean, total = every.loc[strategy].to_dict(), sums.loc[strategy].to_dict()
         row: dict[str, object] = {"strategy": strategy, "episodes": int(total["rows"])}
-        row["windows"] = int(counts[strategy])
+        row |= {name: int(counts[key][strategy]) for name, key in kinds.items()}
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = mean[f"{vehicle}_{kind}"]
@@ -118,6 +120,8 @@ ROWS = (
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
     ("windows", "windows", "{:d}"),
+    ("drives or recordings", "drives", "{:d}"),
+    ("training seeds", "seeds", "{:d}"),
     ("episodes", "episodes", "{:d}"),
 )
 

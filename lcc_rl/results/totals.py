@@ -26,6 +26,14 @@ def frames(rows: Rows, columns: Sequence[str], source: str = "") -> Iterator[pd.
         yield kept[kept[SOURCE] == source] if source else kept
 
 
+def sources_of(rows: Rows) -> list[str]:
+    """Return the names of the sources of leaders, in their order; without one only ""."""
+    found: dict[str, None] = {}
+    for frame in frames(rows, [SOURCE]):
+        found |= dict.fromkeys(map(str, frame.get(SOURCE, ())))
+    return list(found) or [""]
+
+
 def _row_groups(rows: pa.dataset.Dataset, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
     known = [name for name in columns if name in rows.schema.names]
     for file in rows.get_fragments():
