@@ -119,8 +119,8 @@ def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(trained, tmp
 
 
 def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> None:
-    cfg = tiny("train", "variant=alcc", "training.episodes=8")  # before the first update
-    training.run(cfg, tmp_path / "same", quiet=True)
+    cfg = tiny("train", "variant=alcc", "agent.batch_size=4096")  # more than it ever collects
+    training.run(cfg, tmp_path, quiet=True)
     assert "changed nothing" in caplog.text
     folders = [api._folder("evaluate", "alcc", None) for _ in range(2)]
     assert folders[0] != folders[1]  # within one second
