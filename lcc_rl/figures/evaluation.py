@@ -30,7 +30,6 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
-from lcc_rl.functional.pattern import AUTOMATED, parse_string
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import column_cells, signed
 from lcc_rl.results.headline import in_words
@@ -95,12 +94,12 @@ def study_figures(
         tables: as in :func:`write_figures`.
     """
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
-    string = parse_string(cfg["scenario"]["string"], cfg["scenario"]["road"])
-    if not string.drawn and AUTOMATED in string.names:
-        steps = steps.assign(cav_place=string.places(AUTOMATED)[0])
     several = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
-    diagram = space_time(steps, [*names[:1], *names[-2:]], cfg) if len(steps) else None
+    seeds = episodes.groupby("strategy")["training_seed"].count()
+    # Human drivers, networks, then the user's own controllers, then the others.
+    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x in UNTRAINED))
+    diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
     if len(steps) and len(tables) == 1 and cars[-1] not in UNTRAINED:
@@ -186,7 +185,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
     # Of several vehicles the first automated one, and the human after those ahead of it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
-    behind = 1 + int(rows.get("cav_place", pd.Series([0])).iloc[0])
+    behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)
     return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 

@@ -115,7 +115,7 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
         row |= {"distance_lost": 1.0 - part[DISTANCE].mean() / whole}
         row |= {column: part[column].mean() for column in MEANS if column in part}
         row |= limits | {"collisions": int(part["collided"].sum())}
-        kept = all(_keeps(column, limits[column], task.limits[column]) for column in limits)
+        kept = all(keeps(column, limits[column], task.limits[column]) for column in limits)
         found.append(row | {"kept": kept and not row["collisions"]})
     return pd.DataFrame(found)
 
@@ -147,7 +147,7 @@ def _worst(part: pd.DataFrame, column: str) -> float:
     return float(part[column].max() if column.startswith(LARGEST) else part[column].min())
 
 
-def _keeps(column: str, value: float, bound: float) -> bool:
+def keeps(column: str, value: float, bound: float) -> bool:
     """Whether a limit is kept; NaN, the value of a vehicle that does not exist, keeps it."""
     return not (value < bound if column.startswith(LEAST) else value > bound)
 
