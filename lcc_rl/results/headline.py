@@ -33,6 +33,7 @@ WHO = {
     "idm tuned": "IDM, tuned on I-80",
     "rule": "IDM, tuned on these data",
     "reference": "network, for itself",
+    "own_energy": "network, for itself, weighted",
     NETWORK: "network, for both",
     "follower_stopper": "FollowerStopper",
     "pi_saturation": "PI with saturation",
@@ -85,6 +86,12 @@ def in_words(name: str) -> str:
     if name in WHO or first in WHO:
         return WHO.get(name) or f"{WHO[first]} ({rest.replace('_', ' ')})"
     return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
+
+
+def worded(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with the names of strategies, where it has any, in words."""
+    names = [name for name in ("strategy", "behind", "against") if name in table]
+    return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
 
 
 def baseline_of(strategies: Iterable[object]) -> str | None:
