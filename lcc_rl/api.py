@@ -10,15 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from rich.console import Console
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET, path_of
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.results.headline import headline
+from lcc_rl.results.headline import Shown
 from lcc_rl.results.tables import summary
 from lcc_rl.settings import values
+
+WIDTH = 80  # characters
 
 
 @dataclass(frozen=True)
@@ -29,10 +33,21 @@ class Run:
         folder: its files: configuration, parquet tables, and the policy of a training.
         rows: one row per episode, or vehicle of an episode, as in episodes.parquet; of many a
             dataset that is not read yet.
+        cfg: its configuration.
+
+    ``print(run)`` shows the tables that commands print.
     """
 
     folder: Path
     rows: Rows
+    cfg: StudyConfig
+
+    def __str__(self) -> str:
+        console = Console(width=WIDTH)
+        with console.capture() as text:
+            for one in evaluation.found(self.rows, self.cfg):
+                console.print(one.drawn(one.of))
+        return text.get().rstrip()
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -41,8 +56,17 @@ class Run:
 
     @cached_property
     def headline(self) -> pd.DataFrame:
-        """The table that commands print, with energy per vehicle and km, distance and safety."""
-        return headline(self.table)
+        """The table that commands print: energy or a task's score, distance and safety.
+
+        Of several sources of leaders, or cases of a platoon, the rows of each, named in ``of``.
+        """
+        tables = {one.of: one.short for one in evaluation.found(self.rows, self.cfg)}
+        first, *others = tables.values()
+        if not others:
+            return first
+        together = pd.concat([table.assign(of=of) for of, table in tables.items()])
+        together.attrs["shown"] = (Shown("of", "of"), *first.attrs["shown"])
+        return together
 
     @cached_property
     def training(self) -> pd.DataFrame:
@@ -78,7 +102,7 @@ def learn(
     """
     target = _folder("train", variant, folder)
     cfg = load("train", [f"variant={variant}", *overrides])
-    return Run(target, training.run(cfg, target, quiet=True, resume=True))
+    return Run(target, training.run(cfg, target, quiet=True, resume=True), cfg)
 
 
 def compare(
@@ -114,7 +138,7 @@ def compare(
         cfg.compare = {name: _setting(who) for name, who in strategies.items()}
     else:
         cfg.compare = [_setting(who) for who in strategies]
-    return Run(target, evaluation.run(cfg, target, own=False, quiet=True))
+    return Run(target, evaluation.run(cfg, target, own=False, quiet=True), cfg)
 
 
 def _setting(who: Any) -> Any:
@@ -131,4 +155,4 @@ def _setting(who: Any) -> Any:
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:
     if folder is not None:
         return Path(folder)
-    return Path("outputs") / kind / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{variant}"
+    return Path("outputs") / kind / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{variant}"

@@ -11,6 +11,7 @@ import torch
 from commands import QUICK, TINY, UNTRAINED, jobs_in_threads, run_command, tiny
 
 import lcc_rl
+from lcc_rl import api
 from lcc_rl.commands import evaluation, training
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.policies import load_policy
@@ -115,6 +116,14 @@ def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(trained, tmp
     own = found.rows[found.rows["strategy"] == "alcc"].reset_index(drop=True)
     columns = ["profile_id", "driver_id", "total_energy_kj"]
     pd.testing.assert_frame_equal(own[columns], run.rows[columns])
+
+
+def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> None:
+    cfg = tiny("train", "variant=alcc", "agent.batch_size=4096")  # more than it ever collects
+    training.run(cfg, tmp_path, quiet=True)
+    assert "changed nothing" in caplog.text
+    folders = [api._folder("evaluate", "alcc", None) for _ in range(2)]
+    assert folders[0] != folders[1]  # within one second
 
 
 @pytest.mark.slow

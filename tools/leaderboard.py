@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from timeit import repeat
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,8 +36,10 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces import Controller
 from lcc_rl.results.board import as_markdown
+from lcc_rl.results.cells import signed
+from lcc_rl.results.headline import in_words, saved
 from lcc_rl.results.runs import load_config
-from lcc_rl.results.scores import LEAST, SHARE, Task, scores
+from lcc_rl.results.scores import HEADINGS, LEAST, SHARE, Task, keeps, scores
 
 BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
 DECISIONS, WARM_UP = 200, 20
@@ -92,40 +96,52 @@ def scored(folder: Path) -> tuple[str, pd.DataFrame]:
 
 
 def drawn(task: Task, table: pd.DataFrame) -> str:
-    """Return the Markdown table of a task."""
-    bounds = (bounded(column, bound) for column, bound in task.limits.items())
-    head = ["strategy", task.label, f"saved against {task.against}", "distance lost", *bounds]
-    head += ["flow", "spread at the end", "per decision"]
-    lines = [head]
+    """Return the Markdown table of a task; the kept scores hold every measure."""
+    head = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h]", "limits"]
+    lines = [[*head, "decision [ms]"]]
     for row in table.to_dict("records"):
-        name, decision = str(row["strategy"]), row["decision_ms"]
-        interval = f"{row['saving']:+.1%} ({row['saving_low']:+.1%} … {row['saving_high']:+.1%})"
+        share = (100.0 * row[f"saving{end}"] for end in ("", "_low", "_high"))
         cells = [
-            f"**{name}**" if row["kept"] else name,
+            in_words(str(row["strategy"])),
             f"{row['score']:.2f}",
-            interval if np.isfinite(row["saving"]) else "",
-            f"{row['distance_lost']:+.1%}",
-            *(measured(column, row[column]) for column in task.limits),
-            f"{row['flow_vph']:,.0f}/h",
-            f"{row['final_speed_spread_mps']:.2f} m/s",
-            f"{decision:.2f} ms" if np.isfinite(decision) else "",
+            saved(*share),
+            signed(round(-100.0 * row["distance_lost"], 1) + 0.0),
+            f"{row['flow_vph']:,.0f}",
+            "kept" if row["kept"] else broken(task, row),
+            f"{row['decision_ms']:.2f}" if np.isfinite(row["decision_ms"]) else "",
         ]
         lines.append(cells)
     first, *others = ("| " + " | ".join(cells) + " |" for cells in lines)
-    return "\n".join([first, "|" + "---|" * len(head), *others])
+    bounds = ", ".join(bounded(column, bound) for column, bound in task.limits.items())
+    words = f"Saved against {in_words(task.against)}. Limits: {bounds or 'no collision'}."
+    return "\n".join([words, "", first, "|" + "---|" * len(lines[0]), *others])
 
 
 def bounded(column: str, bound: float) -> str:
     """Return a column and its limit in words."""
-    sign = "≥" if column.startswith(LEAST) else "≤"
-    return f"{column} {sign} " + (f"{bound:.2%}" if column.startswith(SHARE) else f"{bound:g}")
+    return f"{named(column)} {'≥' if column.startswith(LEAST) else '≤'} {measured(column, bound)}"
+
+
+def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
+    """Return the limits that are not kept with their values, or the collisions."""
+    found = [
+        f"{named(column)} {measured(column, row[column])}"
+        for column, bound in task.limits.items()
+        if not keeps(column, row[column], bound)
+    ]
+    return "; ".join(found) or f"{row['collisions']} collisions"
+
+
+def named(column: str) -> str:
+    """Return the words of a limited column without its bound."""
+    return re.split(r"\s*[≤≥]", HEADINGS[column].replace("\n", " "))[0]
 
 
 def measured(column: str, value: float) -> str:
-    """Return a value of a limited column."""
-    if not np.isfinite(value):
-        return ""
-    return f"{value:.2%}" if column.startswith(SHARE) else f"{value:.2f}"
+    """Return a value of a limited column with its unit."""
+    if column.startswith(SHARE):
+        return f"{100.0 * value:.2f} %"
+    return f"{value:.0f} m" if column.endswith("_m") else f"{value:.2f} s"
 
 
 def write_tables(reference: Path, page: Path) -> None:
@@ -143,7 +159,7 @@ def write_tables(reference: Path, page: Path) -> None:
         limits = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
         given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
         task = Task(name=path.stem, limits=limits, **given)
-        parts.append(f"### {path.stem}\n\n{first['windows']} windows.\n\n{drawn(task, table)}\n")
+        parts.append(f"### {path.stem}\n\n{first['windows']} windows. {drawn(task, table)}\n")
     _write_between(page, parts)
 
 

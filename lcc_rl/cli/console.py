@@ -21,6 +21,7 @@ HYDRA = {
 }
 TOOLS = {
     "status": ("lcc_rl.cli.status", "what runs are running, waiting, finished, failed"),
+    "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
     "score": ("lcc_rl.commands.score", "any policy on every task and source that it fits"),
     "animate": ("lcc_rl.commands.animate", "episodes as a moving picture: page, SVG, GIF, MP4"),
     "maps": ("lcc_rl.commands.maps", "what policies do over gap and relative speed"),

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
+from rich.table import Table
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import check_evaluation, check_installed, check_measured, check_variant
@@ -42,6 +44,7 @@ from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import Task
 from lcc_rl.results.tables import leader_too_fast, summary
+from lcc_rl.results.totals import sources_of
 from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -125,7 +128,7 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
         # Here: a training, which draws nothing, need not load matplotlib.
         from lcc_rl.figures.evaluation import write_figures
 
-        write_figures(folder, cfg.evaluation.rows)
+        write_figures(folder, cfg.evaluation.rows, [one.short for one in found(rows, cfg)])
     elif not quiet:
         log.info("no figures: there are more than %d rows", FEW)
     return rows
@@ -316,32 +319,67 @@ def _play_missing(
                 progress.update(done)
 
 
-def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
-    """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
-    full = cfg.table == "all"
+class Found(NamedTuple):
+    """All measures of an evaluation behind one source of leaders, or of a case of a platoon.
+
+    Args:
+        of: name of the source or case; empty where there is only one.
+        table: a row per strategy.
+        shorten: returns what a reader asks first.
+        draw_all: draws the whole table under a title.
+    """
+
+    of: str
+    table: pd.DataFrame
+    shorten: Callable[[pd.DataFrame], pd.DataFrame]
+    draw_all: Callable[[pd.DataFrame, str], Table]
+
+    @property
+    def short(self) -> pd.DataFrame:
+        """The table that commands print."""
+        return self.shorten(self.table)
+
+    def drawn(self, title: str, full: bool = False) -> Table:
+        """Return the table for the terminal, with ``full`` all of it."""
+        if full:
+            return self.draw_all(self.table, title)
+        return headline.as_rich(self.short, title, headline.caption_of(self.short))
+
+
+def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
+    """Yield what the rows of an evaluation show: of a task its scores."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
-        draw = string_tables.in_full if full else string_tables.as_rich
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
-                show(draw(string_tables.case_table(part, case), f"{of}{case}"))
+                table = string_tables.case_table(part, case)
+                yield Found(f"{of}{case}", table, string_tables.headline, string_tables.in_full)
         return
-    plan, task = episodes.plan_of(cfg, inputs), task_of(cfg)
-    drivers = f"{len(plan.chosen)} drivers"
-    drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
-    drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
-    for source, count in Counter(inputs.evaluation.sources or [""] * plan.profiles).items():
-        of = f"{source}: " if source else ""
-        title = f"{of}{count} held-out profiles × {drivers}, {cfg.scenario.horizon} steps"
+    task, energy = task_of(cfg), build_energy(cfg)
+    for source in sources_of(rows):
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
-            table = scores.scores(part, task, build_energy(cfg))
-            show((scores.in_full if full else scores.as_rich)(table, task, f"{task.name}: {title}"))
-        elif full:
-            show(headline.in_full(summary(rows, source), title))
+            short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
+            yield Found(source, scores.scores(part, task, energy), short, full)
         else:
-            table = headline.headline(summary(rows, source))
-            show(headline.as_rich(table, title, headline.caption_of(table)))
+            short = partial(headline.headline, energy=energy)
+            yield Found(source, summary(rows, source), short, headline.in_full)
+
+
+def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
+    """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
+    plan = episodes.plan_of(cfg, inputs)
+    drivers = f"{len(plan.chosen)} drivers"
+    drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
+    drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
+    counts = Counter(inputs.evaluation.sources or [""] * plan.profiles)
+    for one in found(rows, cfg):
+        title = one.of
+        if one.of in counts:
+            of = [x for x in (cfg.task and str(cfg.task["name"]), one.of) if x]
+            size = f"{counts[one.of]} held-out profiles × {drivers}, {cfg.scenario.horizon} steps"
+            title = ": ".join([*of, size])
+        show(one.drawn(title, cfg.table == "all"))
     if words := headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step):
         log.info(words)

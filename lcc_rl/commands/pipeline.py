@@ -30,7 +30,7 @@ from lcc_rl.config.schemas import (
     TrainConfig,
 )
 from lcc_rl.data.episodes import write_episodes
-from lcc_rl.envs.inputs import build_source, load_inputs
+from lcc_rl.envs.inputs import build_energy, build_source, load_inputs
 from lcc_rl.errors import Concern, ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
@@ -40,7 +40,8 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
-from lcc_rl.results.runs import check_folder, load_config, save_config
+from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, save_config
+from lcc_rl.results.tables import summary
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -54,7 +55,6 @@ log = logging.getLogger("lcc_rl")
 # all others are passed on to calibration and trainings.
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
-PARTS, FINAL = ".parts", "evaluation"  # configurations of the parts; the last one and its folder
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 NETWORKS, RULE = ("reference", "alcc"), "rule"  # trained by default; the rule by the gradient
 ANALYTIC = "lcc_rl.agents.Analytic"
@@ -149,11 +149,13 @@ def _run(
         place = folder / FINAL / "figures" / "learning_curve.png"
         save(curve, place, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
-        write_figures(folder / FINAL)
-        limit = held_to(trainings.values())
-        page, found = write_page(folder, [command], limit)
-        table = headline(found)
-        title = f"Leader, car, human behind it: {sample_of(rows)}"
+        limit, size = held_to(trainings.values()), sample_of(rows)
+        found = summary(rows)
+        table = headline(found, build_energy(final))
+        write_figures(folder / FINAL, tables=[table])
+        words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
+        page = write_page(folder, [command], found, words, (size, table))
+        title = f"Leader, car, human behind it: {size}"
         show(as_rich(table, title, caption_of(table, limit)))
         tell(verdict(found))
         tell(f"rows, figures and policies: {folder}")

@@ -184,7 +184,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     """Play all tasks that fit and write the scores; return them."""
     who = scored(options.who, tuple(options.trust))
     name = re.sub(r"\W+", "_", who.label)
-    default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}"
+    default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{name}"
     folder = own_folder(options.out or default, "--out", lambda names: False)
     own = dict(map(_source, options.source))
     given, wanted = {**SOURCES, **own}, {*options.on, *own} if options.on else None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from copy import deepcopy
 from pathlib import Path
 
 import pandas as pd
+import torch
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
@@ -131,6 +133,7 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
     profiles = inputs.to_learn_from()
     agent.take(profiles)
     trainer = make_trainer(cfg, agent, profiles, inputs.population, folder)
+    first = deepcopy(agent.policy.state_dict())
     if resume:
         trainer.load()
     save_config(cfg, folder)
@@ -139,6 +142,12 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
     )
     with build_logger(cfg).opened(folder) as trainer.on_row:
         trainer.run()
+    weights = agent.policy.state_dict()
+    if all(torch.equal(weights[name], value) for name, value in first.items()):
+        log.warning(
+            "the training changed nothing: it took no step, or every gradient was 0; the rows are "
+            "of the initial policy"
+        )
     if trainer.best is not None:
         save_policy(agent.policy.state_dict(), cfg, folder / LAST)
         agent.policy.load_state_dict(trainer.best["weights"])

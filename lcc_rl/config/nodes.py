@@ -31,13 +31,13 @@ def path_of(kind: Any) -> str:
     Raises:
         ConfigError: if a module does not hold it by its name.
     """
-    path = f"{kind.__module__}.{kind.__qualname__}"
-    if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
+    module, name = (getattr(kind, key, None) for key in ("__module__", "__qualname__"))
+    if not module or not name or getattr(import_module(module), name, None) is not kind:
         raise ConfigError(
-            f"{path} cannot be named in a configuration: define it at the top of a module, of a "
-            "script or of a notebook"
+            f"{name or kind!r} cannot be named in a configuration: define it at the top of a "
+            "module, of a script or of a notebook"
         )
-    return path
+    return f"{module}.{name}"
 
 
 def find_target(target: str, where: str) -> Any:

@@ -57,7 +57,10 @@ Groups = dict[str, dict[str, Tensor]]
 
 
 def grouped(record: Record, string: VehicleString) -> Groups:
-    """Divide a record into the leader's, that of the automated vehicles and that of all others."""
+    """Divide a record into the leader's, that of the automated vehicles and that of all others.
+
+    The automated vehicles have their places in the string, 0 at the front.
+    """
     groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
     own = list(string.places(AUTOMATED))
     others = [place for place in range(len(string)) if place not in own]
@@ -70,6 +73,8 @@ def grouped(record: Record, string: VehicleString) -> Groups:
             for group, places in (("cav", own), ("hdv", others)):
                 if places:
                     groups[group][name] = entry[..., _slice(places), :]
+            if own:
+                groups["cav"]["place"] = torch.tensor(own).expand(*entry.shape[:2], len(own))
         elif space == "vehicles":
             index = record[INDEX][0]
             place = torch.arange(len(string), device=index.device)

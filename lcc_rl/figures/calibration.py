@@ -118,7 +118,7 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
     figure.suptitle(
         f"{len(table)} drivers, {mode} calibration; correlation of $v_0$ and $T$:\n"
         f"{_pearson(speed, gap)} of all, "
-        f"{_pearson(speed[~bound], gap[~bound])} of those with $v_0$ identified"
+        f"{_pearson(speed[~bound], gap[~bound])} of those with $v_0$ inside its bounds"
     )
     return figure
 
@@ -213,10 +213,10 @@ def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
 def _scatter(
     axis: Axes, speed: np.ndarray, gap: np.ndarray, bound: np.ndarray, colour: str
 ) -> None:
-    """Draw a dot for every driver, hollow where v0 lies on a bound and is not identified."""
+    """Draw a dot for every driver, hollow where v0 lies on a bound."""
     known = ~bound
     hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": SOFT, "linewidths": 0.8}
-    label = f"$v_0$ identified ({known.sum()})"
+    label = f"$v_0$ inside its bounds ({known.sum()})"
     axis.scatter(speed[known], gap[known], 16, colour, alpha=0.6, linewidths=0, label=label)
     if bound.any():
         label = f"$v_0$ on a bound ({bound.sum()}, {100 * bound.mean():.0f} %)"

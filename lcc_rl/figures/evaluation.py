@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +30,13 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
-from lcc_rl.functional.pattern import AUTOMATED, parse_string
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.cells import signed
-from lcc_rl.results.headline import headline, in_words
+from lcc_rl.results.cells import column_cells, signed
+from lcc_rl.results.headline import in_words
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, savings
-from lcc_rl.results.tables import summary
 
 VEHICLES = {
     "leader": ("leader", INK),
@@ -47,12 +45,16 @@ VEHICLES = {
 }
 
 
-def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
+def write_figures(
+    folder: str | Path, rows: str = "episodes", tables: Sequence[pd.DataFrame] = ()
+) -> list[Path]:
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
         folder: holds config.yaml, episodes.parquet and steps.parquet.
         rows: what a row of episodes.parquet is of, ``episodes`` or ``vehicles``.
+        tables: the tables that the evaluation printed; of a single one, ``overview`` shows the
+            savings.
 
     Returns:
         The figures' paths.
@@ -64,7 +66,7 @@ def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
     steps, cfg = read_parquet(folder / "steps.parquet"), stored_config(folder)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
-        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg)
+        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, tables)
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
@@ -76,7 +78,10 @@ def write_figures(folder: str | Path, rows: str = "episodes") -> list[Path]:
 
 
 def study_figures(
-    episodes: pd.DataFrame, steps: pd.DataFrame, cfg: Mapping[str, Any]
+    episodes: pd.DataFrame,
+    steps: pd.DataFrame,
+    cfg: Mapping[str, Any],
+    tables: Sequence[pd.DataFrame] = (),
 ) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of all that an evaluation with a row per episode shows.
 
@@ -86,18 +91,19 @@ def study_figures(
         episodes: rows of episodes.parquet.
         steps: rows of steps.parquet; it may have none.
         cfg: the evaluation's configuration.
+        tables: as in :func:`write_figures`.
     """
-    means, names = Means.of(episodes), list(dict.fromkeys(episodes["strategy"]))
-    string = parse_string(cfg["scenario"]["string"], cfg["scenario"]["road"])
-    if not string.drawn and AUTOMATED in string.names:
-        steps = steps.assign(cav_place=string.places(AUTOMATED)[0])
+    means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     several = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
-    diagram = space_time(steps, [*names[:1], *names[-2:]], cfg) if len(steps) else None
+    seeds = episodes.groupby("strategy")["training_seed"].count()
+    # Human drivers, networks, then the user's own controllers, then the others.
+    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x in UNTRAINED))
+    diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and {"human", "idm"} & set(names) and cars[-1] not in UNTRAINED:
-        yield "overview", overview(episodes, steps, cars[-1])
+    if len(steps) and len(tables) == 1 and cars[-1] not in UNTRAINED:
+        yield "overview", overview(episodes, steps, cars[-1], tables[0])
     for name in [name for name in cars if name not in UNTRAINED] or cars:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
@@ -132,27 +138,29 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 
 @paper
-def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str) -> Figure:
-    """Speeds of one episode, and the energy per vehicle and km that each strategy saves."""
+def overview(
+    episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, table: pd.DataFrame
+) -> Figure:
+    """Speeds of one episode, and what each strategy of a printed table saves."""
     figure = new_figure(PAGE, 2.7)
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
     left.set_title(f"one held-out episode: {in_words(strategy)}", loc="left", pad=16)
     legend_above(left)
-    table = headline(summary(episodes))
     against = str(table.attrs["against"])
+    what, _, unit = str(table.attrs["label"]).removesuffix("]").partition(" [")
     dots(right, range(len(table)), table.fillna({"saved_pct": 0.0}), "saved_pct", INK)
     right.axvline(0.0, color=SOFT, lw=0.8, zorder=0)
     rows_of(right, list(table["strategy"]))
-    for place, energy in enumerate(table["energy_kj_per_km"]):
+    for place, value in enumerate(column_cells(table, table.attrs["score"])):
         look: dict[str, Any] = {"va": "center", "ha": "right", "fontsize": 7}
         transform = right.get_yaxis_transform()
-        right.annotate(f"{energy:.0f} kJ/km", (1.0, place), xycoords=transform, **look)
+        right.annotate(f"{value} {unit}", (1.0, place), xycoords=transform, **look)
     low, high = right.get_xlim()
     right.set_xlim(low, high + 0.3 * (high - low))
     sizes = (episodes[name].nunique() for name in ("profile_id", "driver_id"))
-    style(right, f"path energy per km saved\nagainst {in_words(against)} [%]")
+    style(right, f"{what} saved\nagainst {in_words(against)} [%]")
     title = "{} windows × {} drivers; lines: 95 % intervals".format(*sizes)
     right.set_title(title, loc="right", pad=16)
     return figure
@@ -177,7 +185,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
     # Of several vehicles the first automated one, and the human after those ahead of it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
-    behind = 1 + int(rows.get("cav_place", pd.Series([0])).iloc[0])
+    behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)
     return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 
@@ -211,7 +219,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
         mean = f"{label}, mean {energy[name].mean():.1f} kJ"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
-    style(left, f"path energy of {whose} [kJ per episode]", "drivers")
+    style(left, f"path energy of {whose}\n[kJ per {means.per}]", "drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(left, 1)
@@ -220,7 +228,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     found = savings(means.windows, column, strategy, baseline)
     _mean_line(right, found, means.windows.loc[means.windows["strategy"] == strategy])
     worse = f"{int((saving < 0).sum())} of {len(saving)} drivers worse off"
-    style(right, f"drivers, sorted ({worse})", "path energy saved [%]")
+    style(right, f"drivers, sorted ({worse})", f"path energy saved\nper {means.per} [%]")
     return figure
 
 

@@ -11,18 +11,9 @@ from lcc_rl.agents.limits import RECORDED
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
-from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import (
-    AGAINST,
-    COLUMNS,
-    caption_of,
-    headline,
-    in_words,
-    sample_of,
-    verdict,
-)
+from lcc_rl.results.headline import AGAINST, for_print, in_words
 from lcc_rl.results.savings import UNTRAINED
-from lcc_rl.results.tables import ROWS, summary
+from lcc_rl.results.tables import ROWS
 
 TITLE = "lcc_rl: data → drivers → policies → results"
 LIMIT = "efficiency"
@@ -59,33 +50,35 @@ def held_to(trainings: Iterable[StudyConfig]) -> str:
 
 
 def write_page(
-    folder: str | Path, commands: Sequence[str], limit: str = ""
-) -> tuple[Path, pd.DataFrame]:
+    folder: str | Path,
+    commands: Sequence[str],
+    found: pd.DataFrame,
+    words: str,
+    headline: tuple[str, pd.DataFrame],
+) -> Path:
     """Write ``report.html`` of a job: the headline, figures, drivers, and how it was made.
 
     Args:
         folder: the job's folder, with ``evaluation``, ``calibration`` and a folder per training.
         commands: what was typed.
-        limit: what the networks are held to, see :func:`held_to`.
+        found: the summary of its evaluation.
+        words: what came out.
+        headline: the table that the command prints, and what it is of.
 
     Returns:
-        The page's path, and the summary of its evaluation.
+        The page's path.
 
     Raises:
-        ResultsError: if a table is missing, or the page cannot be written.
+        ResultsError: if the page cannot be written.
     """
     page = Page(folder)
-    episodes = read_parquet(page.folder / "evaluation" / "episodes.parquet")
-    found = summary(episodes)
-    table = headline(found)
+    size, table = headline
 
     def figures(names: dict[str, str]) -> list[tuple[str, str, Path]]:
         paths = {page.folder / f"{name}.png": caption for name, caption in names.items()}
         return [("", caption, path) for path, caption in paths.items() if path.exists()]
 
-    shown = table.rename(columns={"who": COLUMNS[0].heading})
-    words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
-    page.add("Results", words, [("", sample_of(episodes), shown)], figures(RESULTS))
+    page.add("Results", words, [("", size, for_print(table))], figures(RESULTS))
     learned = [str(name) for name in table["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
@@ -98,7 +91,7 @@ def write_page(
         if drawn := figures(names):
             page.add(heading, figures=drawn)
     page.add("All measures", tables=[("", "Means per strategy", _transposed(found))])
-    return page.write(TITLE, commands), found
+    return page.write(TITLE, commands)
 
 
 def _transposed(found: pd.DataFrame) -> pd.DataFrame:

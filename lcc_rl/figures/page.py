@@ -23,6 +23,7 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import PROCESSOR, parquet_metadata, write_parquet
 from lcc_rl.results.cells import as_markdown, columns
+from lcc_rl.results.headline import worded
 
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")
@@ -64,7 +65,7 @@ class Page:
             if name:
                 write_parquet(frame, self.folder / "tables" / f"{name}.parquet")
                 self.tables[name] = frame
-            shown.append((_line(caption), columns(frame)))
+            shown.append((_line(caption), columns(worded(frame))))
         for name, caption, figure in figures:
             if isinstance(figure, Figure):
                 place = self.folder / "figures" / f"{name}.png"
@@ -85,7 +86,7 @@ class Page:
             begin, name, end = found.groups()
             if name not in self.tables:
                 raise ResultsError(f"{page}: no table {name!r}; known: {', '.join(self.tables)}")
-            return f"{begin}\n\n{as_markdown(self.tables[name])}\n\n{end}"
+            return f"{begin}\n\n{as_markdown(worded(self.tables[name]))}\n\n{end}"
 
         text = MARKED.sub(table, page.read_text())
         with atomic_path(page) as part:

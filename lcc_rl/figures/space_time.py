@@ -35,7 +35,7 @@ def space_time(
 
     Args:
         steps: rows of steps.parquet.
-        names: the strategies to show, at most :data:`WIDEST`.
+        names: the strategies to show; the first :data:`WIDEST` that drive the whole string.
         cfg: the evaluation's configuration.
         every: rows between the points of a line.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -51,15 +52,19 @@ def training_figure(training: pd.DataFrame) -> Figure:
     legend_above(first, 1)
     for axis, name in zip(others, limits, strict=True):
         draw_curves(axis, training.assign(percent=100.0 * training[name]), "percent")
+        top = 0.0  # after the first fifth, whose batches would set the scale
         for line in axis.lines:
             line.set_label("")
+            values = np.asarray(line.get_ydata(), float)
+            top = max(top, float(values[len(values) // 5 :].max()))
         what = name.removeprefix(SHARE)
         bound = training.get(f"limit_{what}")
         if bound is not None and bound.nunique() == 1:  # all runs have the same limit
             percent = 100.0 * float(bound.iloc[0])
             axis.axhline(percent, color=INK, lw=0.8, ls="--", label=f"limit {percent:.3g} %")
-            axis.set_ylim(0.0, max(4.0 * percent, 1e-3))  # the first batches would set the scale
             legend_above(axis)
+            top = max(top, percent)
+        axis.set_ylim(0.0, max(1.2 * top, 1e-3))
         style(axis, "training episodes", f"{LIMITS.get(what, what)} [% of the time]")
     footnote(figure, BAND.replace("\n", " "))
     return figure
@@ -75,7 +80,7 @@ def learning_curve(training: pd.DataFrame) -> Figure:
     figure = new_figure(COLUMN, 2.7)
     axis = figure.subplots()
     floor, _ = draw_curves(axis, training, "episode_reward")
-    axis.set_ylim(bottom=1.6 * floor - 1.0)
+    axis.set_ylim(bottom=1.25 * floor - 0.1)
     style(axis, "training episodes", f"mean reward per episode\n(rolling mean of {WINDOW} batches)")
     legend_above(axis, 1)
     footnote(figure, BAND)

@@ -151,6 +151,11 @@ def _facts(text: str, path: str) -> ProgramFacts:
         about = json.loads(text)
     except ValueError as error:
         raise ResultsError(f"{path}: its metadata {ABOUT} are no JSON: {_line(error)}") from error
+    require(
+        about != {},
+        f"{path}: it lacks the metadata {ABOUT}, which name its inputs; docs/interfaces.md "
+        "(Policies made elsewhere) shows how to write them",
+    )
     require(isinstance(about, dict), f"{path}: its metadata {ABOUT} must be a JSON object")
     own = {key: about[key] for key in ("inputs", "output") if key in about}
     return parse(ProgramFacts, own, f"{path}, metadata {ABOUT}")

@@ -80,8 +80,9 @@ def as_rich(who: str, rows: Sequence[Row]) -> Table:
             lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
-        "saved, distance: against the baseline; 95 % interval over drives, or over windows where "
-        "there are fewer than five drives; score.json has every limit and value."
+        "saved, distance: against the baseline; 95 % interval over drives; over windows where "
+        "there are fewer than five drives, too narrow if one drive has several; score.json has "
+        "every limit and value."
     )
     return headline.as_rich(pd.DataFrame(lines), in_words(who), caption, COLUMNS)
 

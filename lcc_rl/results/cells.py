@@ -9,7 +9,7 @@ import pandas as pd
 
 # A column's unit by the end of its name.
 UNITS = {"kj_per_km": "kJ/km", "mps3": "m/s³", "mps": "m/s", "pct": "%", "kj": "kJ", "ms": "ms"}
-UNITS |= {"m": "m", "s": "s"}
+UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 MISSING = "–"
 
@@ -53,6 +53,15 @@ def as_markdown(frame: pd.DataFrame) -> str:
     rows = [[column.heading for column in shown], ["---"] * len(shown)]
     rows += map(list, zip(*(column.cells for column in shown), strict=True))
     return "\n".join("| " + " | ".join(row).replace("|e_v|", "abs e_v") + " |" for row in rows)
+
+
+def as_latex(frame: pd.DataFrame) -> str:
+    """Return a table for LaTeX (package booktabs), with headings and cells as on a page."""
+    shown = columns(frame)
+    cells = pd.DataFrame({column.heading: column.cells for column in shown})
+    places = "".join("r" if column.number else "l" for column in shown)
+    text = cells.to_latex(index=False, escape=True, column_format=places).rstrip()
+    return text.replace("−", "$-$").replace(" … ", " to ").replace(MISSING, "--")
 
 
 def heading(column: str) -> str:

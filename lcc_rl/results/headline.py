@@ -12,9 +12,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from lcc_rl.energy import Fleet
 from lcc_rl.results.cells import MISSING, column_cells
+from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import KEYS
 from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
+from lcc_rl.results.units import burns_one_fuel, per_distance
 
 HUMAN, NETWORK = "human", "alcc"
 WHO = {
@@ -22,11 +25,15 @@ WHO = {
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
     "constant_filtered": "safety filter alone",
-    "idm_acc_filtered": "tuned IDM, filtered",
+    "idm_acc": "tuned IDM",
+    "acc": "tuned ACC",
+    "mpc": "MPC",
+    "mpc_far": "MPC, longer gaps",
     "acc tuned": "ACC, tuned on I-80",
     "idm tuned": "IDM, tuned on I-80",
     "rule": "IDM, tuned on these data",
     "reference": "network, for itself",
+    "own_energy": "network, for itself, weighted",
     NETWORK: "network, for both",
     "follower_stopper": "FollowerStopper",
     "pi_saturation": "PI with saturation",
@@ -44,7 +51,7 @@ CAPTION = (
     "the time: "
     "time-to-collision < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
 )
-COMPARED = "saved: against {}, with the 95 % interval over windows; distance against theirs; "
+COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
 
 
 class Shown(NamedTuple):
@@ -57,6 +64,7 @@ class Shown(NamedTuple):
 COLUMNS = (
     Shown("who", "driven by"),
     Shown("energy_kj_per_km", "energy\n[kJ/km]"),
+    Shown("fuel_g_per_km", "fuel\n[g/km]"),
     Shown("saved_pct", "saved\n[%]"),
     Shown("distance_pct", "dis-\ntance\n[%]"),
     Shown("unsafe_ttc_pct", "TTC\n< 4 s\n[%]"),
@@ -80,29 +88,56 @@ def in_words(name: str) -> str:
     return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
 
 
+def worded(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with the names of strategies, where it has any, in words."""
+    names = [name for name in ("strategy", "behind", "against") if name in table]
+    return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
+
+
 def baseline_of(strategies: Iterable[object]) -> str | None:
     """Return the strategy that tables and figures compare with; None without one."""
     known = set(strategies)
     return next((name for name in AGAINST if name in known), None)
 
 
-def headline(found: pd.DataFrame) -> pd.DataFrame:
+def resampled(found: pd.DataFrame) -> str:
+    """Return what the intervals of savings are over, in words, and whether they are too narrow.
+
+    Args:
+        found: a row per strategy with its numbers of ``windows``, ``drives`` and ``seeds``.
+    """
+    windows, drives, seeds = (int(found[name].max()) for name in ("windows", "drives", "seeds"))
+    over = "windows" if drives < LEAST_DRIVES else f"{drives} drives"
+    if seeds > 1:
+        up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
+        over += f" and {up_to}{seeds} training seeds"
+    if drives < min(LEAST_DRIVES, windows):
+        over += f" (too narrow: windows of {drives} recording{'s' * (drives > 1)} are alike)"
+    return over
+
+
+def headline(found: pd.DataFrame, energy: Fleet | None = None) -> pd.DataFrame:
     """Shorten a summary to what a reader asks first.
 
     Args:
         found: of :func:`lcc_rl.results.tables.summary`.
+        energy: the energy models; where all burn one fuel, the table has it in g/km, too.
 
     Returns:
         A row per strategy with a controlled car, those that draw most first: path energy per
         vehicle and km [kJ/km], the share saved [%] against :func:`baseline_of` with its interval,
         the distance [%] against it, the shares of the time [%] with an unsafe time-to-collision
-        and a long time gap, and collisions. ``attrs["against"]`` names the baseline.
+        and a long time gap, and collisions. Its ``attrs`` hold the baseline (``against``), the
+        column that is compared (``score``) and its name with unit (``label``), the columns that
+        are ``shown`` and the ``caption``.
     """
     cars = found[found[PATH].notna()].sort_values(PER_KM, ascending=False, kind="stable")
     against = baseline_of(cars["strategy"])
     table = pd.DataFrame({"strategy": cars["strategy"]})
     table["who"] = [in_words(str(name)) for name in cars["strategy"]]
     table["energy_kj_per_km"] = cars[PER_KM]
+    if energy is not None and burns_one_fuel(energy):
+        table["fuel_g_per_km"] = cars[PER_KM] * per_distance(1.0, "g/km", energy)
     if against is not None:
         for end in ("", "_low", "_high"):
             table[f"saved_pct{end}"] = 100.0 * cars[f"km_saving_vs_{against}{end}"]
@@ -112,7 +147,9 @@ def headline(found: pd.DataFrame) -> pd.DataFrame:
     table["long_time_gap_pct"] = (100.0 * cars["share_time_gap_long_moving"]).round(2)
     table["collisions"] = cars["collisions"]
     table = table.reset_index(drop=True)
-    table.attrs["against"] = against
+    saved = COMPARED.format(in_words(against), resampled(cars)) if against else ""
+    table.attrs |= {"against": against, "caption": CAPTION.format(saved), "shown": COLUMNS}
+    table.attrs |= {"score": "energy_kj_per_km", "label": "path energy per km [kJ/km]"}
     return table
 
 
@@ -148,9 +185,7 @@ def sample_of(episodes: pd.DataFrame) -> str:
 
 def caption_of(table: pd.DataFrame, more: str = "") -> str:
     """Return what stands below a headline, and what else there is to say."""
-    against = table.attrs.get("against")
-    saved = COMPARED.format(in_words(against)) if against else ""
-    return f"{CAPTION.format(saved)} {more}".strip()
+    return f"{table.attrs['caption']} {more}".strip()
 
 
 def few_windows(episodes: int, steps: float) -> str:
@@ -169,9 +204,16 @@ def few_windows(episodes: int, steps: float) -> str:
 
 
 def as_rich(
-    table: pd.DataFrame, title: str, caption: str, shown: Sequence[Shown] = COLUMNS
+    table: pd.DataFrame, title: str, caption: str, shown: Sequence[Shown] | None = None
 ) -> Table:
-    """Return a table for the terminal, a row per strategy, within 80 characters."""
+    """Return a table for the terminal, a row per strategy, within 80 characters.
+
+    Args:
+        table: the rows.
+        title: above the table.
+        caption: below it.
+        shown: its columns; by default those of a headline.
+    """
     drawn = Table(
         title=escape(title),
         caption=escape(caption),
@@ -179,12 +221,19 @@ def as_rich(
         padding=0,
         show_edge=False,
     )
-    shown = [column for column in shown if column.key in table]
+    shown = [column for column in shown or table.attrs["shown"] if column.key in table]
     for place, column in enumerate(shown):
         drawn.add_column(escape(column.heading), justify="right" if place else "left")
     for row in zip(*(_cells(table, column.key) for column in shown), strict=True):
         drawn.add_row(*map(escape, row))
     return drawn
+
+
+def for_print(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns of a headline that are shown, named for a page or a paper."""
+    keys = [column.key for column in table.attrs["shown"]]
+    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in table]
+    return table[kept].rename(columns={"who": "driven by", "score": table.attrs["label"]})
 
 
 def _cells(table: pd.DataFrame, name: str) -> list[str]:

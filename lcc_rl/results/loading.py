@@ -30,7 +30,7 @@ from lcc_rl.io.files import (
     unpacked_size,
 )
 from lcc_rl.io.memory import require_memory
-from lcc_rl.results.runs import CONFIG, flatten, read_settings
+from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flatten, read_settings
 
 log = logging.getLogger("lcc_rl")
 
@@ -111,7 +111,9 @@ def load(
     """Read one table of every run below a folder.
 
     A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
-    and ``frame.attrs["missing"]`` the missing shards of an evaluation.
+    and ``frame.attrs["missing"]`` the missing shards of an evaluation. Of a finished job of
+    ``lcc-rl run`` the rows of episodes are those of its evaluation, in which those of its
+    trainings are.
 
     Args:
         root: a run folder, or any folder above runs.
@@ -164,6 +166,8 @@ def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
     found = []
     for place, folders, files in os.walk(root, onerror=damaged.unlisted):
         own = SUBFOLDERS if CONFIG in files else ()
+        if PARTS in folders and Path(place, FINAL, name).is_file():
+            folders[:] = [FINAL]  # what its trainings evaluated is evaluated there again
         folders[:] = [x for x in folders if not x.startswith(".") and x not in own]
         if name in files:
             found.append(Path(place, name))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -10,10 +10,14 @@ import pandas as pd
 
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.runs import EPISODES
+from lcc_rl.results.savings import WAYS
 
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
 TRAINED = ["strategy", "training_seed"]
 NUMBERS = ("profile_id", "driver_id", "training_seed")  # name a thing, measure none
+ENERGY = "energy_kj"
+# What the energies of each group of vehicles are divided by.
+DRIVEN = {"cav": WAYS[:1], "hdv": WAYS[1:], "total": WAYS}
 ENDS = {"min": "min", "max": "max", "worst": "max"}  # first word of a column → not its mean
 
 
@@ -26,11 +30,14 @@ class Means:
     Args:
         windows: a row per strategy, training seed and window, with ``episodes``, their number,
             ``collisions``, and ``worst_share_…``, the largest share of an episode.
-        drivers: energies, a row per strategy and driver: means over windows and seeds.
+        drivers: energies and distances, a row per strategy and driver: means over windows and
+            seeds.
+        per: what energies are per.
     """
 
     windows: pd.DataFrame
     drivers: pd.DataFrame
+    per: str = "episode"
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> Self:
@@ -44,7 +51,7 @@ class Means:
         keys = [*TRAINED, "profile_id", "profile"]
         keys += [name for name in ("source",) if name in rows]
         windows = rows.groupby(keys, dropna=False, as_index=False, observed=True, sort=False)
-        energies = [name for name in measures if name.endswith("energy_kj")]
+        energies = [name for name in measures if name.endswith(ENERGY) or name in WAYS]
         drivers = rows.groupby(["strategy", "driver_id"], as_index=False, sort=False)[energies]
         return cls(windows.agg(how), drivers.mean())
 
@@ -54,6 +61,17 @@ class Means:
         if (folder / WINDOWS).exists():
             return cls(read_parquet(folder / WINDOWS), read_parquet(folder / DRIVERS))
         return cls.of(read_parquet(folder / EPISODES))
+
+    def per_km(self) -> Self:
+        """Return the means with energies per vehicle and km, those of windows as in tables.
+
+        A driver's energy is divided by the driver's distance, a window's by the mean distance of
+        the strategy, so that a saving over windows is that of the totals.
+        """
+        ways = self.windows.groupby("strategy")[[x for x in WAYS if x in self.windows]].mean()
+        own = ways.reindex(self.windows["strategy"]).set_index(self.windows.index)
+        windows, drivers = _per_km(self.windows, own), _per_km(self.drivers, self.drivers)
+        return replace(self, windows=windows, drivers=drivers, per="vehicle and km")
 
     def write(self, folder: Path) -> None:
         """Write both tables into a folder, with numbers of single precision and six decimals."""
@@ -66,3 +84,13 @@ class Means:
         """Return the number of windows and drivers, in words."""
         windows = self.windows["profile_id"].nunique()
         return f"{windows} held-out profiles × {self.drivers['driver_id'].nunique()} drivers"
+
+
+def _per_km(table: pd.DataFrame, driven: pd.DataFrame) -> pd.DataFrame:
+    """Divide the energies of each group of vehicles by their distance, ``driven`` row by row."""
+    found = table.copy()
+    for group, names in DRIVEN.items():
+        way = driven[[name for name in names if name in driven]].sum(axis=1) / 1e3
+        energies = table.columns[table.columns.str.fullmatch(f"{group}_.*{ENERGY}")]
+        found[energies] = table[energies].div(way, axis=0)
+    return found

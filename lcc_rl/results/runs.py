@@ -19,6 +19,7 @@ log = logging.getLogger("lcc_rl")
 CONFIG = "config.yaml"
 EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 STEPS = "steps.parquet"
+PARTS, FINAL = ".parts", "evaluation"  # of a job of lcc-rl run: its parts' settings; its last part
 # What no command of other settings may replace: results, and what a stopped run resumes from.
 KEPT = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 

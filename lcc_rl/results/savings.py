@@ -19,6 +19,7 @@ UNTRAINED = (
     "rule",
 )
 NOTHING = Estimate(np.nan)
+WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
 # Prefix of a saving, and of which energy: the path's, which leaves out what the motion stores
 # and with it what ending slower saves; and as drawn (A2).
 KINDS = {"path_": "path_energy_kj", "": "energy_kj"}

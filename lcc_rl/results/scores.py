@@ -10,9 +10,9 @@ from rich.table import Table
 
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.results.headline import COLUMNS, Shown, in_words
-from lcc_rl.results.headline import as_rich as drawn
-from lcc_rl.results.savings import NOTHING, savings
+from lcc_rl.results.cells import heading
+from lcc_rl.results.headline import COLUMNS, Shown, in_words, resampled
+from lcc_rl.results.savings import DRIVE, NOTHING, savings
 from lcc_rl.results.tables import strategies_side_by_side
 from lcc_rl.results.units import check_unit, per_distance
 from lcc_rl.settings import NonNegative, Settings
@@ -73,7 +73,7 @@ class Task(Settings):
     @property
     def label(self) -> str:
         """The score with its unit, for tables."""
-        named = self.score.replace("_", " ")
+        named = heading(self.score)
         return f"{named} [{self.unit}]" if self.score in PER_DISTANCE else named
 
 
@@ -86,8 +86,8 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
         energy: the energy models, for units.
 
     Returns:
-        One row per strategy: seeds, score, the share saved against ``task.against`` with its
-        interval over windows and seeds, the share of the distance that is lost against it, means
+        One row per strategy: seeds, windows, drives, score, the share saved against
+        ``task.against`` with its interval, the share of the distance that is lost against it, means
         of gap, speed and traffic, the value of every limit, collisions, and whether the strategy
         keeps all limits and never collides.
 
@@ -109,11 +109,13 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
         share = NOTHING if name == task.against else savings(rows, SCORE, str(name), task.against)
         limits = {column: _worst(part, column) for column in task.limits}
         row: dict[str, object] = {"strategy": name, "seeds": part["training_seed"].nunique()}
+        row |= {"windows": part["profile_id"].nunique()}
+        row |= {"drives": part.get(DRIVE, part["profile_id"]).nunique()}
         row |= {"score": value, **share.columns("saving")}
         row |= {"distance_lost": 1.0 - part[DISTANCE].mean() / whole}
         row |= {column: part[column].mean() for column in MEANS if column in part}
         row |= limits | {"collisions": int(part["collided"].sum())}
-        kept = all(_keeps(column, limits[column], task.limits[column]) for column in limits)
+        kept = all(keeps(column, limits[column], task.limits[column]) for column in limits)
         found.append(row | {"kept": kept and not row["collisions"]})
     return pd.DataFrame(found)
 
@@ -145,40 +147,45 @@ def _worst(part: pd.DataFrame, column: str) -> float:
     return float(part[column].max() if column.startswith(LARGEST) else part[column].min())
 
 
-def _keeps(column: str, value: float, bound: float) -> bool:
+def keeps(column: str, value: float, bound: float) -> bool:
     """Whether a limit is kept; NaN, the value of a vehicle that does not exist, keeps it."""
     return not (value < bound if column.startswith(LEAST) else value > bound)
 
 
-def columns(task: Task, table: pd.DataFrame) -> list[Shown]:
+def _columns(task: Task, table: pd.DataFrame) -> tuple[Shown, ...]:
     """Return the columns of scores on the terminal: those of every table, and the limits."""
     flows = "flow_vph" in table and table["flow_vph"].notna().any()
     way = Shown("flow_vph", "flow\n[1/h]") if flows else Shown("distance_pct", "dis-\ntance\n[%]")
     limits = [Shown(name, HEADINGS[name].format(bound)) for name, bound in task.limits.items()]
-    return [
+    return (
         COLUMNS[0],
         Shown("score", task.label.replace(" ", "\n")),
-        Shown("saving_pct", "saved\n[%]"),
+        Shown("saved_pct", "saved\n[%]"),
         way,
         *limits,
         Shown("collisions", "colli-\nsions"),
         Shown("kept", "kept"),
-    ]
-
-
-def as_rich(table: pd.DataFrame, task: Task, title: str) -> Table:
-    """Return scores as a table for the terminal, a row per strategy."""
-    percent = {f"saving_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
-    words = [in_words(str(name)) for name in table["strategy"]]
-    shown = table.assign(who=words, distance_pct=-100.0 * table["distance_lost"], **percent)
-    caption = (
-        f"saved: against {in_words(task.against)}, with the 95 % interval over windows and "
-        "training seeds; kept: all limits, without a collision; table=all shows every measure."
     )
-    return drawn(shown, title, caption, columns(task, shown))
 
 
-def in_full(table: pd.DataFrame, task: Task, title: str) -> Table:
+def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
+    """Shorten scores to what a reader asks first, as :func:`lcc_rl.results.headline.headline`."""
+    percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
+    words = [in_words(str(name)) for name in table["strategy"]]
+    found = table.assign(who=words, distance_pct=-100.0 * table["distance_lost"], **percent)
+    shown = _columns(task, found)
+    ends = [f"saved_pct{end}" for end in ("_low", "_high")]
+    found = found[["strategy", *(column.key for column in shown), *ends]]
+    caption = (
+        f"saved: against {in_words(task.against)}, with the 95 % interval over "
+        f"{resampled(table)}; kept: all limits, without a collision; table=all shows every measure."
+    )
+    found.attrs |= {"against": task.against, "caption": caption, "shown": shown}
+    found.attrs |= {"score": SCORE, "label": task.label}
+    return found
+
+
+def in_full(table: pd.DataFrame, title: str, task: Task) -> Table:
     """Return all that scores hold as a table for the terminal, a column per strategy."""
     limits = sorted(task.limits, key=lambda column: column.startswith(SHARE))
     rows = (

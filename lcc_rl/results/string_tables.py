@@ -9,7 +9,6 @@ from rich.table import Table
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import intervals
 from lcc_rl.results.headline import Shown, in_words
-from lcc_rl.results.headline import as_rich as drawn
 from lcc_rl.results.tables import strategies_side_by_side
 
 COUNTS = ("switches", "clamps", "cap_interventions")
@@ -97,10 +96,13 @@ COLUMNS = (
 CAPTION = "sums over followers and frames, means over runs"
 
 
-def as_rich(table: pd.DataFrame, title: str) -> Table:
-    """Return a case's table for the terminal, a row per strategy."""
-    shown = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
-    return drawn(shown, title, f"{CAPTION}; table=all shows every measure.", COLUMNS)
+def headline(table: pd.DataFrame) -> pd.DataFrame:
+    """Shorten a case's table, as :func:`lcc_rl.results.headline.headline`."""
+    found = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
+    found = found[["strategy", *(column.key for column in COLUMNS)]]
+    caption = f"{CAPTION}; table=all shows every measure."
+    found.attrs |= {"caption": caption, "shown": COLUMNS}
+    return found
 
 
 def in_full(table: pd.DataFrame, title: str) -> Table:

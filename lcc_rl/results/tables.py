@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.savings import BASELINES, KINDS, NOTHING, savings
+from lcc_rl.results.savings import BASELINES, DRIVE, NOTHING, WAYS, savings
 from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
@@ -44,26 +44,28 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         source: of the leaders whose rows count; empty for all.
 
     Returns:
-        One row per strategy: mean energies [kJ] and energy per vehicle and km, savings against
-        each of :data:`BASELINES` as shares, positive if energy is saved, with their intervals;
-        shares of (window, driver) pairs and of drivers whose path takes more; and the safety
-        measures.
+        One row per strategy: mean energies [kJ] and energy per vehicle and km; savings against
+        each of :data:`BASELINES` as shares, positive if energy is saved, with their intervals:
+        of path energy per km (``km_saving_vs_…``) and of the energy drawn in an episode
+        (``saving_vs_…``); shares of (window, driver) pairs and of drivers whose path takes more
+        per km; and the safety measures.
         Values that a strategy does not have are NaN.
     """
     # A string without automated vehicles, or without others, has no energies of them.
     columns = [*CAR_COLUMNS, *HUMAN_COLUMNS, "collided"]
-    means = list(dict.fromkeys([*columns, *(f"total_{column}" for column in KINDS.values())]))
-    found = Totals(episodes, means, ["min_ttc_s"], PATH, BASELINES, source)
+    found = Totals(episodes, columns, ["min_ttc_s"], PATH, BASELINES, source)
     windows, every, sums = found.per_window(), found.mean(), found.sums()
     # By the mean distance of the strategy, so that savings are those of the totals.
-    ways = every[["cav_distance_m", "hdv_distance_m"]].sum(axis=1).replace(0.0, np.nan)
+    ways = every[list(WAYS)].sum(axis=1).replace(0.0, np.nan)
     windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
     rows = []
-    counts = windows.groupby("strategy")["profile_id"].nunique()
+    kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": "training_seed"}
+    drives = windows.get(DRIVE, windows["profile_id"])
+    counts = windows.assign(**{DRIVE: drives}).groupby("strategy")[list(kinds.values())].nunique()
     for strategy in found.strategies:
         mean, total = every.loc[strategy].to_dict(), sums.loc[strategy].to_dict()
         row: dict[str, object] = {"strategy": strategy, "episodes": int(total["rows"])}
-        row["windows"] = int(counts[strategy])
+        row |= {name: int(counts[key][strategy]) for name, key in kinds.items()}
         for vehicle in ("cav", "hdv", "total"):
             for kind in ("energy_kj", "net_energy_kj"):
                 row[f"{vehicle}_{kind}"] = mean[f"{vehicle}_{kind}"]
@@ -73,9 +75,8 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
         row[PER_KM] = total[PATH] / kilometres if kilometres else np.nan
         row["distance_m"] = 1e3 * kilometres / total["rows"]
-        energies = {kind: f"total_{column}" for kind, column in KINDS.items()} | {"km_": PER_KM}
         for baseline in BASELINES:
-            for kind, column in energies.items():
+            for kind, column in {"km_": PER_KM, "": "total_energy_kj"}.items():
                 names = (column, strategy, baseline)
                 share = savings(windows, *names) if strategy != baseline else NOTHING
                 row |= share.columns(f"{kind}saving_vs_{baseline}")
@@ -91,10 +92,10 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
 def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
     name = f"saving_vs_{baseline}"
     return (
-        (f"path energy saved against {baseline}", f"path_{name}", "{:+.1%}"),
-        ("  95 % interval, low", f"path_{name}_low", "{:+.1%}"),
-        ("    high", f"path_{name}_high", "{:+.1%}"),
-        ("  energy as drawn", name, "{:+.1%}"),
+        (f"path energy per km saved against {baseline}", f"km_{name}", "{:+.1%}"),
+        ("  95 % interval, low", f"km_{name}_low", "{:+.1%}"),
+        ("    high", f"km_{name}_high", "{:+.1%}"),
+        ("  as drawn, per episode", name, "{:+.1%}"),
         ("  pairs worse off", f"pairs_worse_than_{baseline}", "{:.0%}"),
         ("  drivers worse off", f"drivers_worse_than_{baseline}", "{:.0%}"),
     )
@@ -119,6 +120,8 @@ ROWS = (
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
     ("windows", "windows", "{:d}"),
+    ("drives or recordings", "drives", "{:d}"),
+    ("training seeds", "seeds", "{:d}"),
     ("episodes", "episodes", "{:d}"),
 )
 

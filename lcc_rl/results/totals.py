@@ -9,7 +9,7 @@ import pandas as pd
 import pyarrow as pa
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.savings import DRIVE, KEYS, REPEAT, SOURCE, paired
+from lcc_rl.results.savings import DRIVE, KEYS, REPEAT, SOURCE, WAYS, paired
 
 WINDOW = ["strategy", "training_seed", "profile_id"]
 FOLDED = 100_000  # rows of partial sums that are kept before they are added up
@@ -24,6 +24,14 @@ def frames(rows: Rows, columns: Sequence[str], source: str = "") -> Iterator[pd.
     for frame in [rows] if isinstance(rows, pd.DataFrame) else _row_groups(rows, wanted):
         kept = frame[[name for name in wanted if name in frame]]
         yield kept[kept[SOURCE] == source] if source else kept
+
+
+def sources_of(rows: Rows) -> list[str]:
+    """Return the names of the sources of leaders, in their order; without one only ""."""
+    found: dict[str, None] = {}
+    for frame in frames(rows, [SOURCE]):
+        found |= dict.fromkeys(map(str, frame.get(SOURCE, ())))
+    return list(found) or [""]
 
 
 def _row_groups(rows: pa.dataset.Dataset, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
@@ -48,7 +56,7 @@ class Totals:
         rows: the rows.
         means: columns whose means are needed.
         lows: columns whose minima are needed.
-        paired_by: the energy by which strategies are compared in pairs of window and driver.
+        paired_by: the energy that, per distance, pairs of window and driver are compared by.
         baselines: the strategies that the others are compared with.
         source: of the leaders; empty for all.
     """
@@ -69,7 +77,7 @@ class Totals:
         self.drivers: dict[tuple[str, str], pd.DataFrame] = {}
         parts: list[pd.DataFrame] = []
         self.drives: dict[int, str] = {}  # by window
-        columns = [*WINDOW, *KEYS, DRIVE, REPEAT, *self.means, *self.lows, paired_by]
+        columns = [*WINDOW, *KEYS, DRIVE, REPEAT, *self.means, *self.lows, *WAYS, paired_by]
         for frame in frames(rows, list(dict.fromkeys(columns)), source):
             parts.append(self._window_sums(frame))
             if sum(map(len, parts)) > FOLDED + 2 * len(parts[0]):
@@ -96,7 +104,8 @@ class Totals:
         """Count who is worse off with a strategy than with a baseline, pair by pair."""
         if self.paired_by not in frame:
             return
-        energy = paired(frame, self.paired_by)
+        way = frame[[name for name in WAYS if name in frame]].sum(axis=1)
+        energy = paired(frame.assign(per_way=frame[self.paired_by] / way), "per_way")
         for baseline in (name for name in self.baselines if name in energy):
             for strategy in (str(name) for name in energy if name != baseline):
                 both = energy[[strategy, baseline]].dropna().astype(np.float64)

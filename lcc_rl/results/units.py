@@ -37,9 +37,14 @@ def check_unit(unit: str, energy: Fleet) -> None:
     """Check that a unit is known and means something for all vehicles, see :func:`per_distance`."""
     if unit not in UNITS:
         raise unknown_name("unit (task.unit)", unit, UNITS)
-    fuels = {(round(m.heating_value or 0.0, 3), m.density) for m in energy.models}
-    if unit not in ELECTRIC and (len(fuels) > 1 or not next(iter(fuels))[0]):
+    if unit not in ELECTRIC and not burns_one_fuel(energy):
         raise ConfigError(
             f"task.unit={unit} needs vehicles that all burn one fuel; these burn several, or some "
             "none (energy=…): choose kJ/km or Wh/km"
         )
+
+
+def burns_one_fuel(energy: Fleet) -> bool:
+    """Whether all vehicles burn one fuel."""
+    fuels = {(round(m.heating_value or 0.0, 3), m.density) for m in energy.models}
+    return len(fuels) == 1 and next(iter(fuels))[0] > 0.0

@@ -190,6 +190,7 @@ def test_pairs_are_counted_with_their_repeat(tmp_path) -> None:
             "driver_id": [0, 0, 1, 1] * 2,
             "repeat": [0, 1] * 4,
             "total_path_energy_kj": [1.0, 3.0, 1.0, 1.0, 2.0, 1.0, 0.5, 0.5],
+            "cav_distance_m": 1.0,
             "collided": False,
         }
     )

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
+from lcc_rl.evaluation.rows import grouped
+from lcc_rl.functional.pattern import parse_string
 from lcc_rl.results.scores import HEADINGS, LARGEST, LEAST, SHARE
 
 ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
@@ -103,3 +105,10 @@ def test_traffic_of_a_string() -> None:
     torch.testing.assert_close(
         found["damping_time_s"].flatten(), torch.tensor([0.3, torch.nan]), equal_nan=True
     )
+
+
+def test_every_string_has_the_places_of_its_automated_vehicles() -> None:
+    record = {("vehicles", "speed"): torch.arange(8.0).view(2, 1, 4, 1)}
+    groups = grouped(record, parse_string("human automated human automated"))
+    assert groups["cav"]["place"].tolist() == [[[1, 3]]] * 2
+    assert groups["cav"]["speed"].flatten(1).tolist() == [[1.0, 3.0], [5.0, 7.0]]

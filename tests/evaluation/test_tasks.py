@@ -1,11 +1,16 @@
 """Every task at the size of a test, with a rule to compare with."""
 
+from io import StringIO
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 from commands import DATA
 from helpers import slow_but
 
+from lcc_rl.api import Run
+from lcc_rl.cli.table import main as table_again
 from lcc_rl.commands import evaluation
 from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
@@ -33,6 +38,21 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     assert f"{name}: " in printed
     assert f"saved: against {in_words(task_of(cfg).against)}" in " ".join(printed.split())
     assert max(map(len, printed.splitlines())) <= 80
+    # The same table again, by program and for a paper: the task's score in its unit.
+    run = Run(tmp_path, rows, cfg)
+    for line in str(run).splitlines()[4:8]:
+        assert line.strip() in printed
+    assert run.headline.attrs["label"] == task_of(cfg).label
+    table_again([str(tmp_path), "--format", "csv"])
+    again = pd.read_csv(StringIO(capsys.readouterr().out))
+    np.testing.assert_allclose(again["score"], run.headline["score"])
+    table_again([str(tmp_path), "--format", "latex"])
+    latex = capsys.readouterr().out
+    assert (
+        f"simulated drivers & {run.headline.set_index('strategy').loc['human', 'score']:.1f}"
+        in (latex)
+    )
+    assert r"saved [\%]" in latex
 
 
 @pytest.mark.parametrize(

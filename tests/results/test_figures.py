@@ -151,9 +151,10 @@ def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
 
 def test_the_overview_has_the_savings_of_the_table_and_colours_are_on_the_image(tmp_path) -> None:
     frame = episodes().assign(strategy=lambda x: x["strategy"].replace("alcc", "own_energy"))
-    figure = run_figures.overview(frame, steps().assign(strategy="own_energy"), "own_energy")
-    right = figure.axes[1]
     table = headline(summary(frame))
+    own = steps().assign(strategy="own_energy")
+    figure = run_figures.overview(frame, own, "own_energy", table)
+    right = figure.axes[1]
     assert [x.get_text() for x in right.get_yticklabels()] == list(table["who"])
     shown = right.lines[0].get_xdata()
     np.testing.assert_allclose(shown, table["saved_pct"].fillna(0.0))
@@ -161,7 +162,8 @@ def test_the_overview_has_the_savings_of_the_table_and_colours_are_on_the_image(
     bounds = table[["saved_pct_low", "saved_pct_high"]].dropna()
     np.testing.assert_allclose(ends, bounds)
     for energy in table["energy_kj_per_km"]:
-        assert f"{energy:.0f} kJ/km" in texts(figure)
+        assert f"{energy:.1f} kJ/km" in texts(figure)
+    assert "path energy per km saved" in texts(figure)
     image = pixels(figure, tmp_path / "x.png")
     assert all(count(image, run_figures.VEHICLES[name][1]) > 50 for name in ("cav", "hdv"))
     legend = figure.axes[0].get_legend()  # it covers no data

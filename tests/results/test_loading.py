@@ -68,6 +68,17 @@ def test_rows_are_those_of_the_files_beside_the_settings_that_are_named(
         assert frame.groupby("run")["agent.tau"].first().tolist()[1] == 0.1
 
 
+def test_a_job_counts_each_episode_once(tmp_path) -> None:
+    for name in ("alcc", "evaluation"):
+        write_parquet(pd.DataFrame({"iteration": [1]}), made(tmp_path / name) / "training.parquet")
+    (tmp_path / "evaluation" / "training.parquet").unlink()
+    (tmp_path / ".parts").mkdir()
+    assert set(results.load(tmp_path)["run"]) == {"evaluation"}
+    assert set(results.load(tmp_path, "training")["run"]) == {"alcc"}
+    (tmp_path / "evaluation" / TABLE).unlink()
+    assert set(results.load(tmp_path)["run"]) == {"alcc"}  # stopped before its end
+
+
 def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:
     made(tmp_path / "a")
     with pytest.raises(ConfigError, match=r"'agent.gama'.*Did you mean 'agent.gamma'"):

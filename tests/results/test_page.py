@@ -25,6 +25,8 @@ from lcc_rl.results.headline import (
     sample_of,
     verdict,
 )
+from lcc_rl.results.means import Means
+from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import summary
 
 TABLE = pd.DataFrame(
@@ -103,6 +105,11 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     np.testing.assert_allclose(table["energy_kj_per_km"], per_km)
     saved = 1.0 - per_km["alcc"] / per_km["reference"]
     assert cars.loc["alcc", "km_saving_vs_reference"] == pytest.approx(saved)
+    means = Means.of(episodes()).per_km()  # of the figures by driver
+    shown = savings(means.windows, "total_path_energy_kj", "alcc", "reference")
+    assert shown.value == pytest.approx(saved)
+    by_driver = means.drivers.groupby("strategy")["total_path_energy_kj"].mean()
+    np.testing.assert_allclose(by_driver[table["strategy"]], per_km)
     assert verdict(found) == ""  # nobody to compare with
     assert table.attrs["against"] == "idm"
     own = cars.loc["alcc", "km_saving_vs_idm"]

@@ -45,10 +45,10 @@ def test_summary_by_hand() -> None:
     alcc = table.loc["alcc"]
     assert alcc["total_energy_kj"] == pytest.approx(137.5)  # (145 + 130)/2
     assert alcc["saving_vs_idm"] == pytest.approx(1 - 137.5 / 150)
-    assert alcc["path_saving_vs_reference"] == pytest.approx(1 - 127.5 / 135)
+    assert alcc["km_saving_vs_reference"] == pytest.approx(1 - 127.5 / 135)
     # Driver 0: 145 against 140 with the reference, worse; driver 1: 130 against 150, better.
     assert (alcc["drivers_worse_than_reference"], alcc["drivers_worse_than_idm"]) == (0.5, 0.0)
-    assert np.isnan(alcc["path_saving_vs_idm_low"])  # one window, no seeds: nothing to resample
+    assert np.isnan(alcc["km_saving_vs_idm_low"])  # one window, no seeds: nothing to resample
     assert (alcc["min_ttc_s"], alcc["share_ttc_unsafe"]) == (5.0, pytest.approx(0.05))
     # 275 kJ over two episodes of two vehicles and 0.5 km each: 2 km.
     assert alcc["kj_per_km"] == pytest.approx(137.5)
@@ -63,7 +63,7 @@ def test_a_driver_that_gains_in_the_mean_may_lose_in_single_windows() -> None:
     second.loc[second.index[-1], "total_path_energy_kj"] += 30.0
     row = summary(pd.concat([first, second])).set_index("strategy").loc["alcc"]
     assert (row["drivers_worse_than_idm"], row["pairs_worse_than_idm"]) == (0.0, 0.25)
-    low, high = (row[f"path_saving_vs_idm_{end}"] for end in ("low", "high"))
+    low, high = (row[f"km_saving_vs_idm_{end}"] for end in ("low", "high"))
     # One window of two is drawn: 127.5 or 142.5 kJ against 140.
     assert (low, high) == pytest.approx((1 - 142.5 / 140, 1 - 127.5 / 140))
 

@@ -165,7 +165,7 @@ def human_energy(means: Means) -> pd.DataFrame:
                     "drivers_better_off": f"{int((saved > 0).sum())} of {len(saved)}",
                 }
             )
-    rows.append({"behind": f"alcc ({PAPER})", "energy": NAMES[""], **PAPER_HUMAN})
+    rows.append({"behind": f"alcc {PAPER}", "energy": NAMES[""], **PAPER_HUMAN})
     return _with_its_decimals(rows)
 
 

@@ -14,6 +14,7 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.headline import in_words
 from lcc_rl.results.means import WINDOWS, Means
 from lcc_rl.results.runs import CONFIG, EPISODES
 from lcc_rl.results.savings import LEADER
@@ -109,12 +110,13 @@ def add_main(page: Page, means: Means) -> None:
 
 def _headline(page: Page, means: Means) -> None:
     windows = means.windows
-    text = f"""alcc saves energy for itself and for the human driver behind; reference is the same
-        without regard for the driver behind; own_energy is reference whose own energy counts as
-        often as alcc's reward has terms of energy: what it saves is due to that weight, not to
-        regard for others; idm is one human driver in the car's place, human are drivers of the
-        population in that place, without noise of their own; direct is the human driver directly
-        behind the leader, without the car.
+    text = f"""The network for both (alcc) saves energy for itself and for the human driver behind;
+        the network for itself (reference) is the same without regard for the driver behind; the
+        weighted network for itself (own_energy) is that one, whose own energy counts as often as
+        alcc's reward has terms of energy: what it saves is due to that weight, not to regard for
+        others. One driver (idm) is one human in the car's place, simulated drivers (human) are
+        those of the population in that place, without noise of their own; without an automated
+        car (direct), the human driver is directly behind the leader.
 
         All meet the same {means.size()} with the same noise. Energies are means per episode,
         over all seeds; savings are positive where energy is saved. Path energy is what the speeds
@@ -133,7 +135,7 @@ def _headline(page: Page, means: Means) -> None:
     path = page.folder / "evaluation" / "steps.parquet"
     steps = read_parquet(path) if path.exists() else pd.DataFrame({"strategy": []})
     if (steps["strategy"] == "alcc").any():
-        caption = "Counterpart of Fig. 7: one held-out episode of alcc, first seed."
+        caption = "Counterpart of Fig. 7: one held-out episode of the network for both, first seed."
         drawn.append(("sample_episode", caption, run_figures.sample_episode(steps, "alcc")))
     shown = [
         ("headline", f"Energy of both saved, {means.size()}", tables.headline(windows)),
@@ -180,15 +182,15 @@ def _generalization(page: Page, windows: pd.DataFrame) -> None:
 def _human(page: Page, means: Means) -> None:
     text = """Scenario A: the human driver follows a controlled car. Scenario B: the same driver
         directly follows the leader. In A the driver is one place further back, so part of the
-        saving comes from the place and not from the controller: the rows idm and human show how
-        much a human in the car's place saves."""
+        saving comes from the place and not from the controller: the rows of one driver and of
+        simulated drivers show how much a human in the car's place saves."""
     table = paper_tables.human_energy(means)
     caption = """Counterpart of Fig. 9: human driver's path energy behind {}, and the saving of
         every driver, mean over profiles and seeds."""
     drawn = [
         (
             f"human_energy_{name}",
-            caption.format(name),
+            caption.format(in_words(name)),
             run_figures.human_energy(means, name),
         )
         for name in ("alcc", "reference")
