@@ -11,6 +11,7 @@ from docutils import nodes
 from sphinx.addnodes import download_reference
 
 import lcc_rl
+from lcc_rl.interfaces.ring_page import ring_page
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
 
@@ -35,6 +36,7 @@ python_use_unqualified_type_names = True
 
 PLAIN = (".html",)  # opened, not saved, by a click
 OPENED = ("ring.html", "reports")
+RING = "pretrained/ring-22"  # drives in ring.html, which is written here
 CONFIGURATION = "reference/configuration"
 NAMED = re.compile(r"(?<!!)\[[\w/]+\.md\]\(([\w/.]+\.md[^)\s]*)\)")  # a link that reads as its file
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+)([^)\s#]+)(#[^)\s]*)?\)")
@@ -86,7 +88,8 @@ def copy_pages(app: Any, error: Exception | None) -> None:
 
 
 def setup(app: Any) -> None:
-    """Connect what is above."""
+    """Write the page of the ring, and connect what is above."""
+    (HERE / OPENED[0]).write_text(ring_page(RING), encoding="utf-8")
     app.connect("source-read", read)
     app.connect("include-read", read_included)
     app.connect("doctree-read", open_pages)

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -31,7 +30,6 @@ from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
 
-ROOT = Path(__file__).parents[2]
 STEPS, EPISODE = 600, 976413892
 LOUDER = 10.0  # times the task's noise: in a minute a wave grows
 RING, FOLLOW = "pretrained/ring-22", "pretrained/i80-follow"  # with memory; with all of the filter
@@ -61,6 +59,14 @@ ALL = """<script>document.title = JSON.stringify(STATES.map(([wanted, v, gap, ah
   const car = { v, gap, ahead: { v: ahead, a } };
   return [...FILTERS.map(f => filtered(f, wanted, car)), fuelRate(v, a)];
 }))</script>"""
+VISIT = """<script>
+el("seed").value = 2; restart(); show();
+const read = () => { show(); return el("span").textContent; }, names = [read()];
+el("skip").click(); names.push(read());
+const wave = readings()[3];
+document.querySelector("[value=network]").click(); advance(50); names.push(read());
+document.title = JSON.stringify([names, wave, el("note3").textContent]);
+</script>"""
 
 
 @pytest.fixture(scope="module")
@@ -145,8 +151,12 @@ def test_filter_and_fuel_are_the_packages_in_any_state(browser) -> None:
     torch.testing.assert_close(found, torch.stack([*wanted, fuel], -1), rtol=1e-7, atol=1e-8)
 
 
-def test_the_page_of_the_documentation_is_made_today() -> None:
-    assert (ROOT / "docs" / "ring.html").read_text(encoding="utf-8") == ring_page(RING)
+def test_readings_name_their_time_and_the_skip_ends_in_a_wave(browser) -> None:
+    span, spread, compared = browser(ring_page(RING), VISIT)
+    names = ["Mean since the start: 0 s", "Mean of the last minute", "Mean since the handover: 5 s"]
+    assert span == names
+    assert 2.0 < spread < 4.0  # [m/s], seed 2: 0.8 after five minutes
+    assert re.fullmatch(r".+ %, before 2\.\d\d", compared)
 
 
 @pytest.mark.parametrize("policy", ["pretrained/ddpg", "idm_acc"])
