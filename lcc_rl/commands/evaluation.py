@@ -258,7 +258,7 @@ def evaluate_and_write(
     for line in leader_too_fast(rows, cfg.task is not None):
         log.warning(line)
     if not quiet:
-        _show(rows, cfg, inputs)
+        show_tables(rows, cfg, inputs)
     return rows
 
 
@@ -316,7 +316,7 @@ def _play_missing(
                 progress.update(done)
 
 
-def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
+def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
     full = cfg.table == "all"
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":

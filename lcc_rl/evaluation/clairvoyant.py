@@ -1,8 +1,9 @@
 """Clairvoyant bound: the best drive that the gradient finds when the whole profile is known.
 
-Every episode is optimised by itself. The objective is the energy of the vehicle and of all drivers
-behind it, less what the last speed stores more than the first: otherwise braking just before the
-end would pay (A2 returns more than twice the kinetic energy).
+Every episode is optimised by itself. The objective is the energy of the vehicles and of all drivers
+behind them, less what the last speed stores more than the first: otherwise braking just before the
+end would pay (A2 returns more than twice the kinetic energy). In a task it is divided by the
+distance, at no less flow than that of the drive that a plan begins with.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,6 +19,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
@@ -27,7 +30,7 @@ from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.pieces.base import STEP
+from lcc_rl.pieces.base import STEP, next_key
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.views import VEHICLES, Views
 
@@ -37,6 +40,10 @@ MARGIN = 1.01  # the limits are kept with one per cent to spare
 LEAST_GAP = 0.5  # [m]
 FAR = 20.0  # beyond this a limit is not missed by more [m]
 LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
+FLOW_PRICE = 10.0  # share of the energy that the loss of the whole flow costs
+
+# From the energy and the record of a drive: what a plan minimises, and the price of its limits.
+Goal = Callable[[Tensor, TensorDictBase], tuple[Tensor, Tensor]]
 
 
 class Planned:
@@ -65,8 +72,8 @@ def clairvoyant(
 ) -> Strategy:
     """Return the best strategy found, starting from a learned controller's drive.
 
-    The prices of the limits (time-to-collision, time gap, gap) rise. The problem is not convex:
-    there may be better drives.
+    The prices of the limits (time-to-collision, time gap and gap; in a task the flow, where the
+    filter keeps the gaps) rise. The problem is not convex: there may be better drives.
 
     Args:
         strategy: the controller to begin with; its policy must be a network of the observation.
@@ -91,6 +98,7 @@ def clairvoyant(
     source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
+    goal: Goal = KeptFlow(strategy.cfg) if strategy.cfg.task else partial(within, string)
     shifts = torch.zeros(steps, len(profile), string.count(AUTOMATED), 1, requires_grad=True)
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
     for iteration in range(iterations):
@@ -99,8 +107,8 @@ def clairvoyant(
         data = source.assemble(record)
         check_batch(data, who=strategy.title)
         energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
-        missed = misses(data, string)
-        _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)
+        price, missed = goal(energy, data)
+        _descend(optimizer, price + min(1.0, 0.1 + 1.8 * share) * missed, share)
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
     planned = Planned(strategy.policy, shifts.detach())
@@ -136,6 +144,34 @@ def path_energy(
         (kind,) = views(*(data.get(key) for key in views.keys))
     power = as_fleet(energy).path_power(now, (then - now) / time_step, kind)
     return power.flatten(1).sum(1) * time_step * KILO
+
+
+class KeptFlow:
+    """Energy less what the distance is worth, and the price of flow lost, by the first drive.
+
+    At the price of what a metre takes, saving energy is saving energy per distance.
+    """
+
+    def __init__(self, cfg: StudyConfig) -> None:
+        self.length, self.time_step = cfg.scenario.vehicle_length, cfg.scenario.time_step
+        self.first: tuple[Tensor, Tensor] | None = None
+
+    def __call__(self, energy: Tensor, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return both [kJ], ``[batch]``; see :data:`Goal`."""
+        speed, gap = (data.get(next_key((VEHICLES, x))).flatten(1) for x in ("speed", "gap"))
+        distance = speed.sum(1) * self.time_step
+        flow = speed.mean(1) / (gap.mean(1) + self.length)
+        if self.first is None:
+            self.first = (energy / distance).detach(), flow.detach()
+        per_metre, least = self.first
+        worth = per_metre * distance
+        lost = (1.0 - flow / least).clamp(min=0.0)
+        return energy - worth, FLOW_PRICE * worth.detach() * lost
+
+
+def within(string: VehicleString, energy: Tensor, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Return the energy and the price of the limits of one car, see :data:`Goal`."""
+    return energy, misses(data, string)
 
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
