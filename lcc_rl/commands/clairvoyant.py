@@ -48,7 +48,7 @@ from lcc_rl.runs.states import PROGRESS
 from lcc_rl.settings import Million
 
 DRIVERS = 12
-BLOCK = 288_000  # vehicles × steps planned side by side: a few GiB
+BLOCK = 1_000_000  # vehicles × steps planned side by side: some GiB
 GIVEN = ("variant", "policy", "compare", "seed", "knowledge", "agent", "observation", "reward")
 PATH = {BOTH: "total_path_energy_kj", OWN: "cav_path_energy_kj"}
 KEYS = ["profile_id", "driver_id"]
