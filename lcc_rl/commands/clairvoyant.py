@@ -109,6 +109,7 @@ def block_rows(
     """Yield the rows of everybody behind a block of windows."""
     size = cfg.evaluation
     batch = len(block.evaluation) * len(block.population.time_gap)
+    hold = round(options.hold / cfg.scenario.time_step)
 
     def drive(strategy: Strategy) -> pd.DataFrame:
         return evaluate(strategy, block, size.drivers, batch, size.seed)[0]
@@ -126,6 +127,7 @@ def block_rows(
                 options.iterations,
                 not options.no_compile,
                 own,
+                hold,
                 tell,
             )
             for strategy in learned
@@ -158,6 +160,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--policy", action="append", help="start of the plan (pretrained)")
     parser.add_argument("--regard", action="store_true", help="plan for the car alone, too")
     parser.add_argument("--iterations", type=typed(Million), default=400)
+    parser.add_argument("--hold", type=float, default=0.1, help="how long a shift acts [s]")
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)

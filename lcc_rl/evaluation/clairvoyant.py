@@ -40,7 +40,7 @@ MARGIN = 1.01  # the limits are kept with one per cent to spare
 LEAST_GAP = 0.5  # [m]
 FAR = 20.0  # beyond this a limit is not missed by more [m]
 LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
-FLOW_PRICE = 10.0  # share of the energy that the loss of the whole flow costs
+FLOW_PRICE = 3.0  # share of the energy that the loss of the whole flow costs
 
 # From the energy and the record of a drive: what a plan minimises, and the price of its limits.
 Goal = Callable[[Tensor, TensorDictBase], tuple[Tensor, Tensor]]
@@ -68,6 +68,7 @@ def clairvoyant(
     iterations: int = 400,
     compiled: bool = True,
     own: bool = False,
+    hold: int = 1,
     report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None,
 ) -> Strategy:
     """Return the best strategy found, starting from a learned controller's drive.
@@ -82,6 +83,7 @@ def clairvoyant(
         iterations: steps along the gradient.
         compiled: compile the simulator.
         own: minimise the energy of the automated vehicles only.
+        hold: steps for which a shift acts.
         report: receives the number of the iteration, the energy [kJ] and the price of the limits.
 
     Raises:
@@ -99,23 +101,42 @@ def clairvoyant(
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
     goal: Goal = KeptFlow(strategy.cfg) if strategy.cfg.task else partial(within, string)
-    shifts = torch.zeros(steps, len(profile), string.count(AUTOMATED), 1, requires_grad=True)
+    held = (math.ceil(steps / hold), len(profile), string.count(AUTOMATED), 1)
+    shifts, found = torch.zeros(held, requires_grad=True), Best(len(profile))
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
     for iteration in range(iterations):
         share = iteration / iterations
-        _, record = source.play(source.start(given), network, steps, shifts)
+        every = shifts.repeat_interleave(hold, 0)[:steps]
+        _, record = source.play(source.start(given), network, steps, every)
         data = source.assemble(record)
         check_batch(data, who=strategy.title)
         energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
         price, missed = goal(energy, data)
-        _descend(optimizer, price + min(1.0, 0.1 + 1.8 * share) * missed, share)
+        found.take(price + missed, every)
+        total = price + min(1.0, 0.1 + 1.8 * share) * missed
+        _descend(optimizer, total, share, math.sqrt(hold))
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
-    planned = Planned(strategy.policy, shifts.detach())
+    planned = Planned(strategy.policy, found.shifts)
     return replace(strategy, name=OWN if own else BOTH, policy=planned, seed=None)
 
 
-def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> None:
+class Best:
+    """The shifts of every episode, ``[steps, batch, A, 1]``, at the lowest price so far."""
+
+    def __init__(self, episodes: int) -> None:
+        self.price, self.shifts = torch.full((episodes,), torch.inf), torch.zeros(())
+
+    @torch.no_grad()
+    def take(self, price: Tensor, shifts: Tensor) -> None:
+        """Keep the shifts of the episodes whose price, ``[batch]``, is lower than before."""
+        better = price < self.price
+        self.price = torch.where(better, price, self.price)
+        self.shifts = torch.where(better.view(-1, 1, 1), shifts, self.shifts)
+
+
+def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float, length: float) -> None:
+    """Take a step, the longer the fewer shifts there are."""
     (group,) = optimizer.param_groups
     (shifts,) = group["params"]
     optimizer.zero_grad(set_to_none=True)
@@ -123,7 +144,7 @@ def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> N
     # Every episode is a problem of its own, of its own scale.
     shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
     fall = 0.5 * (1.0 + math.cos(math.pi * share))
-    group["lr"] = SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall
+    group["lr"] = length * (SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall)
     optimizer.step()
 
 
