@@ -3,6 +3,7 @@
 lengths: the held-out windows of HCFS studies whose trainings differ in length, one file.
 sources: the windows of platoons behind several sources of leaders, one file.
 classes: the scores of evaluations with task=… by source and speed of the leader, one file.
+fleets: what fronts of fleets need of evaluations named <setting>_<share>, one file.
 means: the means of one evaluation per window and per driver, two files in a folder.
 alcc: those of an ALCC study's main part, its learning curves, an episode and its drivers.
 """
@@ -23,7 +24,9 @@ from lcc_rl.cli.guard import main_guard
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.fronts import DISTANCE, FLEET
 from lcc_rl.results.means import TRAINED, Means
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.savings import DRIVE, SOURCE
@@ -35,6 +38,9 @@ from lcc_rl.studies.hcfs.tables import LEARNED, MEASURES, RUN, STABLE, per_run, 
 
 # Columns of the learning curves that are kept, besides the terms of the reward.
 CURVE = ("variant", "seed", "iteration", "episodes", "updates", "episode_reward", "collisions")
+
+# What is kept of a fleet's episodes beside energy, distance and flow, of all drivers of a window.
+FLEET_LIMITS = {"max_gap_m": "max", "min_time_gap_s": "min", "collided": "sum"}
 
 # Classes of a leader's mean speed, and the column with the lower end of one [m/s].
 CLASSES, FASTER = (0.0, 15.0, 25.0, 29.0, np.inf), "faster_than_mps"
@@ -97,6 +103,35 @@ def classes(evaluations: Sequence[Path], path: Path) -> None:
     write_parquet(rounded(pd.concat(kept)), path)
 
 
+def fleets(evaluations: Sequence[Path], path: Path) -> None:
+    """Keep a row per setting, share, strategy, seed and window of fleets, for their fronts.
+
+    A strategy ``T_1.2`` is the point of the rule's front with that time gap.
+    """
+    write_parquet(rounded(pd.concat(map(_fleet, evaluations), ignore_index=True)), path)
+
+
+def _fleet(folder: Path) -> pd.DataFrame:
+    cfg, _, rows, _ = leaderboard.task_scores(folder)
+    driven = [name for name in ("cav_distance_m", "hdv_distance_m") if name in rows]
+    rows = rows.assign(
+        **{DISTANCE: rows[driven].sum(axis=1), "training_seed": rows["training_seed"].fillna(-1)}
+    )
+    axes = ["strategy", "training_seed", "profile_id", DRIVE]
+    how = dict.fromkeys(FLEET, "mean") | FLEET_LIMITS
+    kept = rows.groupby(axes, sort=False).agg(how).reset_index()
+    names, string = kept["strategy"].astype(str), cfg.scenario.vehicles
+    time_gap = names.str.extract("^T_(.*)$")[0].astype(float)
+    variant = names.mask(time_gap.notna(), "idm_acc").mask(names == cfg.variant, "learned")
+    return kept.drop(columns="strategy").assign(
+        setting=folder.name.rpartition("_")[0],
+        penetration=string.count(AUTOMATED) / len(string),
+        variant=variant,
+        policy="fleet",
+        limit=time_gap.fillna(0.0),
+    )
+
+
 def means(evaluations: Sequence[Path], target: Path) -> None:
     """Keep the means of an evaluation per window and per driver."""
     Means.of(read_parquet(_only(evaluations) / EPISODES)).write(target)
@@ -124,7 +159,7 @@ def _only(folders: Sequence[Path]) -> Path:
     return folders[0]
 
 
-KINDS = {"lengths": lengths, "sources": sources, "classes": classes, "means": means, "alcc": alcc}
+KINDS = {kind.__name__: kind for kind in (lengths, sources, classes, fleets, means, alcc)}
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -9,8 +9,8 @@ profile, starting from a learned policy's actions, and evaluates the plan like a
 With several policies every episode is planned from each, and the best plan counts. With --regard
 a second plan minimises the car's own energy only: what the first saves against it in the energy of
 all is the most that regard can save. Words that are no options are overrides of the evaluation
-(data, drivers, split, evaluation, scenario, +filter); by default 12 drivers follow on each of 20
-profiles.
+(data, leader, drivers, split, evaluation, scenario, +filter, task); by default 12 drivers follow on
+each of 20 profiles. With task=i24-mixed a whole fleet is planned, at the flow of the learned one.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
+from lcc_rl.commands.evaluation import show_tables, task_of
 from lcc_rl.config import check_overrides, load
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import load_inputs
@@ -37,11 +38,9 @@ from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, tra
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.headline import as_rich, caption_of, headline, show
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import EPISODES
 from lcc_rl.results.savings import savings
-from lcc_rl.results.tables import summary
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -49,23 +48,17 @@ from lcc_rl.runs.states import PROGRESS
 from lcc_rl.settings import Million
 
 DRIVERS = 12
-BLOCK = 480  # episodes planned side by side: a few GiB
+BLOCK = 1_000_000  # vehicles × steps planned side by side: some GiB
 GIVEN = ("variant", "policy", "compare", "seed", "knowledge", "agent", "observation", "reward")
 PATH = {BOTH: "total_path_energy_kj", OWN: "cav_path_energy_kj"}
 KEYS = ["profile_id", "driver_id"]
 
 
-def plan(options: Namespace, overrides: list[str]) -> pd.DataFrame:
+def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) -> pd.DataFrame:
     """Evaluate human driver, policies and plans; write and return the rows of episodes.parquet."""
-    own = ["variant=alcc", f"evaluation.drivers={DRIVERS}"]
-    cfg = load("evaluate", [*own, *overrides])
-    require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
-    folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
-    prepare_torch(cfg)
-    inputs = load_inputs(cfg)
     learned = [start(cfg, path, inputs) for path in options.policy or ["pretrained"]]
     check_distinct(learned)
-    parts = list(blocks(inputs, cfg.evaluation.drivers))
+    parts = list(blocks(inputs, cfg))
     work = len(parts) * len(learned) * (1 + options.regard) * options.iterations
     made, done = [], count(1)
     with ProgressReporter("clairvoyant", work, folder=folder) as progress:
@@ -96,10 +89,11 @@ def start(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
     return trained(cfg, path, policy, inputs.population)
 
 
-def blocks(inputs: Inputs, drivers: int | None) -> Iterator[tuple[int, Inputs]]:
+def blocks(inputs: Inputs, cfg: EvaluateConfig) -> Iterator[tuple[int, Inputs]]:
     """Yield the windows in blocks that fit the memory, each with the number of its first."""
     people = len(inputs.population.time_gap)
-    size = max(BLOCK // min(drivers or people, people), 1)
+    episodes = min(cfg.evaluation.drivers or people, people)
+    size = max(BLOCK // (episodes * len(cfg.scenario.vehicles) * cfg.scenario.horizon), 1)
     for first in range(0, len(inputs.evaluation), size):
         chosen = range(first, min(first + size, len(inputs.evaluation)))
         yield first, replace(inputs, evaluation=inputs.evaluation.select(chosen))
@@ -115,11 +109,14 @@ def block_rows(
     """Yield the rows of everybody behind a block of windows."""
     size = cfg.evaluation
     batch = len(block.evaluation) * len(block.population.time_gap)
+    hold = round(options.hold / cfg.scenario.time_step)
 
     def drive(strategy: Strategy) -> pd.DataFrame:
         return evaluate(strategy, block, size.drivers, batch, size.seed)[0]
 
-    yield from (drive(strategy) for strategy in (baseline(cfg, "idm"), *learned))
+    task = task_of(cfg)
+    rival = baseline(cfg, task.against if task else "idm")
+    yield from (drive(strategy) for strategy in (rival, *learned))
     for own in (False, True) if options.regard else (False,):
         plans = [
             clairvoyant(
@@ -130,6 +127,7 @@ def block_rows(
                 options.iterations,
                 not options.no_compile,
                 own,
+                hold,
                 tell,
             )
             for strategy in learned
@@ -162,14 +160,19 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--policy", action="append", help="start of the plan (pretrained)")
     parser.add_argument("--regard", action="store_true", help="plan for the car alone, too")
     parser.add_argument("--iterations", type=typed(Million), default=400)
+    parser.add_argument("--hold", type=float, default=0.1, help="how long a shift acts [s]")
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
     check_overrides(overrides, GIVEN, "the controller is that of --policy, as it was trained")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
-    episodes = plan(options, overrides)
-    table = headline(summary(episodes))
-    show(as_rich(table, "the whole profile known", caption_of(table)))
+    cfg = load("evaluate", ["variant=alcc", f"evaluation.drivers={DRIVERS}", *overrides])
+    require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
+    folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
+    prepare_torch(cfg)
+    inputs = load_inputs(cfg)
+    episodes = plan(options, cfg, inputs, folder)
+    show_tables(episodes, cfg, inputs)
     if options.regard:
         Console().print(regard(episodes), highlight=False)
     return 0

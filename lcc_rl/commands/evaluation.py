@@ -261,7 +261,7 @@ def evaluate_and_write(
     for line in leader_too_fast(rows, cfg.task is not None):
         log.warning(line)
     if not quiet:
-        _show(rows, cfg, inputs)
+        show_tables(rows, cfg, inputs)
     return rows
 
 
@@ -367,7 +367,7 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
             yield Found(source, summary(rows, source), short, headline.in_full)
 
 
-def _show(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
+def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
     plan = episodes.plan_of(cfg, inputs)
     drivers = f"{len(plan.chosen)} drivers"

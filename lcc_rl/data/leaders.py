@@ -252,8 +252,6 @@ class DriveLeaders(Settings):
     # Regular expression; drives whose names begin with the same match are on the same side.
     together: str | None = None
     tuning: bool = False  # leave the evaluation's part out and divide the rest again
-    # Mean speeds that divide the drives into classes; training draws all classes alike [m/s].
-    classes: Sequence[Positive] = ()
     least_variation: NonNegative = 2.0  # see RecordLeaders
     fastest: Positive | None = None  # highest mean speed of the leader in held-out windows [m/s]
     plausible: Plausible | None = None  # None for the defaults
@@ -282,7 +280,7 @@ class DriveLeaders(Settings):
             training, held_out = divide(profiles)
             if self.tuning:
                 training, held_out = divide(training, again=True)
-            training = by_speed(training.at_least(horizon), self.classes)
+            training = training.at_least(horizon)
         windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
         if not single:  # what is on one side together is one drive in intervals, too
             windows = replace(windows, recordings=tuple(map(self._family, windows.recordings)))
@@ -331,15 +329,6 @@ class DriveLeaders(Settings):
             for part, label in parts
         )
         return first, last
-
-
-def by_speed(profiles: Profiles, bounds: Sequence[float]) -> Profiles:
-    """Return records of which training draws all classes of mean speed [m/s] alike."""
-    if not bounds:
-        return profiles
-    means = [float(profiles.record(index).mean()) for index in range(len(profiles))]
-    place = np.searchsorted(sorted(bounds), means)
-    return replace(profiles, weights=torch.from_numpy(1.0 / np.bincount(place)[place]))
 
 
 def varying(profiles: Profiles, least: float, fastest: float | None = None) -> Profiles:
@@ -422,9 +411,8 @@ class Mixture:
         training = join(parts) if parts else next(iter(found.values())).training
         each = []
         for name, part in zip(learned, parts, strict=True):
-            own = torch.ones(len(part), dtype=torch.float64)
-            own = own if part.weights is None else part.weights
-            each.append(self.weights.get(name, 1.0) * own / own.sum())
+            even = torch.ones(len(part), dtype=torch.float64) / len(part)
+            each.append(self.weights.get(name, 1.0) * even)
         windows = join([one.windows for one in found.values()])
         names = tuple(name for name, one in found.items() for _ in range(len(one.windows)))
         return Leaders(

@@ -1,8 +1,9 @@
 """Clairvoyant bound: the best drive that the gradient finds when the whole profile is known.
 
-Every episode is optimised by itself. The objective is the energy of the vehicle and of all drivers
-behind it, less what the last speed stores more than the first: otherwise braking just before the
-end would pay (A2 returns more than twice the kinetic energy).
+Every episode is optimised by itself. The objective is the energy of the vehicles and of all drivers
+behind them, less what the last speed stores more than the first: otherwise braking just before the
+end would pay (A2 returns more than twice the kinetic energy). In a task it is divided by the
+distance, at no less flow than that of the drive that a plan begins with.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,6 +19,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.checks import check_batch
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
@@ -27,7 +30,7 @@ from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.pieces.base import STEP
+from lcc_rl.pieces.base import STEP, next_key
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.views import VEHICLES, Views
 
@@ -37,6 +40,10 @@ MARGIN = 1.01  # the limits are kept with one per cent to spare
 LEAST_GAP = 0.5  # [m]
 FAR = 20.0  # beyond this a limit is not missed by more [m]
 LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
+FLOW_PRICE = 3.0  # share of the energy that the loss of the whole flow costs
+
+# From the energy and the record of a drive: what a plan minimises, and the price of its limits.
+Goal = Callable[[Tensor, TensorDictBase], tuple[Tensor, Tensor]]
 
 
 class Planned:
@@ -61,12 +68,13 @@ def clairvoyant(
     iterations: int = 400,
     compiled: bool = True,
     own: bool = False,
+    hold: int = 1,
     report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None,
 ) -> Strategy:
     """Return the best strategy found, starting from a learned controller's drive.
 
-    The prices of the limits (time-to-collision, time gap, gap) rise. The problem is not convex:
-    there may be better drives.
+    The prices of the limits (time-to-collision, time gap and gap; in a task the flow, where the
+    filter keeps the gaps) rise. The problem is not convex: there may be better drives.
 
     Args:
         strategy: the controller to begin with; its policy must be a network of the observation.
@@ -75,6 +83,7 @@ def clairvoyant(
         iterations: steps along the gradient.
         compiled: compile the simulator.
         own: minimise the energy of the automated vehicles only.
+        hold: steps for which a shift acts.
         report: receives the number of the iteration, the energy [kJ] and the price of the limits.
 
     Raises:
@@ -91,23 +100,43 @@ def clairvoyant(
     source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
-    shifts = torch.zeros(steps, len(profile), string.count(AUTOMATED), 1, requires_grad=True)
+    goal: Goal = KeptFlow(strategy.cfg) if strategy.cfg.task else partial(within, string)
+    held = (math.ceil(steps / hold), len(profile), string.count(AUTOMATED), 1)
+    shifts, found = torch.zeros(held, requires_grad=True), Best(len(profile))
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
     for iteration in range(iterations):
         share = iteration / iterations
-        _, record = source.play(source.start(given), network, steps, shifts)
+        every = shifts.repeat_interleave(hold, 0)[:steps]
+        _, record = source.play(source.start(given), network, steps, every)
         data = source.assemble(record)
         check_batch(data, who=strategy.title)
         energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
-        missed = misses(data, string)
-        _descend(optimizer, energy + min(1.0, 0.1 + 1.8 * share) * missed, share)
+        price, missed = goal(energy, data)
+        found.take(price + missed, every)
+        total = price + min(1.0, 0.1 + 1.8 * share) * missed
+        _descend(optimizer, total, share, math.sqrt(hold))
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
-    planned = Planned(strategy.policy, shifts.detach())
+    planned = Planned(strategy.policy, found.shifts)
     return replace(strategy, name=OWN if own else BOTH, policy=planned, seed=None)
 
 
-def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> None:
+class Best:
+    """The shifts of every episode, ``[steps, batch, A, 1]``, at the lowest price so far."""
+
+    def __init__(self, episodes: int) -> None:
+        self.price, self.shifts = torch.full((episodes,), torch.inf), torch.zeros(())
+
+    @torch.no_grad()
+    def take(self, price: Tensor, shifts: Tensor) -> None:
+        """Keep the shifts of the episodes whose price, ``[batch]``, is lower than before."""
+        better = price < self.price
+        self.price = torch.where(better, price, self.price)
+        self.shifts = torch.where(better.view(-1, 1, 1), shifts, self.shifts)
+
+
+def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float, length: float) -> None:
+    """Take a step, the longer the fewer shifts there are."""
     (group,) = optimizer.param_groups
     (shifts,) = group["params"]
     optimizer.zero_grad(set_to_none=True)
@@ -115,7 +144,7 @@ def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float) -> N
     # Every episode is a problem of its own, of its own scale.
     shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
     fall = 0.5 * (1.0 + math.cos(math.pi * share))
-    group["lr"] = SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall
+    group["lr"] = length * (SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall)
     optimizer.step()
 
 
@@ -136,6 +165,34 @@ def path_energy(
         (kind,) = views(*(data.get(key) for key in views.keys))
     power = as_fleet(energy).path_power(now, (then - now) / time_step, kind)
     return power.flatten(1).sum(1) * time_step * KILO
+
+
+class KeptFlow:
+    """Energy less what the distance is worth, and the price of flow lost, by the first drive.
+
+    At the price of what a metre takes, saving energy is saving energy per distance.
+    """
+
+    def __init__(self, cfg: StudyConfig) -> None:
+        self.length, self.time_step = cfg.scenario.vehicle_length, cfg.scenario.time_step
+        self.first: tuple[Tensor, Tensor] | None = None
+
+    def __call__(self, energy: Tensor, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return both [kJ], ``[batch]``; see :data:`Goal`."""
+        speed, gap = (data.get(next_key((VEHICLES, x))).flatten(1) for x in ("speed", "gap"))
+        distance = speed.sum(1) * self.time_step
+        flow = speed.mean(1) / (gap.mean(1) + self.length)
+        if self.first is None:
+            self.first = (energy / distance).detach(), flow.detach()
+        per_metre, least = self.first
+        worth = per_metre * distance
+        lost = (1.0 - flow / least).clamp(min=0.0)
+        return energy - worth, FLOW_PRICE * worth.detach() * lost
+
+
+def within(string: VehicleString, energy: Tensor, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Return the energy and the price of the limits of one car, see :data:`Goal`."""
+    return energy, misses(data, string)
 
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:

@@ -1,7 +1,8 @@
 """Export of trained policies as ONNX, PyTorch's ``.pt2`` or a page in which they drive.
 
 An exported program takes the measurements of one vehicle in SI units and returns its acceleration;
-it contains the scales of the observation, the network and the safety filter, if there is one.
+it contains the scales of the observation, the network and the safety filter, if there is one. The
+program of a policy that remembers takes and returns its memory, too.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.strategies import with_weights
+from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.pieces import Action, CBFFilter, Observation
 from lcc_rl.pieces.cbf import STATE
 from lcc_rl.pieces.entries import ENTRIES
+from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.results.policies import load_policy
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
@@ -37,7 +40,7 @@ DERIVED = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
-PRESENT = "behind.present"
+PRESENT, REMEMBERED = "behind.present", "memory.entries."
 
 
 class Input(NamedTuple):
@@ -56,15 +59,17 @@ class ExportedPolicy(nn.Module):
         observation: the piece that gathers and scales measurements.
         action: the piece that turns actions into accelerations.
         safety: the safety filter, or None.
+        memory: the piece that remembers what the columns ``memory.entries.…`` hold, or None.
     """
 
     constants: Tensor
 
     def __init__(
-        self, network: nn.Module, observation: Observation, action: Action, safety: Any
+        self, network: nn.Module, observation: Observation, action: Action, safety: Any, memory: Any
     ) -> None:
         super().__init__()
         self.network, self.largest, self.safety = network, action.max_acceleration, safety
+        self.memory = memory
         self.register_buffer("constants", observation.constants.clone())
         seen = observation.columns()
         needed = [name for column in seen for name in column]
@@ -98,9 +103,35 @@ class ExportedPolicy(nn.Module):
         filtered: Tensor = self.safety.filtered(command, *measured)
         return filtered
 
-    def inputs(self) -> list[Input]:
-        """Return the columns of the input in order."""
-        return [described(name) for name in self.names]
+
+class Remembering(nn.Module):
+    """A policy with its memory: ``state``, ``memory`` to ``acceleration``, ``next_memory``.
+
+    A memory of zeros begins anew; the first number of ``next_memory`` is one.
+    """
+
+    def __init__(self, policy: ExportedPolicy) -> None:
+        super().__init__()
+        self.policy, memory = policy, policy.memory
+        self.repeat = memory.depth if memory.stacked else memory.repeat
+        self.width = 1 + memory.counted * self.repeat
+        flat = [base for name in memory.sources for base in DERIVED.get(name, (name,))]
+        names = [name for name in policy.names if not name.startswith(REMEMBERED)]
+        self.names = list(dict.fromkeys([*names, *flat]))
+
+    def forward(self, state: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the acceleration to command, and the memory of the next step."""
+        measured = dict(zip(self.names, state.split(1, -1), strict=True))
+        pairs = (
+            [measured[x] for x in DERIVED.get(name, (name,))] for name in self.policy.memory.sources
+        )
+        now = torch.cat([one - other[0] if other else one for one, *other in pairs], -1)
+        begun, kept = memory.split((1, self.width - 1), -1)
+        kept = torch.where(begun > 0.0, kept, now.repeat_interleave(self.repeat, -1))
+        entries, kept = self.policy.memory.remember(kept, now)
+        measured |= {f"{REMEMBERED}{n}": x for n, x in enumerate(entries.split(1, -1))}
+        acceleration = self.policy(torch.cat([measured[name] for name in self.policy.names], -1))
+        return acceleration, torch.cat([torch.ones_like(begun), kept], -1)
 
 
 def described(name: str) -> Input:
@@ -115,7 +146,7 @@ def described(name: str) -> Input:
 
 
 def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy:
-    """Build the module that is exported; arguments as for :func:`export`."""
+    """Build the policy that is exported; arguments as for :func:`export`."""
     weights, cfg = load_policy(policy, trust=trust)
     population = bootstrap()
     scenario = cfg.scenario
@@ -134,15 +165,24 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
     learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
     assert isinstance(learned, TensorDictModule)
     (observation,), (action,) = found.values()
-    module = ExportedPolicy(learned.module, observation, action, safety)
+    memory = next((p for p in pieces if isinstance(p, ObservationMemory)), None)
+    module = ExportedPolicy(learned.module, observation, action, safety, memory)
     return module.eval().requires_grad_(False)
+
+
+def program(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy | Remembering:
+    """Return the module that a program is made of; arguments as for :func:`export`."""
+    module = exported_policy(policy, trust)
+    remembers = any(name.startswith(REMEMBERED) for name in module.names)
+    return Remembering(module) if remembers else module
 
 
 def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> Path:
     """Write a trained policy, with its safety filter, for use elsewhere.
 
     The ending chooses the form. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) take
-    ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²];
+    ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²],
+    of a policy that remembers also ``memory`` and ``next_memory`` (zeros at first);
     names, units and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A
     page (``.html``) shows the ring road with the policy in any browser, see
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
@@ -174,14 +214,16 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
 
 def _program(policy: str | Path, trust: Sequence[str]) -> tuple[Any, str]:
     """Return the exported program, and what is to know about it as JSON."""
-    module = exported_policy(policy, trust)
-    inputs = [item._asdict() for item in module.inputs()]
+    module = program(policy, trust)
+    inputs = [described(name)._asdict() for name in module.names]
+    own = module.policy if isinstance(module, Remembering) else module
     about: dict[str, Any] = {"policy": str(policy), "lcc_rl": __version__, "inputs": inputs}
-    about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
-    example = torch.ones(2, len(module.names))
-    batch = {"state": {0: torch.export.Dim("batch", min=1)}}
-    program = torch.export.export(module, (example,), dynamic_shapes=batch)
-    return program, json.dumps(about, ensure_ascii=False)
+    about |= {"output": "acceleration [m/s²]", "filter": own.safety is not None}
+    widths = [len(module.names)] + ([module.width] if isinstance(module, Remembering) else [])
+    batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
+    examples = tuple(torch.ones(2, width) for width in widths)
+    made = torch.export.export(module, examples, dynamic_shapes=batch)
+    return made, json.dumps(about, ensure_ascii=False)
 
 
 def _as_page(policy: str | Path, trust: Sequence[str]) -> bytes:
@@ -191,14 +233,15 @@ def _as_page(policy: str | Path, trust: Sequence[str]) -> bytes:
 
 
 def _as_pt2(policy: str | Path, trust: Sequence[str]) -> bytes:
-    program, about = _program(policy, trust)
+    made, about = _program(policy, trust)
     buffer = BytesIO()
-    torch.export.save(program, buffer, extra_files={"lcc_rl": about})
+    torch.export.save(made, buffer, extra_files={"lcc_rl": about})
     return buffer.getvalue()
 
 
 def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
-    program, about = _program(policy, trust)
+    exported, about = _program(policy, trust)
+    count = len(exported.graph_signature.user_inputs)
     try:
         import onnx
         import onnxscript  # noqa: F401 - what torch exports with
@@ -211,12 +254,12 @@ def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch, about itself
         made = torch.onnx.export(
-            program,
+            exported,
             (),
             dynamo=True,
             verbose=False,
-            input_names=["state"],
-            output_names=["acceleration"],
+            input_names=TAKES[:count],
+            output_names=MAKES[:count],
         )
     assert made is not None
     proto = made.model_proto
@@ -239,7 +282,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if path.suffix == ".html":
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    for item in exported_policy(options.policy, options.trust).inputs():
+    for item in map(described, program(options.policy, options.trust).names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: from these, in this order, the acceleration [m/s²]")
     return 0

@@ -106,9 +106,19 @@ class ObservationMemory(StepTransform):
     def compute(self, *entries: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the entries, and the history where it is kept."""
         kept, *measured = self.views(*entries)
-        now = torch.cat(measured, -1)
+        found, kept = self.remember(kept, torch.cat(measured, -1))
+        return (found, kept) if self.stacked else found
+
+    def remember(self, kept: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the entries, and what is kept for the next step.
+
+        Args:
+            kept: of the step before, ``[…, sources × seconds]`` or the whole history.
+            now: what is measured, ``[…, sources]``.
+        """
         if not self.stacked:
-            return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
+            found = torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
+            return found, found
         past = kept.unflatten(-1, (self.counted, self.depth))
         past = torch.cat([now.unsqueeze(-1), past[..., :-1]], -1)
         return past[..., self.places].flatten(-2), past.flatten(-2)

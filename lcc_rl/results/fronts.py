@@ -1,33 +1,40 @@
-"""Controllers compared at the same share of the time beyond a limit.
+"""Controllers compared as fronts: energy over what saving it costs, at equal cost.
 
-A controller that drives nearer saves less energy and misses the limit of the time gap less. Two
-controllers are compared as curves over several limits, read where both miss as much.
+A controller that drives nearer saves less energy, and misses the limit of the time gap less or
+takes less of the flow. Two controllers are compared as curves over several limits or time gaps,
+read where both cost as much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.intervals import Estimate, bounds, share_saved, weights
+from lcc_rl.results.intervals import Estimate, bounds, drawn_windows, share_saved, weights
+from lcc_rl.results.savings import DRIVE
 
 KINDS = ["variant", "policy"]
 ENERGY, SHARE = "total_path_energy_kj", "share_time_gap_long_moving"
-# Energy and share of one kind of controller, each ``[limits, windows, seeds]``.
-Front = tuple[NDArray[np.float64], NDArray[np.float64]]
+# Of a fleet.
+FLEET = NET, DISTANCE, FLOW = "total_net_energy_kj", "distance_m", "flow_vph"
+# Columns of one kind of controller, each ``[limits, windows, seeds]``, and their means by limit.
+Front = Mapping[str, NDArray[np.float64]]
+Curve = Mapping[str, NDArray[np.float64]]
+Measure = Callable[[Curve, Curve], float]
 
 
-def front(windows: pd.DataFrame, kind: Sequence[str]) -> Front:
-    """Return the means of one kind of controller by limit, window and seed.
+def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) -> Front:
+    """Return columns of one kind of controller by limit, window and seed.
 
     Args:
-        windows: columns :data:`KINDS`, ``limit``, ``training_seed``, ``profile_id``, energy and
-            share; a row per training and window.
+        windows: columns :data:`KINDS`, ``limit`` (or what else is varied along a front),
+            ``training_seed``, ``profile_id`` and ``columns``; a row per training and window.
         kind: variant and policy.
+        columns: which.
 
     Raises:
         ResultsError: if it is missing, or lacks a window or seed at one of its limits.
@@ -44,8 +51,45 @@ def front(windows: pd.DataFrame, kind: Sequence[str]) -> Front:
             f"{' × '.join(map(str, sizes))}"
         )
     rows = rows.sort_values(axes)
-    energy, share = (rows[column].to_numpy(float).reshape(sizes) for column in (ENERGY, SHARE))
-    return energy, share
+    return {column: rows[column].to_numpy(float).reshape(sizes) for column in columns}
+
+
+def compared(
+    windows: pd.DataFrame,
+    one: Sequence[str],
+    other: Sequence[str],
+    columns: Sequence[str],
+    measure: Measure,
+) -> Estimate:
+    """Return a measure of two kinds of controllers with its interval.
+
+    Windows, or drives if the rows name five or more, and seeds are resampled as in
+    :func:`lcc_rl.results.intervals.saving`, without resamples whose measure is not a number;
+    there is no interval where that of all rows is none.
+
+    Args:
+        windows, columns: see :func:`front`.
+        one, other: variant and policy of each.
+        measure: of the means by limit of both.
+    """
+    fronts = [front(windows, kind, columns) for kind in (one, other)]
+    value = measure(*({name: x.mean((1, 2)) for name, x in each.items()} for each in fronts))
+    drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
+    drawn = [_resampled(each, stream, drives) for stream, each in enumerate(fronts, 1)]
+    found = np.array([measure(*pair) for pair in zip(*drawn, strict=True)])
+    found = found[np.isfinite(found)]
+    return Estimate(value, *bounds(found)) if np.isfinite(value) else Estimate(value)
+
+
+def _resampled(front: Front, stream: int, drives: Sequence[object] | None) -> Iterator[Curve]:
+    """Yield the means by limit of every resample; a stream draws its own seeds."""
+    _, windows, seeds = next(iter(front.values())).shape
+    drawn = drawn_windows(windows, drives), weights(seeds, stream)
+    means = [
+        np.einsum("rw,lws,rs->rl", drawn[0], x, drawn[1], optimize=True) for x in front.values()
+    ]
+    for rows in zip(*means, strict=True):
+        yield dict(zip(front, rows, strict=True))
 
 
 def energy_at(energy: NDArray[np.float64], share: NDArray[np.float64], at: float) -> float:
@@ -63,30 +107,51 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both spend at most the same share of the time beyond the limit. The interval is that of
-    :func:`lcc_rl.results.intervals.saving`, without resamples in which a front does not reach the
-    share.
-
-    Args:
-        windows: see :func:`front`.
-        one: variant and policy of the controller that saves.
-        other: variant and policy of the controller that it is compared with.
-        at: the largest share of the time.
+    Both spend at most the share ``at`` of the time beyond the limit; see :func:`compared`.
     """
-    fronts = [front(windows, kind) for kind in (one, other)]
-    energies = [energy_at(e.mean((1, 2)), s.mean((1, 2)), at) for e, s in fronts]
-    value = float(share_saved(*energies))
-    drawn = weights(fronts[0][0].shape[1], 0)
-    found = []
-    for stream, parts in enumerate(fronts, 1):
-        seeds = weights(parts[0].shape[2], stream)
-        means = [np.einsum("rw,lws,rs->rl", drawn, part, seeds, optimize=True) for part in parts]
-        found.append([energy_at(e, s, at) for e, s in zip(*means, strict=True)])
-    saved = share_saved(*np.array(found))
-    saved = saved[np.isfinite(saved)]
-    if not len(saved):
-        return Estimate(value)
-    return Estimate(value, *bounds(saved))
+
+    def measure(*curves: Curve) -> float:
+        return float(share_saved(*(energy_at(x[ENERGY], x[SHARE], at) for x in curves)))
+
+    return compared(windows, one, other, (ENERGY, SHARE), measure)
+
+
+def per_distance(curve: Curve) -> NDArray[np.float64]:
+    """Return the energy per distance, ``[limits]``."""
+    return curve[NET] / curve[DISTANCE]
+
+
+def saved(point: Curve, baseline: Curve) -> float:
+    """Return the share of a baseline's energy per distance that a fleet saves."""
+    return float(share_saved(per_distance(point)[0], per_distance(baseline)[0]))
+
+
+def flow_gained(point: Curve, baseline: Curve) -> float:
+    """Return the share of a baseline's flow that a fleet gains."""
+    return float(point[FLOW][0] / baseline[FLOW][0] - 1.0)
+
+
+def saved_at_flow(point: Curve, rule: Curve) -> float:
+    """Return the share of the energy per distance that a fleet saves against a front, at its flow.
+
+    NaN if the front does not reach that flow.
+    """
+    order = np.argsort(rule[FLOW])
+    spent, flow = per_distance(rule)[order], rule[FLOW][order]
+    rival = np.interp(point[FLOW][0], flow, spent, left=np.nan, right=np.nan)
+    return float(share_saved(per_distance(point)[0], rival))
+
+
+def gained_at_energy(point: Curve, rule: Curve) -> float:
+    """Return the share of the flow that a fleet gains on a front, at its energy per distance.
+
+    The front's flow is the largest at which it needs no more energy; NaN if it always needs more.
+    """
+    order = np.argsort(rule[FLOW])
+    spent, flow = per_distance(rule)[order], rule[FLOW][order]
+    fine = np.linspace(flow[0], flow[-1], 1001)
+    enough = fine[np.interp(fine, flow, spent) <= per_distance(point)[0]]
+    return float(point[FLOW][0] / enough.max() - 1.0) if len(enough) else np.nan
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:

@@ -91,12 +91,22 @@ def _means(
     table: NDArray[np.float64], stream: int, drives: Sequence[object] | None = None
 ) -> NDArray[np.float64]:
     """Return the resampled means of ``[windows, seeds]``; a stream draws its own seeds."""
-    drawn = weights(len(table), 0)
-    if drives is not None and len(set(drives)) >= LEAST_DRIVES:
-        names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
-        drawn = weights(len(names), 0)[:, [names[name] for name in drives]]
-        drawn = drawn / drawn.sum(1, keepdims=True)
-    return ((drawn @ table) * weights(table.shape[1], stream)).sum(1)
+    drawn = drawn_windows(len(table), drives) @ table
+    return (drawn * weights(table.shape[1], stream)).sum(1)
+
+
+def drawn_windows(count: int, drives: Sequence[object] | None = None) -> NDArray[np.float64]:
+    """Return the weights of windows in every resample, ``[RESAMPLES, count]``; of whole drives.
+
+    Args:
+        count: number of windows.
+        drives: as of :func:`saving`.
+    """
+    if drives is None or len(set(drives)) < LEAST_DRIVES:
+        return weights(count, 0)
+    names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
+    drawn = weights(len(names), 0)[:, [names[name] for name in drives]]
+    return drawn / drawn.sum(1, keepdims=True)
 
 
 def bounds(resampled: NDArray[np.float64]) -> tuple[float, float]:

@@ -240,16 +240,12 @@ def test_records_are_drawn_by_their_weights() -> None:
 
 def test_a_mixture_holds_every_source(table) -> None:
     cycles = {"training": {"udds": {"path": "udds"}}, "held_out": {"us06": {"path": "us06"}}}
-    highway = DriveLeaders(path=table, classes=[20.4])  # of unlike size
-    sources = {"cycles": RecordLeaders(**cycles), "highway": highway}
+    sources = {"cycles": RecordLeaders(**cycles), "highway": DriveLeaders(path=table)}
     mixture = Mixture(weights={"highway": 3}, **sources).load(0.1, 100)
     training, held_out = mixture.training, mixture.windows
     of_cycles = torch.tensor([name == "udds" for name in training.recordings])
     share = training.weights / training.weights.sum()
     assert float(share[of_cycles].sum()) == pytest.approx(0.25)
-    slow = torch.tensor([float(training.record(n).mean()) < 20.4 for n in range(len(training))])
-    assert (slow & ~of_cycles).sum() > (~slow).sum() > 1
-    assert float(share[slow & ~of_cycles].sum()) == pytest.approx(0.375)
     assert set(held_out.sources) == {"cycles", "highway"}
     spread = held_out.spread(2)
     assert [spread.sources.count(name) for name in sources] == [2, 2]

@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 from helpers import POPULATION, compose, wavy_profiles
 
+from lcc_rl.config import load
 from lcc_rl.envs import Inputs
 from lcc_rl.evaluation.clairvoyant import clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
@@ -49,6 +50,23 @@ def test_who_knows_the_profile_saves() -> None:
     assert [number for number, *_ in told] == list(range(1, 16))
     assert told[0][1] == pytest.approx(before[BOTH].sum(axis=1).mean(), rel=1e-4)
     assert told[-1][1] == pytest.approx(after[BOTH].sum(axis=1).mean(), rel=0.01)
+
+
+def test_a_fleet_saves_at_the_flow_of_the_learned_one() -> None:
+    words = ["variant=alcc", "task=i24-mixed", "scenario.string={size: 6, penetration: 0.5}"]
+    cfg = load("evaluate", [*words, f"scenario.horizon={STEPS}"])
+    weights = load_policy("pretrained/i24-mixed", "alcc")
+    start = trained(cfg, "pretrained/i24-mixed", weights, POPULATION)
+    plan = clairvoyant(start, INPUTS, 2, 1, iterations=25, compiled=False, hold=10)
+    before, after = played(start), played(plan)
+    spent = [
+        x["total_net_energy_kj"] / (x["cav_distance_m"] + x["hdv_distance_m"])
+        for x in (before, after)
+    ]
+    assert (spent[1] <= spent[0] * 1.0001).all()
+    assert spent[1].mean() < 0.995 * spent[0].mean()
+    assert (after["flow_vph"] > 0.998 * before["flow_vph"]).all()
+    assert after["min_time_gap_s"].min() > 1.0
 
 
 @pytest.mark.slow

@@ -5,23 +5,34 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, wavy_profiles
+from helpers import POPULATION, small_env, wavy_profiles
 from pages import ROOT, blocks
+from tensordict import TensorDict
 
+import lcc_rl
 from lcc_rl.config import load
-from lcc_rl.envs import build_env
+from lcc_rl.envs import Inputs, build_env
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import LccError
+from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.named import controller_of, is_policy
-from lcc_rl.evaluation.strategies import driven_by
+from lcc_rl.evaluation.rollout import play
+from lcc_rl.evaluation.strategies import driven_by, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.interfaces.driver import Driver, Measured, entries
+from lcc_rl.interfaces.export import ExportedPolicy, Remembering
 from lcc_rl.interfaces.onnx_policy import OnnxPolicy
+from lcc_rl.pieces import Action, Observation
 from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.knowledge import ObservationMemory
+from lcc_rl.results.policies import load_policy
 
 onnx = pytest.importorskip("onnx", reason="extra interfaces")
 pytest.importorskip("onnxruntime", reason="extra interfaces")
@@ -97,6 +108,49 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
     for step in range(1, 4):
         command, kept = driver(measured, kept)
         assert command.tolist() == [float(step)] * 2
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_an_exported_policy_that_remembers_drives_as_the_policy(tmp_path) -> None:
+    pytest.importorskip("onnxscript", reason="extra interfaces")
+    path = str(lcc_rl.export("pretrained/i24-follow5", tmp_path / "follow.onnx"))
+    cfg = load("evaluate", ["task=i24-follow5", "variant=alcc", "scenario.horizon=40"])
+    weights = load_policy("pretrained/i24-follow5", "alcc")
+    policy = trained(cfg, "pretrained", weights, POPULATION)
+    program = replace(policy, cfg=driven_by(policy.cfg, controller_of(path)), policy=None)
+    inputs = Inputs(wavy_profiles(2), wavy_profiles(2), POPULATION)
+    shown = ["cav_net_energy_kj", "mean_gap_m", "hdv_distance_m"]
+    rows = [evaluate(one, inputs, 2, 10, seed=1)[0][shown] for one in (policy, program)]
+    pd.testing.assert_frame_equal(*rows, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["filtered", "stacked"])
+def test_it_remembers_as_the_piece_does(kind) -> None:
+    words = ["+knowledge=memory", f"scenario.pieces.memory.kind={kind}", "scenario.horizon=9"]
+    env = small_env("alcc", 3, words, nominal=True)
+    pieces = pieces_of(env)
+    kinds = (Observation, Action, ObservationMemory)
+    seen, action, memory = (next(p for p in pieces if isinstance(p, k)) for k in kinds)
+    network = torch.nn.Linear(len(seen.constants), 1)
+    driver = Remembering(ExportedPolicy(network, seen, action, None, memory))
+    kept = torch.zeros(3, driver.width)
+
+    whose = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}
+    places = [(whose[view], entry) for view, entry in (n.split(".") for n in driver.names)]
+
+    def policy(td: TensorDict) -> TensorDict:
+        nonlocal kept
+        state = [td[space, entry].view(3, -1)[:, [place]] for (space, place), entry in places]
+        found, kept = driver(torch.cat(state, -1), kept)
+        wanted = network(td["automated", "observation"]).clamp(-1.0, 1.0)
+        torch.testing.assert_close(found.view(-1, 1, 1), 3.0 * wanted, atol=1e-4, rtol=0.0)
+        return td.set(("automated", "action"), wanted)
+
+    policy.in_keys = [("automated", "observation")]
+    policy.in_keys += [(space, entry) for (space, _), entry in places]
+    with torch.no_grad():
+        play(env, policy, None, [("vehicles", "speed")])
+    assert (kept[:, 0] == 1.0).all()
 
 
 FOREIGN = [

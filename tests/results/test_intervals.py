@@ -4,7 +4,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lcc_rl.results.fronts import ENERGY, SHARE, energy_at, points, saving_at
+from lcc_rl.results.fronts import (
+    DISTANCE,
+    ENERGY,
+    FLEET,
+    FLOW,
+    NET,
+    SHARE,
+    compared,
+    energy_at,
+    gained_at_energy,
+    points,
+    saved_at_flow,
+    saving_at,
+)
 from lcc_rl.results.intervals import crossed, mean, saving, share_saved
 from lcc_rl.results.savings import per_window, savings
 
@@ -111,6 +124,43 @@ def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     assert table.loc[("idm", 0.02), SHARE] == pytest.approx(0.01)
     nothing = saving_at(fronts(0.0, 2.0), NETWORK, RULE, 0.012)
     assert -0.03 < nothing.low < 0.0 < nothing.high < 0.03
+
+
+def test_fleets_are_compared_at_equal_flow_and_at_equal_energy() -> None:
+    """A rule needs 10 − (2000 − flow) / 100 kJ/m, and the fleet 1 kJ/m less at a flow of 1,900."""
+    generator = np.random.default_rng(0)
+    rows = []
+    for window, drive in enumerate(generator.normal(0.0, 0.3, 8).repeat(5)):
+        own = {"profile_id": window, "drive": f"{drive}", DISTANCE: 50.0, "training_seed": 0}
+        for gap in (1.0, 1.5, 2.0):
+            flow = 2000.0 - 200.0 * (gap - 1.0)
+            energy = 50.0 * (10.0 - (2000.0 - flow) / 100.0 + drive)
+            rows.append({**own, "policy": "rule", "limit": gap, NET: energy, FLOW: flow})
+        energy = 50.0 * (8.0 + drive)
+        rows.append({**own, "policy": "learned", "limit": 0.0, NET: energy, FLOW: 1900.0})
+    frame = pd.DataFrame(rows).assign(variant="fleet")
+    sides = ("fleet", "learned"), ("fleet", "rule")
+    saved = compared(frame, *sides, FLEET, saved_at_flow)
+    assert saved.value == pytest.approx(
+        1.0 / (9.0 + frame[frame.policy == "learned"][NET].mean() / 50.0 - 8.0)
+    )
+    assert saved.high - saved.low < 0.03  # what drives differ by is on both sides
+    gained = compared(frame, *sides, FLEET, gained_at_energy)
+    assert gained.value == pytest.approx(1900.0 / 1800.0 - 1.0, abs=1e-3)
+    # At a tenth of the energy no time gap of the rule saves as much.
+    cheap = frame[NET].where(frame.policy == "rule", frame[NET] / 10.0)
+    none = compared(frame.assign(**{NET: cheap}), *sides, FLEET, gained_at_energy)
+    assert np.isnan([none.value, none.low, none.high]).all()
+    # Drives that the fleet saves unlike are resampled as wholes.
+    unlike = frame[NET] * np.where(
+        frame.policy == "rule", 1.0, 1.0 + 0.1 * frame.drive.astype(float)
+    )
+    whole = compared(frame.assign(**{NET: unlike}), *sides, FLEET, saved_at_flow)
+    alone = compared(
+        frame.drop(columns="drive").assign(**{NET: unlike}), *sides, FLEET, saved_at_flow
+    )
+    assert whole.value == alone.value
+    assert whole.high - whole.low > 1.5 * (alone.high - alone.low)
 
 
 def test_windows_of_one_drive_are_resampled_together() -> None:

@@ -11,6 +11,7 @@ from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
+from lcc_rl.results.fronts import NET
 from lcc_rl.studies.hcfs.tables import LARGEST, SUMS, sources
 
 
@@ -91,6 +92,27 @@ def test_scores_by_source_and_speed_of_the_leader(tmp_path, monkeypatch) -> None
     assert own["saving"].to_dict() == pytest.approx({15.0: 0.04, 29.0: 0.03})
     assert own["outside_max_gap_m"].to_dict() == {15.0: 0, 29.0: 1}
     assert own["windows"].to_dict() == {15.0: 1, 29.0: 2}
+
+
+def test_fleets_by_setting_and_share(tmp_path, monkeypatch) -> None:
+    cfg = load("evaluate", ["task=i24-mixed", "scenario.string={size: 4, penetration: 0.25}"])
+    drivers = [(0, 100.0, 50.0), (1, 110.0, 70.0)]  # energy and gap
+    rows = pd.DataFrame(
+        [
+            {"strategy": strategy, "driver_id": driver, NET: energy, "max_gap_m": gap}
+            for strategy in ("human", "T_1.2", "alcc")
+            for driver, energy, gap in drivers
+        ]
+    ).assign(profile_id=3, drive="a", min_time_gap_s=1.2, collided=False, flow_vph=2e3)
+    rows = rows.assign(cav_distance_m=1e3, hdv_distance_m=3e3, training_seed=pd.NA)
+    found = (cfg, task_of(cfg), rows, None)
+    monkeypatch.setattr(keep.leaderboard, "task_scores", lambda folder: found)
+    keep.fleets([tmp_path / "free_0.25"], tmp_path / "fleets.parquet")
+    table = pd.read_parquet(tmp_path / "fleets.parquet").set_index("variant")
+    assert table["limit"].to_dict() == pytest.approx({"human": 0.0, "idm_acc": 1.2, "learned": 0.0})
+    assert set(table["setting"]) == {"free"}
+    own = table.loc["learned", ["penetration", NET, "distance_m", "max_gap_m"]]
+    assert own.tolist() == [0.25, 105.0, 4e3, 70.0]
 
 
 def test_means_per_window_and_per_driver(tmp_path) -> None:
