@@ -179,7 +179,7 @@ class PopulationMean(torch.nn.Module):
         """Return the mean acceleration [m/s²]; arguments as in ``idm_acceleration``."""
         known = self.constants
         shift = approach_rate * (0.5 / (known.acceleration * known.deceleration) ** 0.5)
-        index = reverse(torch.searchsorted(self.thresholds, reverse(-shift.detach())))
+        index = reverse(torch.searchsorted(self.thresholds, reverse(-shift.detach()).contiguous()))
         share, first, second = self.sums[index].unbind(-1)
         # Mean of max(0, T + c) and of its square.
         linear = first + shift * share

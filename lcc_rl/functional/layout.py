@@ -30,3 +30,8 @@ def join(parts: Sequence[Tensor], dim: int) -> Tensor:
         dim: −2 for vehicles, −1 for what an entry consists of.
     """
     return reverse(torch.cat([reverse(part) for part in parts], -1 - dim))
+
+
+def total(entry: Tensor, dim: int) -> Tensor:
+    """Sum over vehicles (−2) or parts (−1), in an order that does not depend on the memory."""
+    return entry.contiguous().sum(dim, keepdim=True)

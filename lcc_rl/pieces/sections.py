@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lcc_rl.functional.layout import join
+from lcc_rl.functional.layout import join, total
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import sum_ranges
 from lcc_rl.pieces.base import Key
@@ -71,4 +71,4 @@ class Sections:
 
 def _sum(entry: Tensor) -> Tensor:
     """Return the sum over vehicles, ``[*batch, 1, 1]``."""
-    return entry if entry.shape[-2] == 1 else entry.sum(-2, keepdim=True)
+    return entry if entry.shape[-2] == 1 else total(entry, -2)

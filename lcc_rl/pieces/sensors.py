@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from lcc_rl.functional.layout import join
+from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.sensing import Sensing
@@ -96,7 +96,8 @@ class Sensors(StepTransform):
         """Return what is measured of frames, the latest first, and what is kept."""
         number = age.long()
         columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
-        gap, speed, ahead, acceleration, _ = frames.gather(-1, columns).split(1, -1)
+        chosen = reverse(reverse(frames).gather(0, reverse(columns)))
+        gap, speed, ahead, acceleration, _ = chosen.split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
         gap_error, speed_error, ahead_error = (
             bound * self._error(seed, step - number, stream)

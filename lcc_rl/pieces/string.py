@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.layout import join
+from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import between, stream_id, uniform
 from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
@@ -154,7 +154,8 @@ class StringMotion(StepTransform):
         joined = parts[0] if len(parts) == 1 else join(parts, -2)
         if indices:
             order = join(indices, -1).unsqueeze(-1)
-            return torch.zeros_like(joined).scatter(-2, order.expand_as(joined), joined)
+            places, values = reverse(order.expand_as(joined)), reverse(joined)
+            return reverse(torch.zeros_like(values).scatter(1, places, values))
         return self.arrange(joined)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
