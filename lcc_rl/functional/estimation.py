@@ -20,6 +20,7 @@ from torch import Tensor
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import limit
 from lcc_rl.functional.idm import IDMConstants, power
+from lcc_rl.functional.layout import join, reverse
 
 REFERENCE_SPEED = 15.0  # v_ref [m/s]; only scales q so that it is of order one
 
@@ -138,8 +139,8 @@ def _updated(
     # else the pair would leave the ridge that the measurements allow.
     bounded = q.clamp(min=0.0)
     time_gap = time_gap + covariance / variance_q * (bounded - q)
-    estimate = torch.cat([bounded, time_gap.clamp(0.05, 10.0)], dim=-1)
-    learned = torch.cat([variance_q, covariance, variance_t], dim=-1)
+    estimate = join([bounded, time_gap.clamp(0.05, 10.0)], -1)
+    learned = join([variance_q, covariance, variance_t], -1)
     return Belief(estimate, learned)
 
 
@@ -178,7 +179,7 @@ class PopulationMean(torch.nn.Module):
         """Return the mean acceleration [m/s²]; arguments as in ``idm_acceleration``."""
         known = self.constants
         shift = approach_rate * (0.5 / (known.acceleration * known.deceleration) ** 0.5)
-        index = torch.searchsorted(self.thresholds, -shift.detach())
+        index = reverse(torch.searchsorted(self.thresholds, reverse(-shift.detach()).contiguous()))
         share, first, second = self.sums[index].unbind(-1)
         # Mean of max(0, T + c) and of its square.
         linear = first + shift * share

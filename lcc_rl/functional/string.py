@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
+from lcc_rl.functional.layout import join, reverse
 
 
 class Motion(NamedTuple):
@@ -39,7 +40,7 @@ def entries_ahead(leader: Tensor | None, entry: Tensor) -> Tensor:
         entry: the entry of every vehicle, ``[*batch, N, w]``.
     """
     first = entry[..., -1:, :] if leader is None else leader.unsqueeze(-2)
-    return first if entry.shape[-2] == 1 else torch.cat([first, entry[..., :-1, :]], dim=-2)
+    return first if entry.shape[-2] == 1 else join([first, entry[..., :-1, :]], -2)
 
 
 def advance_string(
@@ -108,7 +109,7 @@ def _whole(entry: Tensor) -> Tensor:
 
 def _picked(entry: Tensor, blocks: Sequence[slice]) -> Tensor:
     parts = [entry[..., block, :] for block in blocks]
-    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
+    return parts[0] if len(parts) == 1 else join(parts, -2)
 
 
 def gather(entry: Tensor, index: Tensor) -> Tensor:
@@ -122,7 +123,7 @@ def gather(entry: Tensor, index: Tensor) -> Tensor:
         ``[*batch, n, w]``.
     """
     wide = index.unsqueeze(-1).expand(*index.shape, entry.shape[-1])
-    return entry.gather(-2, wide)
+    return reverse(reverse(entry).gather(1, reverse(wide)))
 
 
 def sum_ranges(entry: Tensor, first: Tensor, last: Tensor) -> Tensor:

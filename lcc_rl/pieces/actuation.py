@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.functional.actuation import Response
+from lcc_rl.functional.layout import join
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Key, StepTransform
 from lcc_rl.pieces.string import OBEYED
@@ -54,9 +55,9 @@ class Actuation(StepTransform):
     def compute(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
         """Return the accelerations, and what is kept."""
         command, kept = self.views(*entries)
-        line = torch.cat([kept[..., 1:], command], -1)
+        line = join([kept[..., 1:], command], -1)
         acceleration = self.response.next(kept[..., :1], line[..., :1])
-        return acceleration, torch.cat([acceleration, line[..., 1:]], -1)
+        return acceleration, join([acceleration, line[..., 1:]], -1)
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         specs = super().written_specs(batch, device)

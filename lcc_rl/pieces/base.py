@@ -25,6 +25,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.views import NEXT as NEXT
 from lcc_rl.pieces.views import Key as Key
@@ -253,6 +254,8 @@ class StepTransform(Piece):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self.begin(tensordict, tensordict_reset)
+        for key in (*self.targets, *self.constants):  # as a step lays them out
+            tensordict_reset.set(key, batch_innermost(tensordict_reset.get(key)))
         return tensordict_reset
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -18,6 +18,7 @@ from lcc_rl.functional.braking import (
     safe_acceleration,
     safe_command,
 )
+from lcc_rl.functional.layout import join
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.sensing import brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
@@ -261,6 +262,6 @@ class Promised(StepTransform):
         else:
             room = least_room(speed, now.gap, ahead, safety.limits)
         past = frames_of(sensors, AHEAD_ACCELERATION)[..., : safety.sensing.oldest]
-        hardest = torch.cat([acceleration, past], -1).amin(-1, keepdim=True)
+        hardest = join([acceleration, past], -1).amin(-1, keepdim=True)
         kept_up = hardest >= -safety.braking_ahead - ROUNDING
         return ((room >= -ROUNDING) & kept_up).to(speed.dtype)

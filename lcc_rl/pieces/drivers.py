@@ -15,6 +15,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GIPPS_LAW
 from lcc_rl.functional.idm import IDM_LAW
+from lcc_rl.functional.layout import join
 from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
@@ -131,11 +132,11 @@ class Drivers(Controller):
             kept.append(self._strayed(before, seed, step))
         if self.late:
             *more, history = more  # type: ignore[assignment]
-            now = torch.cat(motion, -1)
+            now = join(motion, -1)
             # Before the first step nothing else was ever seen.
             past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
             motion = past[..., -3:].split(1, -1)
-            kept.insert(0, torch.cat([now, past[..., :-3]], -1))
+            kept.insert(0, join([now, past[..., :-3]], -1))
         command = self.acceleration(*motion, desired_speed, time_gap, *more)
         if self.noise:
             draw = uniform(seed, step, self.noise_stream + self.index)
@@ -152,9 +153,9 @@ class Drivers(Controller):
         drawn, further = (
             self.strays * normal(seed, step, stream + self.index) for stream in self.stray_streams
         )
-        first = torch.cat(self.noise_step.start(drawn, further), -1)
+        first = join(self.noise_step.start(drawn, further), -1)
         latest, last = before.split(1, -1)
-        later = torch.cat([self.noise_step.next(latest, last, drawn), latest], -1)
+        later = join([self.noise_step.next(latest, last, drawn), latest], -1)
         return torch.where(step == 0, first, later)
 
     def acceleration(

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import NEXT, SEED, STEP, Feature, Key, StepTransform
@@ -121,7 +122,8 @@ class ObservationMemory(StepTransform):
             return found, found
         past = kept.unflatten(-1, (self.counted, self.depth))
         past = torch.cat([now.unsqueeze(-1), past[..., :-1]], -1)
-        return past[..., self.places].flatten(-2), past.flatten(-2)
+        seen = past[..., self.places]
+        return batch_innermost(seen.flatten(-2)), batch_innermost(past.flatten(-2))
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         vehicles, width = self.event_shape

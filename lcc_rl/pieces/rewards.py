@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
 from lcc_rl.pieces.base import RewardPiece
@@ -127,7 +128,7 @@ class EnergyReward(RewardTerm):
         if self.of == "behind":
             power = self.sections.sum(power, *indices)
         elif self.of == "string":
-            power = power.sum(-2, keepdim=True).expand(*power.shape[:-2], *self.event_shape)
+            power = total(power, -2).expand(*power.shape[:-2], *self.event_shape)
         return power * -self.factor
 
 

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Unbounded
 
+from lcc_rl.functional.layout import join, total
 from lcc_rl.functional.rules import follower_stopper_speed, pi_saturation_speed
 from lcc_rl.pieces.base import Key
 from lcc_rl.pieces.controllers import Controller
@@ -54,8 +55,8 @@ class Averaging(Controller):
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean [m/s], ``[*batch, n, 1]``, and the history with the present in it."""
-        past = torch.cat([speed, history[..., :-1]], -1)
-        return past.sum(-1, keepdim=True) / (step + 1).clamp(max=self.samples), past
+        past = join([speed, history[..., :-1]], -1)
+        return total(past, -1) / (step + 1).clamp(max=self.samples), past
 
     def towards(self, wanted: Tensor, speed: Tensor) -> Tensor:
         """Return the acceleration [m/s²] to a speed, within the limits."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from torch import Tensor, cat
+from torch import Tensor
 from torch.nn.functional import pad
 
+from lcc_rl.functional.layout import join, total
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import sum_ranges
 from lcc_rl.pieces.base import Key
@@ -53,7 +54,7 @@ class Sections:
             parts[-1] = parts[-1] + _sum(entry[..., : self.wrapped, :])
         if not parts:
             return entry[..., :0, :]
-        return parts[0] if len(parts) == 1 else cat(parts, -2)
+        return parts[0] if len(parts) == 1 else join(parts, -2)
 
     def _sum_drawn(self, entry: Tensor, own: Tensor, *others: Tensor) -> Tensor:
         first, last = own + 1, pad(own[..., 1:], (0, 1), value=len(self.string))
@@ -70,4 +71,4 @@ class Sections:
 
 def _sum(entry: Tensor) -> Tensor:
     """Return the sum over vehicles, ``[*batch, 1, 1]``."""
-    return entry if entry.shape[-2] == 1 else entry.sum(-2, keepdim=True)
+    return entry if entry.shape[-2] == 1 else total(entry, -2)

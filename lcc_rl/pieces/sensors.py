@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
+from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.sensing import Sensing
@@ -83,7 +84,7 @@ class Sensors(StepTransform):
     def compute(self, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return what is measured, and what is kept."""
         memory, *now, seed, step = self.views(*entries)
-        frames = torch.cat([*now, memory[..., 1 : -len(SEEN)]], -1)
+        frames = join([*now, memory[..., 1 : -len(SEEN)]], -1)
         dropped = memory[..., :1] - self.sensing.late
         missing = uniform(seed, step, self.missing + self.index) < self.dropouts
         dropped = torch.where(missing & (dropped < self.sensing.longest), dropped + 1.0, 0.0)
@@ -95,7 +96,8 @@ class Sensors(StepTransform):
         """Return what is measured of frames, the latest first, and what is kept."""
         number = age.long()
         columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
-        gap, speed, ahead, acceleration, _ = frames.gather(-1, columns).split(1, -1)
+        chosen = reverse(reverse(frames).gather(0, reverse(columns)))
+        gap, speed, ahead, acceleration, _ = chosen.split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
         gap_error, speed_error, ahead_error = (
             bound * self._error(seed, step - number, stream)
@@ -103,7 +105,7 @@ class Sensors(StepTransform):
         )
         speed = (speed + speed_error).clamp(min=0.0)
         ahead = (ahead + ahead_error).clamp(min=0.0)
-        kept = torch.cat([age, frames], -1)
+        kept = join([age, frames], -1)
         return gap + gap_error, speed, ahead - speed, ahead, acceleration, kept
 
     def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
@@ -124,11 +126,11 @@ class Sensors(StepTransform):
         *now, seed, step = self.first(*(start.get(key) for key in self.first.keys))
         closing = self.time_step * (now[SPEED] - now[AHEAD])
         frames = [
-            torch.cat([now[GAP] + number * closing, *now[SPEED:]], -1)
+            join([now[GAP] + number * closing, *now[SPEED:]], -1)
             for number in range(self.sensing.oldest + 1)
         ]
         age = torch.full_like(closing, self.sensing.late)
-        values = self._measured(torch.cat(frames, -1), age, seed, step)
+        values = self._measured(join(frames, -1), age, seed, step)
         for key, value in zip(self.targets, values, strict=True):
             start.set(key, value)
 

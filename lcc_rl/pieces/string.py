@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import between, stream_id, uniform
 from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
@@ -150,10 +151,11 @@ class StringMotion(StepTransform):
 
     def _assemble(self, parts: tuple[Tensor, ...], indices: tuple[Tensor, ...]) -> Tensor:
         """Return one entry of every vehicle, front to back, from that of every role."""
-        joined = parts[0] if len(parts) == 1 else torch.cat(parts, -2)
+        joined = parts[0] if len(parts) == 1 else join(parts, -2)
         if indices:
-            order = torch.cat(indices, -1).unsqueeze(-1)
-            return torch.zeros_like(joined).scatter(-2, order.expand_as(joined), joined)
+            order = join(indices, -1).unsqueeze(-1)
+            places, values = reverse(order.expand_as(joined)), reverse(joined)
+            return reverse(torch.zeros_like(values).scatter(1, places, values))
         return self.arrange(joined)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
@@ -178,7 +180,7 @@ class StringMotion(StepTransform):
         still = torch.zeros_like(speed)
         values = (speed, gap, relative, still, still.clone(), still.clone())
         for key, value in zip(self.targets, values, strict=True):
-            start.set(key, value.contiguous())
+            start.set(key, value)
 
 
 def _spread(leader: Tensor, count: int) -> Tensor:

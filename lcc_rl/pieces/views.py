@@ -25,6 +25,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.layout import join
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.string import entries_ahead, gather, selector
 
@@ -134,7 +135,7 @@ class Views:
             # The first vehicles come round to the end on a ring; elsewhere nobody is there.
             wrapped = entry[..., :distance, :]
             end = wrapped if self.string.ring else torch.zeros_like(wrapped)
-            entry = torch.cat([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
+            entry = join([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
         if index >= 0:
             return gather(entry, entries[index])
         return self.select(entry)
@@ -169,4 +170,4 @@ def _held(place: int, entries: Sequence[Tensor]) -> Tensor:
 
 def _joined(parts: Sequence[Resolver], entries: Sequence[Tensor]) -> Tensor:
     found = [part(entries) for part in parts]
-    return found[0] if len(found) == 1 else torch.cat(found, -1)
+    return found[0] if len(found) == 1 else join(found, -1)

@@ -35,7 +35,7 @@ from lcc_rl.agents.actor import GaussianExploration, make_actor, shared_policy
 from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet
 from lcc_rl.envs.clock import Clock, Traffic
-from lcc_rl.envs.step import Pieces
+from lcc_rl.envs.step import Pieces, pieces_of
 from lcc_rl.pieces import (
     CACC,
     FVDM,
@@ -388,6 +388,22 @@ def test_torchrls_compose_and_this_packages_give_the_same(road) -> None:
     assert set(other.keys(True, True)) == set(data.keys(True, True))
     for key in data.keys(True, True):
         assert torch.equal(other[key], data[key]), key
+
+
+@pytest.mark.parametrize("road", list(STRINGS))
+def test_a_step_lays_out_what_the_next_one_reads_as_a_reset_does(road) -> None:
+    """Else a compiled step would be compiled once more."""
+    env = full_env(road)
+    start = env.reset()
+    reached = env.rand_step(start)["next"]
+    steps = [piece for piece in pieces_of(env) if isinstance(piece, StepTransform)]
+    read = {key for piece in steps for late, key in piece.needs if not late}
+    for key in read - set(ACTIONS):
+        before, after = (
+            [step for step, size in zip(x.stride(), x.shape, strict=True) if size > 1]
+            for x in (start[key], reached[key])
+        )
+        assert before == after, key
 
 
 @each_piece
