@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from commands import NO_AGENT, UNTRAINED, run_command, tiny
@@ -135,8 +137,9 @@ def test_who_cannot_drive_is_told_how(who, words) -> None:
 
 
 def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
-    with pytest.raises(LccError, match="at the top of a module"):
-        lcc_rl.compare([lambda gap: gap], overrides=SMALL, folder=tmp_path)
+    for who in (lambda gap: gap, partial(steady, gain=0.1)):
+        with pytest.raises(LccError, match="at the top of a module"):
+            lcc_rl.compare([who], overrides=SMALL, folder=tmp_path)
     with pytest.raises(LccError, match="two steady: give each a name"):
         evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)
 

@@ -158,6 +158,7 @@ FOREIGN = [
     ({**ABOUT, "inputs": [{**GAP, "name": "../../etc/passwd"}]}, "is not measured"),
     ({**ABOUT, "inputs": [{**GAP, "unit": "ft"}]}, "self.gap is in m, got 'ft'"),
     ({**ABOUT, "inputs": [GAP, GAP]}, r"expected the input state \[batch, 2\]"),
+    ({}, "lacks the metadata"),
     ({**ABOUT, "inputs": []}, "inputs"),
     ({**ABOUT, "output": "acceleration [g]"}, "output"),
     ({"inputs": [GAP]}, "output is required"),
