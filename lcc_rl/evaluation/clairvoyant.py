@@ -96,11 +96,18 @@ def clairvoyant(
         any_leader(strategy.cfg), inputs.evaluation, inputs.population, len(profile), nominal=True
     )
     given = reset_options(env, profile, driver, seed, count)
-    string, fleet = strategy.cfg.scenario.vehicles, build_energy(strategy.cfg)
+    string, task = strategy.cfg.scenario.vehicles, strategy.cfg.task
+    count_energy = partial(
+        path_energy,
+        time_step=strategy.cfg.scenario.time_step,
+        string=string if own else None,
+        energy=build_energy(strategy.cfg),
+    )
     source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
-    goal: Goal = KeptFlow(strategy.cfg) if strategy.cfg.task else partial(within, string)
+    # Plans follow the smooth energy; the best is chosen by the one that is measured.
+    goal, measured = (KeptFlow(strategy.cfg) if task else partial(within, string) for _ in "ab")
     held = (math.ceil(steps / hold), len(profile), string.count(AUTOMATED), 1)
     shifts, found = torch.zeros(held, requires_grad=True), Best(len(profile))
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
@@ -110,9 +117,9 @@ def clairvoyant(
         _, record = source.play(source.start(given), network, steps, every)
         data = source.assemble(record)
         check_batch(data, who=strategy.title)
-        energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
+        energy = count_energy(data)
         price, missed = goal(energy, data)
-        found.take(price + missed, every)
+        found.take(torch.stack(measured(count_energy(data, exact=bool(task)), data)).sum(0), every)
         total = price + min(1.0, 0.1 + 1.8 * share) * missed
         _descend(optimizer, total, share, math.sqrt(hold))
         means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
@@ -153,8 +160,12 @@ def path_energy(
     time_step: float,
     string: VehicleString | None = None,
     energy: Fleet | None = None,
+    exact: bool = False,
 ) -> Tensor:
-    """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ]."""
+    """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ].
+
+    If ``exact``, the energy drawn less what the motion stores, which has jumps.
+    """
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
     if string is not None:
         views = Views(string, AUTOMATED, ["self.speed", "next.self.speed"])
@@ -163,7 +174,12 @@ def path_energy(
     if string is not None and kind is not None:
         views = Views(string, AUTOMATED, ["self.energy_class"])
         (kind,) = views(*(data.get(key) for key in views.keys))
-    power = as_fleet(energy).path_power(now, (then - now) / time_step, kind)
+    fleet, motion = as_fleet(energy), (now, (then - now) / time_step)
+    if exact:
+        stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
+        power = fleet.power(*motion, kind) - stored / time_step
+    else:
+        power = fleet.path_power(*motion, kind)
     return power.flatten(1).sum(1) * time_step * KILO
 
 
