@@ -2,7 +2,8 @@
 
 Each run is an evaluation of the task, i24-mixed or ring-22, with another scenario.string. Scores go
 to outputs/reference/tasks, the figure to docs/figures; without runs the figure is drawn again from
-what is kept.
+what is kept. Instead of a task, ``fronts`` prints what learned fleets save beside the front of a
+rule (tools/keep.py fleets), as a Markdown table.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from leaderboard import task_scores
 from matplotlib.figure import Figure
@@ -21,6 +23,17 @@ from lcc_rl.errors import require
 from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, save, style
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.fronts import (
+    DISTANCE,
+    FLEET,
+    FLOW,
+    NET,
+    compared,
+    flow_gained,
+    saved,
+    saved_at_flow,
+)
+from lcc_rl.results.intervals import Estimate
 
 SHARE, LEARNED = "penetration", "learned"
 REFERENCE, FIGURES = Path("outputs/reference/tasks"), Path("docs/figures")
@@ -30,7 +43,8 @@ SHOWN = {
     "i24-mixed": {"saving": "fuel saved per km [%]", "flow_vph": "flow [vehicles/h]"},
     "ring-22": {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"},
 }
-HUMAN = "human"
+HUMAN, RULE = "human", "idm_acc"
+FRONTS = "fleets_fronts.parquet"
 SHOWN_AS = {
     LEARNED: ("learned", "#0072b2"),
     "idm_acc": ("tuned IDM", "#009e73"),
@@ -50,6 +64,35 @@ def scored(run: Path) -> pd.DataFrame:
     string = cfg.scenario.vehicles
     found.insert(0, SHARE, string.count(AUTOMATED) / len(string))
     return found
+
+
+def fronts(rows: pd.DataFrame) -> str:
+    """Return a Markdown table: a row per setting and share, by :mod:`lcc_rl.results.fronts`."""
+    head = ["fleet", "saved", "flow [1/h]", "against the rule at this flow", "the rule at best"]
+    lines = [head, ["---"] * len(head)]
+    learned, human, rule = ((name, "fleet") for name in (LEARNED, HUMAN, RULE))
+    for (setting, share), part in rows.groupby(["setting", SHARE], sort=False):
+        means = part.groupby(["variant", "limit"])[list(FLEET)].mean()
+        flow, spent = means[FLOW], means[NET] / means[DISTANCE]
+        others = spent[RULE], flow[RULE]
+        saving = 100.0 * (1.0 - others[0] / spent[HUMAN].iloc[0])
+        own, best = flow[LEARNED].iloc[0], saving.idxmax()
+        gap = np.interp(own, others[1].to_numpy()[::-1], others[1].index.to_numpy()[::-1])
+        cells = [f"{setting}, {share:.0%}"]
+        cells.append(percent(compared(part, learned, human, FLEET, saved)))
+        gained = percent(compared(part, learned, human, FLEET, flow_gained))
+        cells.append(f"{own:,.0f}: {gained}")
+        against = compared(part, learned, rule, FLEET, saved_at_flow)
+        cells.append(f"{percent(against)}; T = {gap:.2f} s")
+        cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {others[1][best]:,.0f}")
+        lines.append(cells)
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def percent(found: Estimate) -> str:
+    """Return an estimate and its interval in per cent."""
+    value, low, high = (f"{100.0 * x:.1f}" for x in (found.value, found.low, found.high))
+    return f"{value} % ({low} … {high})".replace("-", "−")
 
 
 @paper
@@ -91,11 +134,14 @@ def drawn(table: pd.DataFrame, task: str) -> Figure:
 def main(words: Sequence[str] | None = None) -> int:
     """Keep the scores of the runs given, and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("task", choices=SHOWN, help="of the runs")
+    parser.add_argument("task", choices=[*SHOWN, "fronts"], help="of the runs")
     parser.add_argument("runs", nargs="*", type=Path, help="folders of evaluations")
     parser.add_argument("--reference", type=Path, default=REFERENCE, help="where scores are kept")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="folder of the image")
     options = parser.parse_args(words)
+    if options.task == "fronts":
+        print(fronts(read_parquet(options.reference / FRONTS)))
+        return 0
     name = NAMES[options.task]
     kept = options.reference / f"{name}.parquet"
     if options.runs:

@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.config.schemas import StudyConfig
@@ -41,9 +41,6 @@ LEAST_GAP = 0.5  # [m]
 FAR = 20.0  # beyond this a limit is not missed by more [m]
 LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
 FLOW_PRICE = 3.0  # share of the energy that the loss of the whole flow costs
-
-# From the energy and the record of a drive: what a plan minimises, and the price of its limits.
-Goal = Callable[[Tensor, TensorDictBase], tuple[Tensor, Tensor]]
 
 
 class Planned:
@@ -84,25 +81,21 @@ def clairvoyant(
         compiled: compile the simulator.
         own: minimise the energy of the automated vehicles only.
         hold: steps for which a shift acts.
-        report: receives the number of the iteration, the energy [kJ] and the price of the limits.
+        report: receives the number of the iteration, what is minimised and the price of the limits.
 
     Raises:
         Diverged: if an action, or an entry that is minimised or limited, is not a number.
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
-    count = len(inputs.population.time_gap)
-    profile, driver = pairs(len(inputs.evaluation), count, drivers)
-    env = build_env(
-        any_leader(strategy.cfg), inputs.evaluation, inputs.population, len(profile), nominal=True
-    )
-    given = reset_options(env, profile, driver, seed, count)
-    string, fleet = strategy.cfg.scenario.vehicles, build_energy(strategy.cfg)
+    env, given = _episodes(strategy, inputs, drivers, seed)
     source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
-    goal: Goal = KeptFlow(strategy.cfg) if strategy.cfg.task else partial(within, string)
-    held = (math.ceil(steps / hold), len(profile), string.count(AUTOMATED), 1)
-    shifts, found = torch.zeros(held, requires_grad=True), Best(len(profile))
+    # Plans follow the smooth energy; the best one is chosen by the energy that is measured.
+    goal, measured = Goal(strategy.cfg, own), Goal(strategy.cfg, own, exact=True)
+    cars = strategy.cfg.scenario.vehicles.count(AUTOMATED)
+    held = (math.ceil(steps / hold), env.batch_size[0], cars, 1)
+    shifts, found = torch.zeros(held, requires_grad=True), Best(env.batch_size[0])
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
     for iteration in range(iterations):
         share = iteration / iterations
@@ -110,15 +103,25 @@ def clairvoyant(
         _, record = source.play(source.start(given), network, steps, every)
         data = source.assemble(record)
         check_batch(data, who=strategy.title)
-        energy = path_energy(data, strategy.cfg.scenario.time_step, string if own else None, fleet)
-        price, missed = goal(energy, data)
-        found.take(price + missed, every)
+        price, missed = goal(data)
+        found.take(torch.stack(measured(data)).sum(0), every)
         total = price + min(1.0, 0.1 + 1.8 * share) * missed
         _descend(optimizer, total, share, math.sqrt(hold))
-        means = {"kJ": float(energy.detach().mean()), "missed": float(missed.detach().mean())}
+        means = {"kJ": float(price.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
     planned = Planned(strategy.policy, found.shifts)
     return replace(strategy, name=OWN if own else BOTH, policy=planned, seed=None)
+
+
+def _episodes(
+    strategy: Strategy, inputs: Inputs, drivers: int | None, seed: int
+) -> tuple[TransformedEnv, TensorDict]:
+    """Return the environment of all episodes, and their reset options."""
+    count = len(inputs.population.time_gap)
+    profile, driver = pairs(len(inputs.evaluation), count, drivers)
+    cfg = any_leader(strategy.cfg)
+    env = build_env(cfg, inputs.evaluation, inputs.population, len(profile), nominal=True)
+    return env, reset_options(env, profile, driver, seed, count)
 
 
 class Best:
@@ -153,8 +156,12 @@ def path_energy(
     time_step: float,
     string: VehicleString | None = None,
     energy: Fleet | None = None,
+    exact: bool = False,
 ) -> Tensor:
-    """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ]."""
+    """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ].
+
+    If ``exact``, the energy drawn less what the motion stores, which has jumps.
+    """
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
     if string is not None:
         views = Views(string, AUTOMATED, ["self.speed", "next.self.speed"])
@@ -163,22 +170,40 @@ def path_energy(
     if string is not None and kind is not None:
         views = Views(string, AUTOMATED, ["self.energy_class"])
         (kind,) = views(*(data.get(key) for key in views.keys))
-    power = as_fleet(energy).path_power(now, (then - now) / time_step, kind)
+    fleet, motion = as_fleet(energy), (now, (then - now) / time_step)
+    if exact:
+        stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
+        power = fleet.power(*motion, kind) - stored / time_step
+    else:
+        power = fleet.path_power(*motion, kind)
     return power.flatten(1).sum(1) * time_step * KILO
 
 
-class KeptFlow:
-    """Energy less what the distance is worth, and the price of flow lost, by the first drive.
+class Goal:
+    """What a plan minimises, and the price of its limits, each ``[batch]`` [kJ].
 
-    At the price of what a metre takes, saving energy is saving energy per distance.
+    In a task: the energy less what the distance is worth, at the price that a metre takes in the
+    first drive, so that less is less energy per distance; the limit is the flow of that drive.
+
+    Args:
+        cfg: configuration of the controller to begin with.
+        own: count the energy of the automated vehicles only.
+        exact: count the energy as it is measured where the plan's is smooth.
     """
 
-    def __init__(self, cfg: StudyConfig) -> None:
-        self.length, self.time_step = cfg.scenario.vehicle_length, cfg.scenario.time_step
+    def __init__(self, cfg: StudyConfig, own: bool, exact: bool = False) -> None:
+        scenario = cfg.scenario
+        self.task, self.string = cfg.task is not None, scenario.vehicles
+        self.length, self.time_step = scenario.vehicle_length, scenario.time_step
+        whose = self.string if own else None
+        self.counted = (self.time_step, whose, build_energy(cfg), exact and self.task)
         self.first: tuple[Tensor, Tensor] | None = None
 
-    def __call__(self, energy: Tensor, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return both [kJ], ``[batch]``; see :data:`Goal`."""
+    def __call__(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return both for a drive."""
+        energy = path_energy(data, *self.counted)
+        if not self.task:
+            return energy, misses(data, self.string)
         speed, gap = (data.get(next_key((VEHICLES, x))).flatten(1) for x in ("speed", "gap"))
         distance = speed.sum(1) * self.time_step
         flow = speed.mean(1) / (gap.mean(1) + self.length)
@@ -188,11 +213,6 @@ class KeptFlow:
         worth = per_metre * distance
         lost = (1.0 - flow / least).clamp(min=0.0)
         return energy - worth, FLOW_PRICE * worth.detach() * lost
-
-
-def within(string: VehicleString, energy: Tensor, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Return the energy and the price of the limits of one car, see :data:`Goal`."""
-    return energy, misses(data, string)
 
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
