@@ -48,7 +48,7 @@ FILTERED = "_filtered"  # ends the names of those who drive behind the safety fi
 FEW, WIDEST = 5, 10_000  # windows; characters
 CAPTION = (
     "energy per vehicle and km, without what motion stores; {}shares of the time: "
-    "time-to-collision < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
+    "TTC < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
 )
 COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
 
