@@ -45,6 +45,12 @@ SHOWN = {
 }
 HUMAN, RULE = "human", "idm_acc"
 FRONTS = "fleets_fronts.parquet"
+SETTINGS = {  # of what is kept for fronts, for readers
+    "front": "I-24, windows of 100 s",
+    "free": "free driving, 100 s",
+    "long": "I-24, windows of 400 s",
+    "true": "true drivers behind I-24, 100 s",
+}
 SHOWN_AS = {
     LEARNED: ("learned", "#0072b2"),
     "idm_acc": ("tuned IDM", "#009e73"),
@@ -68,17 +74,26 @@ def scored(run: Path) -> pd.DataFrame:
 
 def fronts(rows: pd.DataFrame) -> str:
     """Return a Markdown table: a row per setting and share, by :mod:`lcc_rl.results.fronts`."""
-    head = ["fleet", "saved", "flow [1/h]", "against the rule at this flow", "the rule at best"]
+    head = [
+        "leaders",
+        "automated",
+        "saved",
+        "flow [1/h]",
+        "against the rule at this flow",
+        "the rule at best",
+    ]
     lines = [head, ["---"] * len(head)]
     learned, human, rule = ((name, "fleet") for name in (LEARNED, HUMAN, RULE))
-    for (setting, share), part in rows.groupby(["setting", SHARE], sort=False):
+    names = pd.Categorical(rows["setting"].map(SETTINGS), list(SETTINGS.values()))
+    groups = rows.assign(setting=names).groupby(["setting", SHARE], observed=True)
+    for (setting, share), part in groups:
         means = part.groupby(["variant", "limit"])[list(FLEET)].mean()
         flow, spent = means[FLOW], means[NET] / means[DISTANCE]
         others = spent[RULE], flow[RULE]
         saving = 100.0 * (1.0 - others[0] / spent[HUMAN].iloc[0])
         own, best = flow[LEARNED].iloc[0], saving.idxmax()
         gap = np.interp(own, others[1].to_numpy()[::-1], others[1].index.to_numpy()[::-1])
-        cells = [f"{setting}, {share:.0%}"]
+        cells = [str(setting), f"{100.0 * float(str(share)):.0f} %"]
         cells.append(percent(compared(part, learned, human, FLEET, saved)))
         gained = percent(compared(part, learned, human, FLEET, flow_gained))
         cells.append(f"{own:,.0f}: {gained}")

@@ -108,7 +108,10 @@ def fleets(evaluations: Sequence[Path], path: Path) -> None:
 
     A strategy ``T_1.2`` is the point of the rule's front with that time gap.
     """
-    write_parquet(rounded(pd.concat(map(_fleet, evaluations), ignore_index=True)), path)
+    rows = pd.concat(map(_fleet, evaluations), ignore_index=True)
+    # Humans drive in every evaluation of a setting.
+    axes = ["setting", "penetration", "variant", "limit", "training_seed", "profile_id"]
+    write_parquet(rounded(rows.drop_duplicates(axes, ignore_index=True)), path)
 
 
 def _fleet(folder: Path) -> pd.DataFrame:

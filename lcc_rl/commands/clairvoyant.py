@@ -166,9 +166,8 @@ def main(arguments: list[str]) -> int:
     options, overrides = parser.parse_known_args(arguments)
     check_overrides(overrides, GIVEN, "the controller is that of --policy, as it was trained")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
-    chosen = any(word.startswith("evaluation.drivers=") for word in overrides)
-    drivers = [] if chosen else [f"evaluation.drivers={DRIVERS}"]
-    cfg = load("evaluate", ["variant=alcc", *drivers, *overrides])
+    cfg = load("evaluate", ["variant=alcc", *overrides])
+    cfg.evaluation.drivers = cfg.evaluation.drivers or DRIVERS
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
     prepare_torch(cfg)
