@@ -26,6 +26,7 @@ from benchmarks.gym import gym
 from benchmarks.harness import EXTRA, Row, drawn, installed
 from benchmarks.loading import loading, start
 from benchmarks.read import read
+from benchmarks.string import string
 from benchmarks.train import train
 from benchmarks.update import update
 from lcc_rl.config.schemas import Device
@@ -37,7 +38,7 @@ from lcc_rl.io.memory import torch_device
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million, Parallel
 
-LISTED = (read, loading, start, env, gym, collect, update, train, calibrate, evaluate)
+LISTED = (read, loading, start, env, string, gym, collect, update, train, calibrate, evaluate)
 NO_DEVICE = ("read", "loading", "start")  # always on the processor
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
