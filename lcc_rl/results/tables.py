@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.savings import BASELINES, KINDS, NOTHING, savings
+from lcc_rl.results.savings import BASELINES, KINDS, NOTHING, Windows
 from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
@@ -58,6 +58,8 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     # By the mean distance of the strategy, so that savings are those of the totals.
     ways = every[["cav_distance_m", "hdv_distance_m"]].sum(axis=1).replace(0.0, np.nan)
     windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
+    energies = {kind: f"total_{column}" for kind, column in KINDS.items()} | {"km_": PER_KM}
+    by_window = {kind: Windows.of(windows, column) for kind, column in energies.items()}
     rows = []
     counts = windows.groupby("strategy")["profile_id"].nunique()
     for strategy in found.strategies:
@@ -73,11 +75,9 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
         row[PER_KM] = total[PATH] / kilometres if kilometres else np.nan
         row["distance_m"] = 1e3 * kilometres / total["rows"]
-        energies = {kind: f"total_{column}" for kind, column in KINDS.items()} | {"km_": PER_KM}
         for baseline in BASELINES:
-            for kind, column in energies.items():
-                names = (column, strategy, baseline)
-                share = savings(windows, *names) if strategy != baseline else NOTHING
+            for kind, energy in by_window.items():
+                share = energy.saving(strategy, baseline) if strategy != baseline else NOTHING
                 row |= share.columns(f"{kind}saving_vs_{baseline}")
             worse = found.worse_off(strategy, baseline)
             row |= {f"{name}_worse_than_{baseline}": share for name, share in worse.items()}
