@@ -11,7 +11,7 @@ ARGS ?=
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test test-all extras coverage lint size docs clean
+.PHONY: run test test-all extras coverage lint size benchmarks docs clean
 
 run: $(STAMP)
 	$(BIN)/python -m lcc_rl.cli.pipeline $(ARGS)
@@ -37,6 +37,15 @@ lint: $(STAMP)
 # Lines, code, guards, tests and cases, beside their targets.
 size: $(STAMP)
 	$(BIN)/python tools/size.py
+
+# All benchmarks on two cores, three repeats each, and their rows as Markdown; needs the extras.
+BENCHMARK := $(BIN)/python tools/benchmarks
+ROWS := outputs/benchmarks
+benchmarks: $(STAMP)
+	mkdir -p $(ROWS)
+	$(BENCHMARK) env collect string start gym evaluate --repeats 3 --out $(ROWS)/1.parquet $(ARGS) & \
+	$(BENCHMARK) update train calibrate read loading --repeats 3 --out $(ROWS)/2.parquet $(ARGS) & wait
+	$(BENCHMARK) --page $(ROWS)/1.parquet $(ROWS)/2.parquet | tee $(ROWS)/page.md
 
 # Strict: a broken link or name is an error. Needs no network once the extra is installed.
 # Notebooks run if they have changed, ten minutes; ARGS="-D nb_execution_mode=off" leaves them out.

@@ -91,6 +91,17 @@ def _write(root: ElementTree.Element, path: Path) -> None:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
+def start(cfg: StudyConfig, folder: Path, around: float) -> None:
+    """Start SUMO with all vehicles on the ring, ``around`` [m]; its files go into a folder."""
+    sumo, step = load_sumo(), cfg.scenario.time_step
+    write_network(folder / "ring.net.xml", around)
+    write_vehicles(folder / "ring.rou.xml", cfg, around)
+    words = ["sumo", "-n", f"{folder}/ring.net.xml", "-r", f"{folder}/ring.rou.xml"]
+    words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-step-log"]
+    sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
+    sumo.simulationStep()
+
+
 def simulate(
     cfg: StudyConfig, driver: str | None, folder: Path, seconds: float, from_s: float, seed: int
 ) -> pd.DataFrame:
@@ -110,13 +121,8 @@ def simulate(
     sumo, step, around = load_sumo(), cfg.scenario.time_step, cfg.scenario.circumference
     if around is None:
         raise ConfigError("SUMO's ring needs scenario.circumference")
-    write_network(folder / "ring.net.xml", around)
-    write_vehicles(folder / "ring.rou.xml", cfg, around)
-    words = ["sumo", "-n", f"{folder}/ring.net.xml", "-r", f"{folder}/ring.rou.xml"]
-    words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-step-log"]
-    sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
+    start(cfg, folder, around)
     try:
-        sumo.simulationStep()
         bridge = None if driver is None else Bridge(driver, FIRST, seed=seed, trust=list(cfg.trust))
         noise = np.random.default_rng(seed)
         rows = []

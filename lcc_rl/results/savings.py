@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -86,16 +87,32 @@ def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -
         (:func:`lcc_rl.results.intervals.saving`), on the windows that both were evaluated on; NaN
         if one of them is missing.
     """
-    energy = per_window(episodes[episodes["strategy"].isin([strategy, baseline])], column)
-    energy["training_seed"] = energy["training_seed"].astype(object).fillna(-1)
-    table = energy.pivot(index="profile_id", columns=["strategy", "training_seed"], values=column)
-    table = table.dropna(axis=1, how="all").dropna()
-    drives = None
-    if DRIVE in energy:
-        drives = energy.groupby("profile_id")[DRIVE].first().reindex(table.index).tolist()
-    if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
-        return NOTHING
-    return saving(table[strategy].to_numpy(), table[baseline].to_numpy(), drives=drives)
+    chosen = episodes[episodes["strategy"].isin([strategy, baseline])]
+    return Windows.of(chosen, column).saving(strategy, baseline)
+
+
+class Windows(NamedTuple):
+    """Mean energies over drivers: a row per window, a column per strategy and training seed."""
+
+    energy: pd.DataFrame
+    drives: pd.Series | None  # the recorded drive of each window
+
+    @classmethod
+    def of(cls, episodes: pd.DataFrame, column: str) -> Windows:
+        """Return those of the rows of an evaluation, or of :func:`per_window`."""
+        rows = per_window(episodes, column)
+        rows["training_seed"] = rows["training_seed"].astype(object).fillna(-1)
+        table = rows.pivot(index="profile_id", columns=["strategy", "training_seed"], values=column)
+        return cls(table, rows.groupby("profile_id")[DRIVE].first() if DRIVE in rows else None)
+
+    def saving(self, strategy: str, baseline: str) -> Estimate:
+        """Return the share that a strategy saves, see :func:`savings`."""
+        both = self.energy.columns.get_level_values(0).isin([strategy, baseline])
+        table = self.energy.loc[:, both].dropna(axis=1, how="all").dropna()
+        if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
+            return NOTHING
+        drives = None if self.drives is None else self.drives.reindex(table.index).tolist()
+        return saving(table[strategy].to_numpy(), table[baseline].to_numpy(), drives=drives)
 
 
 def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, float]:

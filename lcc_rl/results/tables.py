@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.savings import BASELINES, DRIVE, NOTHING, WAYS, savings
+from lcc_rl.results.savings import BASELINES, DRIVE, NOTHING, WAYS, Windows
 from lcc_rl.results.totals import Totals, frames
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
@@ -58,6 +58,8 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     # By the mean distance of the strategy, so that savings are those of the totals.
     ways = every[list(WAYS)].sum(axis=1).replace(0.0, np.nan)
     windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
+    energies = {"km_": PER_KM, "": "total_energy_kj"}
+    by_window = {kind: Windows.of(windows, column) for kind, column in energies.items()}
     rows = []
     kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": "training_seed"}
     drives = windows.get(DRIVE, windows["profile_id"])
@@ -76,9 +78,8 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         row[PER_KM] = total[PATH] / kilometres if kilometres else np.nan
         row["distance_m"] = 1e3 * kilometres / total["rows"]
         for baseline in BASELINES:
-            for kind, column in {"km_": PER_KM, "": "total_energy_kj"}.items():
-                names = (column, strategy, baseline)
-                share = savings(windows, *names) if strategy != baseline else NOTHING
+            for kind, energy in by_window.items():
+                share = energy.saving(strategy, baseline) if strategy != baseline else NOTHING
                 row |= share.columns(f"{kind}saving_vs_{baseline}")
             worse = found.worse_off(strategy, baseline)
             row |= {f"{name}_worse_than_{baseline}": share for name, share in worse.items()}

@@ -85,7 +85,7 @@ def calibrate(options: Namespace) -> list[Row]:
     source = EpisodesSource(path=options.episodes) if options.episodes else stream(options.quick)
     observed = observe(source.load().episodes)
     few = np.linspace(0, observed.count - 1, 2 if options.quick else 6).round().astype(int)
-    compiled = numba.njit(squared_error)
+    compiled = numba.njit(fastmath=True, error_model="numpy")(squared_error)
     everyone = [objective(observed, index, compiled) for index in range(observed.count)]
     everyone[0](np.array([20.0, 1.0]))  # compiles
     found: dict[str, Any] = {}

@@ -8,8 +8,10 @@ Every row also goes into one parquet file (--out). What each measures: docs/benc
 from __future__ import annotations
 
 import logging
+import os
 from argparse import BooleanOptionalAction, Namespace
 from collections.abc import Callable, Sequence
+from datetime import date
 from shutil import which
 
 import pandas as pd
@@ -23,21 +25,22 @@ from benchmarks.collect import collect
 from benchmarks.env import env
 from benchmarks.evaluate import evaluate
 from benchmarks.gym import gym
-from benchmarks.harness import EXTRA, Row, drawn, installed
+from benchmarks.harness import EXTRA, Row, drawn, installed, page
 from benchmarks.loading import loading, start
 from benchmarks.read import read
+from benchmarks.string import string
 from benchmarks.train import train
 from benchmarks.update import update
 from lcc_rl.config.schemas import Device
 from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import how_to_install, unknown_name
 from lcc_rl.io.atomic import new_file
-from lcc_rl.io.files import processor, write_parquet
+from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.io.memory import torch_device
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million, Parallel
 
-LISTED = (read, loading, start, env, gym, collect, update, train, calibrate, evaluate)
+LISTED = (read, loading, start, env, string, gym, collect, update, train, calibrate, evaluate)
 NO_DEVICE = ("read", "loading", "start")  # always on the processor
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
@@ -68,6 +71,9 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
         "--quick", action="store_true", help="two repeats of tiny sizes, not compiled, as a trial"
     )
     parser.add_argument("--out", default="outputs/benchmark.parquet", help="where the rows go")
+    parser.add_argument(
+        "--page", nargs="+", metavar="ROWS", help="measure nothing: print files of rows as Markdown"
+    )
     options = parser.parse_args(arguments)
     options.repeats = 2 if options.quick else options.repeats
     if options.compile is None:
@@ -78,6 +84,9 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print and write."""
     options = parse(arguments)
+    if options.page:
+        print(page(pd.concat(map(read_parquet, options.page), ignore_index=True)))
+        return 0
     for name in options.names:
         if name not in BENCHMARKS:
             raise unknown_name("benchmark", name, BENCHMARKS)
@@ -96,12 +105,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "clock": options.clock,
         "machine": processor(),
         "torch": torch.__version__,
+        "date": f"{date.today()}",
+        "repeats": options.repeats,
     }
     for name in options.names or BENCHMARKS:
         for device in ["cpu"] if name in NO_DEVICE else chosen:
             measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))
             console.print(drawn(f"{name}, {device}", measured))
-            rows += [{"benchmark": name, **row, "device": device} for row in measured]
+            where = {"device": device, "load": os.getloadavg()[0]}
+            rows += [{"benchmark": name, **row, **where} for row in measured]
             # After each, so that what is measured stays whatever happens to the next.
             if rows:
                 table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from rich.table import Table
 
@@ -149,3 +150,21 @@ def drawn(name: str, rows: list[Row]) -> Table:
         spread = f"{low} … {high}"
         table.add_row(row["case"], str(batch), value, spread, row["unit"], ratio, other or "")
     return table
+
+
+def page(rows: pd.DataFrame) -> str:
+    """Return rows as a table in Markdown, below a line on where and when they were measured."""
+    kinds = ("machine", "device", "torch", "threads", "clock", "repeats", "date")
+    where = (f"{kind} {', '.join(map(str, rows[kind].unique()))}" for kind in kinds)
+    lines = [
+        f"{'; '.join(where)}; load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."
+    ]
+    lines += ["", "| case | batch | median | unit | ratio | to |", "|---|---|---|---|---|---|"]
+    for _, row in rows.iterrows():
+        batch = "" if pd.isna(row["batch"]) else f"{row['batch']:,}"
+        number = f"{row['value']:,.0f}" if row["value"] >= 1000 else f"{row['value']:.3g}"
+        compared = pd.notna(row["alternative"])
+        ratio, other = (f"{row['ratio']:.2f}", row["alternative"]) if compared else ("", "")
+        cells = (f"{row['benchmark']}: {row['case']}", batch, number, row["unit"], ratio, other)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import torch
 
 from benchmarks.collect import OTHER
@@ -16,6 +18,8 @@ from lcc_rl.agents import DDPG
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.replay import Trainer, transitions
 
+WIDTH = 20  # environments side by side
+
 
 def train(options: Namespace) -> list[Row]:
     """Return the seconds per 1,000 (step + update) of DDPG, at one update per transition.
@@ -23,7 +27,8 @@ def train(options: Namespace) -> list[Row]:
     "Trainer" is the package's own with 20 environments side by side, its bookkeeping included,
     checkpoints (one per 10 iterations) not; stable-baselines3's is ``DDPG.learn`` with the plain
     loop as one environment. Both learn in batches of 1,024 from a buffer of 20,000; "medium"
-    is torch's reduced precision of matrix products, see docs/benchmarks.md.
+    is torch's reduced precision of matrix products, see docs/benchmarks.md. "At equal width" both
+    have 20 environments, and learn a batch of 256 per 8 transitions.
     """
     batch, steps = (32, 40) if options.quick else (1024, 300)
     with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder:
@@ -32,9 +37,23 @@ def train(options: Namespace) -> list[Row]:
             runs[OTHER] = their_training(options, batch, steps)
         runs |= {f"{name}, medium": medium(run) for name, run in runs.items()}
         spent = alternate(runs, options.repeats)
-    costs = {name: seconds * 1000 / steps for name, seconds in spent.items()}
-    against = {name: [OTHER] for name in runs if name != OTHER}
-    return rows_of(costs, "s", against, batch)
+        rows = costs(spent, steps, batch)
+        batch, steps = (batch // 4, 10 * steps - 10 * steps % (8 * WIDTH))
+        runs = {"Trainer": trainer(options, batch, steps, Path(folder) / "equal", 0.125)}
+        if installed():
+            runs[OTHER] = their_training(options, batch, steps, WIDTH, 2, 2 * WIDTH // 8)
+        spent = {
+            f"{name}, at equal width": x for name, x in alternate(runs, options.repeats).items()
+        }
+        return rows + costs(spent, steps, batch)
+
+
+def costs(spent: Mapping[str, np.ndarray], steps: int, batch: int) -> list[Row]:
+    """Return the rows of so many steps; the alternative is stable-baselines3's."""
+    other = next((name for name in spent if name.startswith(OTHER)), "")
+    against = {name: [other] for name in spent if name != other}
+    each = {name: seconds * 1000 / steps for name, seconds in spent.items()}
+    return rows_of(each, "s", against, batch)
 
 
 def medium(run: Run) -> Run:
@@ -51,14 +70,14 @@ def medium(run: Run) -> Run:
     return reduced
 
 
-def trainer(options: Namespace, batch: int, steps: int, folder: Path) -> Run:
-    """Return one iteration of the package's training: so many transitions and updates."""
+def trainer(options: Namespace, batch: int, steps: int, folder: Path, updates: float = 1.0) -> Run:
+    """Return one iteration of the package's training: so many transitions, updates for each."""
     cfg = deepcopy(study(options.quick)[0])
-    cfg.training.environments, cfg.training.segment = 20, steps // 20
+    cfg.training.environments, cfg.training.segment = WIDTH, steps // WIDTH
     cfg.training.episodes, cfg.training.compiled = 10**6, options.compile
-    env = alcc(options, 20)
-    env.base_env.horizon = steps // 20  # episodes of one segment
-    agent = DDPG(batch_size=batch, updates_per_transition=1.0)
+    env = alcc(options, WIDTH)
+    env.base_env.horizon = steps // WIDTH  # episodes of one segment
+    agent = DDPG(batch_size=batch, updates_per_transition=updates)
     agent = agent.start(Scene(7, device=options.device))
     trained = Trainer(agent, env, cfg.training, 0, folder, "benchmark")
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
@@ -67,12 +86,15 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path) -> Run:
     return lambda: trained._numbers(collector)
 
 
-def their_training(options: Namespace, batch: int, steps: int) -> Run:
+def their_training(
+    options: Namespace, batch: int, steps: int, width: int = 1, every: int = 1, updates: int = 1
+) -> Run:
     """Return ``DDPG.learn`` of stable-baselines3 for so many steps, after a start of no updates."""
     from benchmarks.theirs import PlainVector, their_agent
 
-    how = {"train_freq": 1, "gradient_steps": 1, "batch_size": batch, "buffer_size": 20000}
-    vector = PlainVector(training(options, 1), options.compile)
+    how = {"train_freq": every, "gradient_steps": updates, "batch_size": batch}
+    how["buffer_size"] = 20000
+    vector = PlainVector(training(options, width), options.compile)
     model = their_agent(options, vector, "DDPG", learning_starts=batch, verbose=0, **how)
-    model.learn(batch + 1)
+    model.learn(batch + every * width)
     return lambda: model.learn(steps, reset_num_timesteps=False)

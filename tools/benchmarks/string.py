@@ -1,0 +1,100 @@
+"""Benchmark of long strings of vehicles, and of one beside SUMO."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import sumo_ring
+import torch
+from tensordict import TensorDict
+
+from benchmarks.env import collecting
+from benchmarks.harness import Row, Run, agree, endings, rates
+from benchmarks.plain import PlainLoop, alcc
+from benchmarks.plain_numba import NumbaString
+from lcc_rl.config import load
+from lcc_rl.envs import build_env, load_inputs
+from lcc_rl.evaluation.rollout import Player
+from lcc_rl.interfaces.sumo import load_sumo
+
+SIZE, NUMBA, SUMO = 100, "loops in numba", "libsumo"
+
+
+def string(options: Namespace) -> list[Row]:
+    """Return vehicle-steps per second of strings of 100 vehicles.
+
+    First a batch behind automated vehicles that keep their speed, with the estimate of every
+    driver and the reward, by the training's collector, beside the same physics as one function of
+    tensors, and that of the drivers as loops of numbers that numba compiles. Then a single ring of
+    human drivers by the evaluation's player, which keeps speeds and gaps, beside SUMO, which
+    drives its own IDM and keeps nothing.
+    """
+    return [*batch(options), *ring(options)]
+
+
+def batch(options: Namespace) -> list[Row]:
+    """Return the rows of many strings side by side."""
+    count, steps = (4, 10) if options.quick else (1024, 30)
+    env = alcc(options, count, 30, SIZE - 1)
+    start, zero = env.reset(), torch.zeros(count, 1, 1, device=options.device)
+    plain, loops = PlainLoop(env), NumbaString(PlainLoop(env), start.cpu())
+    runs: dict[str, Run] = {NUMBA: partial(loops.play, steps)}
+    against: dict[str, list[str]] = {}
+    for ending in endings(options):
+        advance = torch.compile(plain.step, dynamic=False) if ending else plain.step
+
+        def loop(steps: int = steps, advance: Any = advance) -> Any:
+            state = plain.start(start)
+            for _ in range(steps):
+                state, _ = advance(state, zero.squeeze(-2))
+            return state
+
+        own, other = f"StringCollector{ending}", f"plain loop{ending}"
+        again = alcc(options, count, 30, SIZE - 1)
+        runs |= {own: collecting(again, zero, steps, bool(ending)), other: loop}
+        against[own] = [other, NUMBA]
+    played, state = loops.play(steps)[0], loop()
+    for column, key in enumerate(("speed", "gap")):
+        agree(f"{key} of {NUMBA}", played[..., column], state[key].squeeze(-1))
+    counts = dict.fromkeys(runs, count * steps * SIZE)
+    return rates(options, runs, "vehicle-steps/s", counts, against, count)
+
+
+def ring(options: Namespace) -> list[Row]:
+    """Return the rows of one ring; both are first checked to reach the same speeds."""
+    steps, around = 20 if options.quick else 600, 23.0 * SIZE
+    size = [f'scenario.string="human*{SIZE}"', f"scenario.circumference={around}"]
+    fixed = [f"scenario.horizon={steps}"]
+    fixed += [f"scenario.controllers.human.{noise}=0" for noise in ("noise", "wiener")]
+    cfg = load("evaluate", ["variant=idm", "scenario=ring", "drivers=fixed", *size, *fixed])
+    inputs, key = load_inputs(cfg), ("vehicles", "speed")
+    runs: dict[str, Run] = {}
+    for ending in endings(options):
+        env = build_env(cfg, inputs.evaluation, inputs.population, 1)
+        player = Player(env, None, [key, ("vehicles", "gap")], compiled=bool(ending))
+        runs[f"Player{ending}"] = partial(player.play, TensorDict(batch_size=[1]))
+    against = {name: [SUMO] for name in runs}
+    speed = player.play(TensorDict(batch_size=[1]))[0][key][-1]
+    counts = dict.fromkeys([*runs, SUMO], steps * SIZE)
+    if find_spec("libsumo") is None:
+        return rates(options, runs, "vehicle-steps/s", counts, against, 1)
+    sumo = load_sumo()
+
+    def simulate() -> None:
+        for _ in range(steps):
+            sumo.simulationStep()
+
+    with TemporaryDirectory(prefix="lcc_rl_benchmark_") as name:
+        sumo_ring.start(cfg, Path(name), around)
+        try:
+            simulate()
+            theirs = [sumo.vehicle.getSpeed(f"car{number}") for number in range(SIZE)]
+            agree("SUMO's speed [m/s]", theirs, speed.flatten(), 1e-3)
+            return rates(options, {**runs, SUMO: simulate}, "vehicle-steps/s", counts, against, 1)
+        finally:
+            sumo.close()
