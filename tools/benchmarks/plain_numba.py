@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 
 from benchmarks.plain import PlainLoop
-from benchmarks.plain_env import bits, power
+from benchmarks.plain_scalars import bits, power
 from lcc_rl.functional.estimation import REFERENCE_SPEED
 from lcc_rl.functional.random import STEP as STRIDE
 from lcc_rl.functional.random import STREAM
