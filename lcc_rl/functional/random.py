@@ -42,7 +42,8 @@ def uniform(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tenso
     Returns:
         float32 of the broadcast shape.
     """
-    bits = hash_bits(seed + step * STEP + stream * STREAM)
+    # The mask keeps what counts, within 64 bits.
+    bits = hash_bits(seed + step * STEP + (stream * STREAM & MASK))
     return (bits >> 8).to(torch.float32) * 2.0**-24
 
 
