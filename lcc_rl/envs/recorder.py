@@ -151,6 +151,8 @@ class Recorder(TorchDispatchMode):
         if variables is not None:
             same = value.dtype == dtype
             return variables if same else self._stated(f"{kind}({{0}})", [variables])
+        if isinstance(value, int):  # a stream's counter may exceed what torch takes and wraps
+            value = (value + 2**63) % 2**64 - 2**63
         value = torch.as_tensor(value, dtype=dtype)
         literals = [self.variable(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
         return torch.tensor(literals, dtype=torch.int64).reshape(value.shape)
