@@ -74,15 +74,16 @@ def controller_of(who: Any, behind: bool = False) -> Any:
         who: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
             dotted path of a class or of a function of named entries; a yaml file that holds a
             node; an ONNX program (:mod:`lcc_rl.interfaces.onnx_policy`); or a node.
-        behind: whether it drives behind the safety filter, for which tuned ones have constants of
-            their own.
+        behind: whether it drives behind a filter that keeps a longest time gap, for which tuned
+            ones have constants of their own that count on it.
 
     Raises:
         ConfigError: if there is no such controller, or it cannot be built.
     """
     if isinstance(who, str):
         plain = who.removesuffix(FILTERED)
-        who = who if _words(who, behind) else plain
+        named = behind or plain not in TUNED.values()
+        who = who if named and _words(who, behind) else plain
         words = _words(who, behind)
         if words:
             return _loaded(words, id(GlobalHydra.instance().hydra))

@@ -118,11 +118,8 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         return Strategy(name, cfg)
     kept, named = cfg.scenario.filters.get(AUTOMATED) or {}, name.endswith(FILTERED)
     require(bool(kept) or not named, f"{name} drives behind the safety filter: add +filter=cbf")
-    # Constants tuned behind a filter count on the longest time gap that it keeps.
     held = bool(kept) and kept.get("time_gap", True) is not None
-    plain = name.removesuffix(FILTERED)
-    tuned = plain in TUNED.values() and not held
-    controller = controller_of(who or (plain if tuned else name), held)
+    controller = controller_of(who or name, held)
     if named or (kept and name in TUNED):
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _target(cfg) == controller[TARGET]:

@@ -36,7 +36,7 @@ from lcc_rl.results.headline import in_words
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.runs import stored_config
-from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver, savings
+from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver
 
 VEHICLES = {
     "leader": ("leader", INK),
@@ -225,7 +225,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     legend_above(left, 1)
     saving = share_saved(energy[strategy], energy[baseline])
     _sorted_bars(right, saving, colour(strategy))
-    found = savings(means.windows, column, strategy, baseline)
+    found = means.saving(column, strategy, baseline)
     _mean_line(right, found, means.windows.loc[means.windows["strategy"] == strategy])
     worse = f"{int((saving < 0).sum())} of {len(saving)} drivers worse off"
     style(right, f"drivers, sorted ({worse})", f"path energy saved\nper {means.per} [%]")

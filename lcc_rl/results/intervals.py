@@ -57,6 +57,7 @@ def saving(
     baseline: ArrayLike,
     paired: bool = False,
     drives: Sequence[object] | None = None,
+    ways: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Estimate:
     """Return the share saved by the mean against that of a baseline, see :func:`share_saved`.
 
@@ -74,16 +75,22 @@ def saving(
         paired: column by column, both sides come from the same training.
         drives: what each window is cut from; whole drives are resampled if there are at least
             five, because windows of one drive are alike.
+        ways: the distances of both sides, as the energies: what is saved is then energy per
+            distance, ratios of totals, in which energy and distance are resampled together.
 
     Returns:
         The share with its interval; without one if there is one window and one seed of each. If a
         side has one seed, the interval does not cover what another seed would change.
     """
-    own, other = (np.asarray(side, dtype=np.float64) for side in (values, baseline))
-    value = share_saved(_mean(own), _mean(other))
-    if max(*own.shape, *other.shape) < 2:
+    sides = [np.asarray(side, dtype=np.float64) for side in (values, baseline)]
+    driven = [np.asarray(side, dtype=np.float64) for side in ways or map(np.ones_like, sides)]
+    value = share_saved(*(_mean(x) / _mean(way) for x, way in zip(sides, driven, strict=True)))
+    if max(shape for side in sides for shape in side.shape) < 2:
         return Estimate(value)
-    means = _means(own, 1, drives), _means(other, 1 if paired else 2, drives)
+    means = (
+        _means(x, stream, drives) / _means(way, stream, drives)
+        for x, way, stream in zip(sides, driven, (1, 1 if paired else 2), strict=True)
+    )
     return Estimate(value, *bounds(share_saved(*means)))
 
 

@@ -9,13 +9,15 @@ from typing import Self
 import pandas as pd
 
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.intervals import Estimate
 from lcc_rl.results.runs import EPISODES
-from lcc_rl.results.savings import WAYS
+from lcc_rl.results.savings import WAYS, savings
 
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
 TRAINED = ["strategy", "training_seed"]
 NUMBERS = ("profile_id", "driver_id", "training_seed")  # name a thing, measure none
 ENERGY = "energy_kj"
+PER_KM = "vehicle and km"
 # What the energies of each group of vehicles are divided by.
 DRIVEN = {"cav": WAYS[:1], "hdv": WAYS[1:], "total": WAYS}
 ENDS = {"min": "min", "max": "max", "worst": "max"}  # first word of a column → not its mean
@@ -63,15 +65,13 @@ class Means:
         return cls.of(read_parquet(folder / EPISODES))
 
     def per_km(self) -> Self:
-        """Return the means with energies per vehicle and km, those of windows as in tables.
+        """Return the means whose drivers' energies, and whose savings, are per vehicle and km."""
+        return replace(self, drivers=_per_km(self.drivers), per=PER_KM)
 
-        A driver's energy is divided by the driver's distance, a window's by the mean distance of
-        the strategy, so that a saving over windows is that of the totals.
-        """
-        ways = self.windows.groupby("strategy")[[x for x in WAYS if x in self.windows]].mean()
-        own = ways.reindex(self.windows["strategy"]).set_index(self.windows.index)
-        windows, drivers = _per_km(self.windows, own), _per_km(self.drivers, self.drivers)
-        return replace(self, windows=windows, drivers=drivers, per="vehicle and km")
+    def saving(self, column: str, strategy: str, baseline: str) -> Estimate:
+        """Return what a strategy saves over windows, see :func:`lcc_rl.results.savings.savings`."""
+        per = DRIVEN[column.partition("_")[0]] if self.per == PER_KM else ()
+        return savings(self.windows, column, strategy, baseline, per)
 
     def write(self, folder: Path) -> None:
         """Write both tables into a folder, with numbers of single precision and six decimals."""
@@ -86,11 +86,11 @@ class Means:
         return f"{windows} held-out profiles × {self.drivers['driver_id'].nunique()} drivers"
 
 
-def _per_km(table: pd.DataFrame, driven: pd.DataFrame) -> pd.DataFrame:
-    """Divide the energies of each group of vehicles by their distance, ``driven`` row by row."""
+def _per_km(table: pd.DataFrame) -> pd.DataFrame:
+    """Divide the energies of each group of vehicles by their distance, row by row."""
     found = table.copy()
     for group, names in DRIVEN.items():
-        way = driven[[name for name in names if name in driven]].sum(axis=1) / 1e3
+        way = table[[name for name in names if name in table]].sum(axis=1) / 1e3
         energies = table.columns[table.columns.str.fullmatch(f"{group}_.*{ENERGY}")]
         found[energies] = table[energies].div(way, axis=0)
     return found

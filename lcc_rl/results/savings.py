@@ -73,14 +73,20 @@ def per_window(episodes: pd.DataFrame, columns: str | Sequence[str]) -> pd.DataF
     return episodes.groupby(keys, dropna=False, sort=False)[names].mean().reset_index()
 
 
-def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> Estimate:
+def savings(
+    episodes: pd.DataFrame, column: str, strategy: str, baseline: str, per: Sequence[str] = ()
+) -> Estimate:
     """Return the share of the baseline's mean energy that a strategy saves.
+
+    ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)`` is what tables show.
 
     Args:
         episodes: rows of an evaluation, or of :func:`per_window`.
         column: the energy.
         strategy: the strategy that saves.
         baseline: the strategy that it is compared with.
+        per: columns of distances, by whose sum the energy is divided, total by total; by none,
+            what an episode takes is compared, and who falls back saves by it.
 
     Returns:
         The share with its interval over windows or drives, and seeds
@@ -88,22 +94,29 @@ def savings(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -
         if one of them is missing.
     """
     chosen = episodes[episodes["strategy"].isin([strategy, baseline])]
-    return Windows.of(chosen, column).saving(strategy, baseline)
+    return Windows.of(chosen, column, per).saving(strategy, baseline)
 
 
 class Windows(NamedTuple):
-    """Mean energies over drivers: a row per window, a column per strategy and training seed."""
+    """Means over drivers: a row per window, a column per strategy and training seed."""
 
     energy: pd.DataFrame
+    way: pd.DataFrame | None  # what the energy is divided by
     drives: pd.Series | None  # the recorded drive of each window
 
     @classmethod
-    def of(cls, episodes: pd.DataFrame, column: str) -> Windows:
+    def of(cls, episodes: pd.DataFrame, column: str, per: Sequence[str] = ()) -> Windows:
         """Return those of the rows of an evaluation, or of :func:`per_window`."""
-        rows = per_window(episodes, column)
+        ways = [name for name in per if name in episodes]
+        rows = per_window(episodes, [column, *ways])
         rows["training_seed"] = rows["training_seed"].astype(object).fillna(-1)
-        table = rows.pivot(index="profile_id", columns=["strategy", "training_seed"], values=column)
-        return cls(table, rows.groupby("profile_id")[DRIVE].first() if DRIVE in rows else None)
+        rows = rows.assign(way=rows[ways].sum(axis=1))
+        energy, way = (
+            rows.pivot(index="profile_id", columns=["strategy", "training_seed"], values=name)
+            for name in (column, "way")
+        )
+        drives = rows.groupby("profile_id")[DRIVE].first() if DRIVE in rows else None
+        return cls(energy, way if ways else None, drives)
 
     def saving(self, strategy: str, baseline: str) -> Estimate:
         """Return the share that a strategy saves, see :func:`savings`."""
@@ -112,7 +125,12 @@ class Windows(NamedTuple):
         if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
             return NOTHING
         drives = None if self.drives is None else self.drives.reindex(table.index).tolist()
-        return saving(table[strategy].to_numpy(), table[baseline].to_numpy(), drives=drives)
+        own, other = (table[name].to_numpy() for name in (strategy, baseline))
+        way, ways = self.way, None
+        if way is not None:
+            way = way.loc[table.index, table.columns]
+            ways = way[strategy].to_numpy(), way[baseline].to_numpy()
+        return saving(own, other, drives=drives, ways=ways)
 
 
 def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, float]:

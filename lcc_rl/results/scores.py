@@ -12,7 +12,7 @@ from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.results.cells import heading
 from lcc_rl.results.headline import COLUMNS, Shown, in_words, resampled
-from lcc_rl.results.savings import DRIVE, NOTHING, savings
+from lcc_rl.results.savings import DRIVE, NOTHING, WAYS, savings
 from lcc_rl.results.tables import strategies_side_by_side
 from lcc_rl.results.units import check_unit, per_distance
 from lcc_rl.settings import NonNegative, Settings
@@ -100,13 +100,15 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
         raise ConfigError(f"task.limits.{missing[0]}: episodes.parquet has no such column")
     if task.against not in set(episodes["strategy"]):
         raise ConfigError(f"task.against={task.against}: it is not among the strategies evaluated")
-    rows, whole = _scored(episodes, task)
+    rows, per = _scored(episodes, task), [DISTANCE] if task.score in PER_DISTANCE else []
+    whole = rows.loc[rows["strategy"] == task.against, DISTANCE].mean()
     found = []
     for name, part in rows.groupby("strategy", sort=False):
-        value = float(part[SCORE].mean())
-        if task.score in PER_DISTANCE:
-            value = per_distance(value / whole * 1e3, task.unit, energy)
-        share = NOTHING if name == task.against else savings(rows, SCORE, str(name), task.against)
+        value, share = float(part[SCORE].mean()), NOTHING
+        if per:
+            value = per_distance(value / part[DISTANCE].mean() * 1e3, task.unit, energy)
+        if name != task.against:
+            share = savings(rows, SCORE, str(name), task.against, per)
         limits = {column: _worst(part, column) for column in task.limits}
         row: dict[str, object] = {"strategy": name, "seeds": part["training_seed"].nunique()}
         row |= {"windows": part["profile_id"].nunique()}
@@ -120,24 +122,16 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
-def _scored(episodes: pd.DataFrame, task: Task) -> tuple[pd.DataFrame, float]:
-    """Return the rows with score and distance of all vehicles, and the baseline's distance [m].
-
-    An energy is scaled to that mean distance by the strategy's own: a saving is then a ratio of
-    totals, in which short episodes count little.
-    """
-    parts = [name for name in ("cav_distance_m", "hdv_distance_m") if name in episodes]
+def _scored(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
+    """Return the rows with score, an energy as such, and distance of all vehicles."""
+    parts = [name for name in WAYS if name in episodes]
     rows = episodes.assign(**{DISTANCE: episodes[parts].sum(axis=1)})
-    driven = rows.groupby("strategy")[DISTANCE].mean()
-    whole = float(driven[task.against])
-    if task.score in PLAIN:
-        return rows.assign(**{SCORE: rows[task.score]}), whole
-    column = PER_DISTANCE[task.score]
-    energy = rows[column] if column in rows else pd.Series(float("nan"), rows.index)
+    column = PER_DISTANCE.get(task.score, task.score)
+    score = rows[column] if column in rows else pd.Series(float("nan"), rows.index)
     alone = column.replace("total", "hdv")  # where nobody is automated
     if alone in rows:
-        energy = energy.fillna(rows[alone])
-    return rows.assign(**{SCORE: energy * whole / rows["strategy"].map(driven)}), whole
+        score = score.fillna(rows[alone])
+    return rows.assign(**{SCORE: score})
 
 
 def _worst(part: pd.DataFrame, column: str) -> float:

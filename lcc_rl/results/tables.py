@@ -55,11 +55,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
     columns = [*CAR_COLUMNS, *HUMAN_COLUMNS, "collided"]
     found = Totals(episodes, columns, ["min_ttc_s"], PATH, BASELINES, source)
     windows, every, sums = found.per_window(), found.mean(), found.sums()
-    # By the mean distance of the strategy, so that savings are those of the totals.
-    ways = every[list(WAYS)].sum(axis=1).replace(0.0, np.nan)
-    windows[PER_KM] = 1e3 * windows[PATH] / windows["strategy"].map(ways)
-    energies = {"km_": PER_KM, "": "total_energy_kj"}
-    by_window = {kind: Windows.of(windows, column) for kind, column in energies.items()}
+    by_window = {"km_": Windows.of(windows, PATH, WAYS), "": Windows.of(windows, "total_energy_kj")}
     rows = []
     kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": "training_seed"}
     drives = windows.get(DRIVE, windows["profile_id"])

@@ -75,6 +75,8 @@ def test_constants_tuned_behind_a_filter_need_its_longest_gap(longest: str, own:
         for name in ("idm_acc", "idm_acc_filtered")
     )
     assert (behind["desired_speed"] < plain["desired_speed"]) == own
+    asked = baseline(load("evaluate", words), "idm_acc_filtered", "idm_acc_filtered")  # compare=
+    assert asked.cfg.scenario.controllers["automated"] == behind
     alone = baseline(load("evaluate", words), "constant_filtered").cfg.scenario
     assert alone.controllers["automated"]["acceleration"] == 3.0  # full throttle
 

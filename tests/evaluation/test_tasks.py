@@ -28,6 +28,12 @@ MORE = {
 }
 
 
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_brings_its_leaders_whatever_the_variant(name) -> None:
+    own, other = (load("evaluate", [f"task={name}", *words]) for words in ([], ["variant=cacc"]))
+    assert other.leader == own.leader
+
+
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("name", slow_but(QUICK, TASKS))
 def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, capsys) -> None:
@@ -48,10 +54,9 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     np.testing.assert_allclose(again["score"], run.headline["score"])
     table_again([str(tmp_path), "--format", "latex"])
     latex = capsys.readouterr().out
-    assert (
-        f"simulated drivers & {run.headline.set_index('strategy').loc['human', 'score']:.1f}"
-        in (latex)
-    )
+    against = task_of(cfg).against
+    score = run.headline.set_index("strategy").loc[against, "score"]
+    assert any(f"{in_words(against)} & {score:{form}}" in latex for form in (".1f", ",.0f"))
     assert r"saved [\%]" in latex
 
 

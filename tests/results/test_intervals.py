@@ -60,6 +60,25 @@ def test_interval_is_that_of_a_plain_loop() -> None:
     assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
 
 
+def test_energy_and_distance_are_resampled_together() -> None:
+    """Who falls back in some windows takes as much less energy there: per km nothing varies."""
+    generator = np.random.default_rng(4)
+    way = generator.uniform(500, 2000, (12, 1))
+    own = way * generator.uniform(0.5, 1.0, (12, 3))
+    found = saving(0.18 * own, 0.2 * way, ways=(own, way))
+    assert (found.low, found.value, found.high) == pytest.approx((0.1, 0.1, 0.1))
+    noise = generator.uniform(0.8, 1.0, (12, 3))
+    found = saving(0.2 * own * noise, 0.2 * way, ways=(own, way))
+    draws = []
+    for _ in range(4000):
+        windows, seeds = generator.integers(0, 12, 11), generator.integers(0, 3, 2)
+        mine, driven = (x[windows][:, seeds] for x in (own * noise, own))
+        draws.append(1.0 - mine.sum() / driven.sum())
+    low, high = np.quantile(draws, [0.025, 0.975])
+    assert found.value == pytest.approx(1.0 - (own * noise).sum() / own.sum())
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
+
+
 @pytest.mark.parametrize("seeds", [8, 1])
 def test_interval_covers_a_known_saving(seeds) -> None:
     """Windows, seeds and their interaction vary; a human baseline meets the same windows."""

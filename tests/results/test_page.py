@@ -26,7 +26,6 @@ from lcc_rl.results.headline import (
     verdict,
 )
 from lcc_rl.results.means import Means
-from lcc_rl.results.savings import savings
 from lcc_rl.results.tables import summary
 
 TABLE = pd.DataFrame(
@@ -106,7 +105,7 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     saved = 1.0 - per_km["alcc"] / per_km["reference"]
     assert cars.loc["alcc", "km_saving_vs_reference"] == pytest.approx(saved)
     means = Means.of(episodes()).per_km()  # of the figures by driver
-    shown = savings(means.windows, "total_path_energy_kj", "alcc", "reference")
+    shown = means.saving("total_path_energy_kj", "alcc", "reference")
     assert shown.value == pytest.approx(saved)
     by_driver = means.drivers.groupby("strategy")["total_path_energy_kj"].mean()
     np.testing.assert_allclose(by_driver[table["strategy"]], per_km)
