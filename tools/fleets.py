@@ -1,16 +1,16 @@
-"""Scores over the share of automated vehicles: python tools/fleets.py <task> <evaluation>…
+"""What fleets save over the share of automated vehicles, as figures of docs/figures.
 
-Each run is an evaluation of the task, i24-mixed or ring-22, with another scenario.string. Scores go
-to outputs/reference/tasks, the figure to docs/figures; without runs the figure is drawn again from
-what is kept. Instead of a task, ``fronts`` prints what learned fleets save beside the front of a
-rule (tools/keep.py fleets), as a Markdown table.
+``python tools/fleets.py i24-mixed`` prints what learned fleets save beside the front of a rule, as
+a Markdown table, and draws both, of what tools/keep.py fleets keeps. ``python tools/fleets.py
+ring-22 <evaluation>…`` keeps the scores of evaluations of ring-22, each with another
+scenario.string, and draws them; without runs it draws again what is kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from lcc_rl.results.fronts import (
     FLEET,
     FLOW,
     NET,
+    Measure,
     compared,
     flow_gained,
     saved,
@@ -37,12 +38,8 @@ from lcc_rl.results.intervals import Estimate
 
 SHARE, LEARNED = "penetration", "learned"
 REFERENCE, FIGURES = Path("outputs/reference/tasks"), Path("docs/figures")
-NAMES = {"i24-mixed": "fleets", "ring-22": "fleets_ring"}
-PERCENT = ("saving",)
-SHOWN = {
-    "i24-mixed": {"saving": "fuel saved per km [%]", "flow_vph": "flow [vehicles/h]"},
-    "ring-22": {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"},
-}
+RING = "fleets_ring"
+SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
 HUMAN, RULE = "human", "idm_acc"
 FRONTS = "fleets_fronts.parquet"
 SETTINGS = {  # of what is kept for fronts, for readers
@@ -58,14 +55,14 @@ SHOWN_AS = {
     "acc": ("tuned linear ACC", "#e69f00"),
     "follower_stopper": ("FollowerStopper", "#cc79a7"),
     "pi_saturation": ("PI with saturation", "#d55e00"),
-    "idm": ("simulated driver (IDM)", "#6b6b6b"),
 }
+COLOURS = ("#56b4e9", "#009e73", "#e69f00", "#cc79a7")  # of the shares of a front
 
 
 def scored(run: Path) -> pd.DataFrame:
     """Return the scores of one evaluation, with its share of automated vehicles."""
     cfg, task, _, found = task_scores(run)
-    require(task.name in SHOWN, f"{run}: an evaluation of {task.name}, not of {', '.join(SHOWN)}")
+    require(task.name == "ring-22", f"{run}: an evaluation of {task.name}, not of ring-22")
     found["strategy"] = found["strategy"].astype(str).replace(cfg.variant, LEARNED)
     string = cfg.scenario.vehicles
     found.insert(0, SHARE, string.count(AUTOMATED) / len(string))
@@ -83,25 +80,37 @@ def fronts(rows: pd.DataFrame) -> str:
         "the rule at best",
     ]
     lines = [head, ["---"] * len(head)]
-    learned, human, rule = ((name, "fleet") for name in (LEARNED, HUMAN, RULE))
-    names = pd.Categorical(rows["setting"].map(SETTINGS), list(SETTINGS.values()))
-    groups = rows.assign(setting=names).groupby(["setting", SHARE], observed=True)
-    for (setting, share), part in groups:
-        means = part.groupby(["variant", "limit"])[list(FLEET)].mean()
-        flow, spent = means[FLOW], means[NET] / means[DISTANCE]
-        others = spent[RULE], flow[RULE]
-        saving = 100.0 * (1.0 - others[0] / spent[HUMAN].iloc[0])
-        own, best = flow[LEARNED].iloc[0], saving.idxmax()
-        gap = np.interp(own, others[1].to_numpy()[::-1], others[1].index.to_numpy()[::-1])
-        cells = [str(setting), f"{100.0 * float(str(share)):.0f} %"]
-        cells.append(percent(compared(part, learned, human, FLEET, saved)))
-        gained = percent(compared(part, learned, human, FLEET, flow_gained))
-        cells.append(f"{own:,.0f}: {gained}")
-        against = compared(part, learned, rule, FLEET, saved_at_flow)
-        cells.append(f"{percent(against)}; T = {gap:.2f} s")
-        cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {others[1][best]:,.0f}")
+    for setting, share, part in by_setting(rows):
+        saving, flow = curve(part, RULE)
+        own, best = curve(part, LEARNED)[1].iloc[0], float(saving.idxmax())
+        gap = np.interp(own, flow.to_numpy()[::-1], flow.index.to_numpy()[::-1])
+        cells = [setting, f"{share:.0f} %", percent(against(part, HUMAN, saved))]
+        cells.append(f"{own:,.0f}: {percent(against(part, HUMAN, flow_gained))}")
+        cells.append(f"{percent(against(part, RULE, saved_at_flow))}; T = {gap:.2f} s")
+        cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {flow[best]:,.0f}")
         lines.append(cells)
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, float, pd.DataFrame]]:
+    """Yield the rows of each setting and share with the setting in words and the share [%]."""
+    names = pd.Categorical(rows["setting"].map(SETTINGS), list(SETTINGS.values()))
+    rows = rows.assign(setting=names)
+    for (setting, share), part in rows.groupby(["setting", SHARE], observed=True):
+        yield str(setting), 100.0 * float(str(share)), part
+
+
+def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
+    """Return what a kind of fleet saves against humans [%] and its flow [1/h], by time gap."""
+    means = part.groupby(["variant", "limit"])[list(FLEET)].mean()
+    own, people = means.xs(name), means.xs(HUMAN).iloc[0]
+    saving = 100.0 * (1.0 - own[NET] / own[DISTANCE] * people[DISTANCE] / people[NET])
+    return saving, own[FLOW]
+
+
+def against(part: pd.DataFrame, name: str, measure: Measure) -> Estimate:
+    """Return a measure of the learned fleet against another."""
+    return compared(part, (LEARNED, "fleet"), (name, "fleet"), FLEET, measure)
 
 
 def percent(found: Estimate) -> str:
@@ -111,13 +120,43 @@ def percent(found: Estimate) -> str:
 
 
 @paper
-def drawn(table: pd.DataFrame, task: str) -> Figure:
-    """Draw what a task shows over the share; hollow where a limit is missed."""
+def drawn_fronts(rows: pd.DataFrame) -> Figure:
+    """Draw, for each setting, the learned fleets beside the rule's fronts, a colour per share."""
+    figure = new_figure(PAGE, 5.4)
+    axes = dict(zip(SETTINGS.values(), figure.subplots(2, 2).flat, strict=True))
+    shares = 100.0 * np.sort(rows[SHARE].unique())
+    hues = dict(zip(shares.round(), COLOURS, strict=False))
+    for setting, share, part in by_setting(rows):
+        axis, hue = axes[setting], hues[round(share)]
+        people = curve(part, HUMAN)[1].iloc[0]
+        (saving, flow), (own, point) = curve(part, RULE), curve(part, LEARNED)
+        axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue, lw=1.0, ms=4)
+        x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, saved)
+        axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, lw=2.5, alpha=0.5)
+        axis.plot(x, own, "o", color=hue, mec=INK, ms=7, label=f"{share:g} % automated", zorder=5)
+    for setting, axis in axes.items():
+        axis.axhline(0.0, color=INK, lw=0.6)
+        axis.axvline(0.0, color=INK, lw=0.6)
+        axis.set(xlim=(-15.0, 15.0), ylim=(-2.0, None), title=setting)  # the fronts go on
+        style(axis, "flow against humans only [%]", "fuel saved per km [%]")
+    handles = axes[SETTINGS["front"]].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
+    footnote(
+        figure,
+        "large: learned, with the 95 % interval; small: the tuned IDM by its time gap, "
+        "shorter to the right",
+    )
+    return figure
+
+
+@paper
+def drawn(table: pd.DataFrame) -> Figure:
+    """Draw what the ring shows over the share; hollow where a limit is missed."""
     figure = new_figure(PAGE, 3.2)
-    axes = figure.subplots(1, len(SHOWN[task]))
+    axes = figure.subplots(1, len(SHOWN))
     humans = table[table["strategy"] == HUMAN]
-    for axis, (column, label) in zip(axes, SHOWN[task].items(), strict=True):
-        scale = 100.0 if column in PERCENT else 1.0
+    for axis, (column, label) in zip(axes, SHOWN.items(), strict=True):
+        scale = 100.0 if column == "saving" else 1.0
         for name, (words, colour) in SHOWN_AS.items():
             rows = table[table["strategy"] == name].sort_values(SHARE)
             if rows.empty:
@@ -149,19 +188,20 @@ def drawn(table: pd.DataFrame, task: str) -> Figure:
 def main(words: Sequence[str] | None = None) -> int:
     """Keep the scores of the runs given, and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("task", choices=[*SHOWN, "fronts"], help="of the runs")
-    parser.add_argument("runs", nargs="*", type=Path, help="folders of evaluations")
+    parser.add_argument("task", choices=["i24-mixed", "ring-22"])
+    parser.add_argument("runs", nargs="*", type=Path, help="folders of evaluations of ring-22")
     parser.add_argument("--reference", type=Path, default=REFERENCE, help="where scores are kept")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="folder of the image")
     options = parser.parse_args(words)
-    if options.task == "fronts":
-        print(fronts(read_parquet(options.reference / FRONTS)))
+    if options.task == "i24-mixed":
+        rows = read_parquet(options.reference / FRONTS)
+        print(fronts(rows))
+        save(drawn_fronts(rows), options.figures / "fleets.png")
         return 0
-    name = NAMES[options.task]
-    kept = options.reference / f"{name}.parquet"
+    kept = options.reference / f"{RING}.parquet"
     if options.runs:
         write_parquet(pd.concat(map(scored, options.runs), ignore_index=True), kept)
-    print(save(drawn(read_parquet(kept), options.task), options.figures / f"{name}.png"))
+    print(save(drawn(read_parquet(kept)), options.figures / f"{RING}.png"))
     return 0
 
 
