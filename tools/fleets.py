@@ -82,7 +82,7 @@ def fronts(rows: pd.DataFrame) -> str:
     lines = [head, ["---"] * len(head)]
     for setting, share, part in by_setting(rows):
         saving, flow = curve(part, RULE)
-        own, best = curve(part, LEARNED)[1].iloc[0], float(saving.idxmax())
+        own, best = curve(part, LEARNED)[1].iloc[0], saving.index.to_numpy(float)[saving.argmax()]
         gap = np.interp(own, flow.to_numpy()[::-1], flow.index.to_numpy()[::-1])
         cells = [setting, f"{share:.0f} %", percent(against(part, HUMAN, saved))]
         cells.append(f"{own:,.0f}: {percent(against(part, HUMAN, flow_gained))}")
