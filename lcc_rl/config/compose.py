@@ -263,6 +263,10 @@ def _unknown_option(name: str) -> ConfigError:
     places |= dict.fromkeys((HUMAN, AUTOMATED), "scenario.controllers")
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
+    if root in ("out", "output", "folder", "dir"):
+        return ConfigError(
+            f"unknown option {name!r}: hydra.run.dir=… sets the folder of the results"
+        )
     return unknown_name("option", name, _top_level() | _groups())
 
 

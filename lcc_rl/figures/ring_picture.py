@@ -70,7 +70,7 @@ def _panel(name: str, motion: Motion, place: int, top: float) -> str:
         f'<circle class="road" r="{RADIUS}" stroke-width="{ROAD}"/>\n'
         + "\n".join(cars)
         + f'<text class="name" y="4" font-size="26">{3.6 * last.mean():.1f} km/h</text>'
-        '<text class="soft" y="26" font-size="13">in the last minute</text></g>'
+        '<text class="soft" y="26" font-size="13">mean speed in the end</text></g>'
     )
 
 

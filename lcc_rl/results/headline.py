@@ -34,7 +34,7 @@ WHO = {
     "rule": "IDM, tuned on these data",
     "reference": "network, for itself",
     "own_energy": "network, for itself, weighted",
-    NETWORK: "network, for both",
+    NETWORK: "network, for all",
     "follower_stopper": "FollowerStopper",
     "pi_saturation": "PI with saturation",
     "cacc": "CACC",
@@ -77,7 +77,7 @@ def in_words(name: str) -> str:
 
     Examples:
         >>> in_words("alcc"), in_words("alcc ddpg"), in_words("preview_10s")
-        ('network, for both', 'network, for both (ddpg)', 'preview 10 s')
+        ('network, for all', 'network, for all (ddpg)', 'preview 10 s')
     """
     if name.endswith(FILTERED) and name not in WHO:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"

@@ -284,7 +284,7 @@ def grid() -> pd.DataFrame:
 def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
     figure = accelerations(grid(), pd.DataFrame(columns=steps().columns), {"scenario": {}})
     titles = [axis.get_title(loc="left") for axis in figure.axes[:4]]
-    names = ("network, for both", "IDM, tuned on I-80")
+    names = ("network, for all", "IDM, tuned on I-80")
     assert titles == [f"{name}, at {speed} m/s" for name in names for speed in (2, 6)]
     image = pixels(figure, tmp_path / "map.png")
     for axis in figure.axes[:4]:

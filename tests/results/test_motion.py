@@ -157,7 +157,7 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     assert command.main([str(run_folder)]) == 0
     name = capsys.readouterr().out.splitlines()[-1]
     assert name == str(run_folder / "figures" / "animation_alcc_0.html")
-    assert "network, for both: profile p, driver 0" in Path(name).read_text()
+    assert "network, for all: profile p, driver 0" in Path(name).read_text()
     out = run_folder.parent / "there.html"
     words = ["--strategy", "idm", "--episode", "1", "--start", "1", "--duration", "0.5"]
     assert command.main([str(run_folder), *words, "--out", str(out)]) == 0

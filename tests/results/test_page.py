@@ -132,8 +132,8 @@ def test_every_table_of_strategies_fits_80_columns() -> None:
 
 def test_names_are_words_in_tables_and_figures() -> None:
     words = {
-        "alcc": "network, for both",
-        "alcc analytic": "network, for both (analytic)",
+        "alcc": "network, for all",
+        "alcc analytic": "network, for all (analytic)",
         "idm tuned": "IDM, tuned on I-80",
         "my_pid_filtered": "my pid, filtered",
     }
@@ -148,7 +148,7 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     saved = 100.0 * (1.0 - own["path_energy_kj_per_km"] / rule["path_energy_kj_per_km"])
     words = verdict(found)
     assert words.startswith(
-        f"With the network, for both, energy per vehicle and km is {saved:.1f} % ("
+        f"With the network, for all, energy per vehicle and km is {saved:.1f} % ("
     )
     assert "less than with IDM, tuned on these data; long time gaps: 0.40 % of" in words
     assert "within the uncertainty" in verdict(found.assign(km_saving_vs_rule_low=-1.0))
