@@ -265,7 +265,7 @@ def _unknown_option(name: str) -> ConfigError:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in ("out", "output", "folder", "dir"):
         return ConfigError(
-            f"unknown option {name!r}: hydra.run.dir=… sets the folder of the results"
+            f"unknown option {name!r}: hydra.run.dir=… sets the folder"
         )
     return unknown_name("option", name, _top_level() | _groups())
 

@@ -52,6 +52,7 @@ REFUSED = {
     "run variants=[]": "variants",
     "run variant=idm": "variant=idm has no effect on lcc-rl run",
     f"train -m variant=idm {' '.join(LISTS)}": "at most 100000 runs",
+    "train out=x": "hydra.run.dir=… sets the folder",
     "train hydra.run.dir=file/run": "Not a directory",
     f"train hydra.run.dir={'x' * 5000}": "too long",
     "train variant=idm sweep=mine": "sweep=mine has no effect.* -m",

@@ -77,7 +77,7 @@ def drivers() -> pd.DataFrame:
 
 FIGURES = {
     "power_map": (alcc.power_map, ["kW", "speed [m/s]"]),
-    "learning_curve": (lambda: learning_curve(training()), ["for both (2 seeds)", "95 % interval"]),
+    "learning_curve": (lambda: learning_curve(training()), ["for all (2 seeds)", "95 % interval"]),
     "reward_terms": (
         lambda: alcc.reward_terms(training()),
         ["energy of the human driver", "(2 seeds)"],

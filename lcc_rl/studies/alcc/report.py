@@ -110,7 +110,7 @@ def add_main(page: Page, means: Means) -> None:
 
 def _headline(page: Page, means: Means) -> None:
     windows = means.windows
-    text = f"""The network for both (alcc) saves energy for itself and for the human driver behind;
+    text = f"""The network for all (alcc) saves energy for itself and for the human driver behind;
         the network for itself (reference) is the same without regard for the driver behind; the
         weighted network for itself (own_energy) is that one, whose own energy counts as often as
         alcc's reward has terms of energy: what it saves is due to that weight, not to regard for
@@ -135,7 +135,7 @@ def _headline(page: Page, means: Means) -> None:
     path = page.folder / "evaluation" / "steps.parquet"
     steps = read_parquet(path) if path.exists() else pd.DataFrame({"strategy": []})
     if (steps["strategy"] == "alcc").any():
-        caption = "Counterpart of Fig. 7: one held-out episode of the network for both, first seed."
+        caption = "Counterpart of Fig. 7: one held-out episode of the network for all, first seed."
         drawn.append(("sample_episode", caption, run_figures.sample_episode(steps, "alcc")))
     shown = [
         ("headline", f"Energy of both saved, {means.size()}", tables.headline(windows)),
