@@ -62,8 +62,8 @@ def wide(path: Path) -> None:
     for run in range(4):
         ahead, own = (10.0 + 3.0 * np.sin((time - late) / (4.0 + run)) for late in (0.0, 1.0))
         gap = 20.0 + np.cumsum(ahead - own) * 0.04
-        speeds = {"v_leader_kmh": 3.6 * ahead, "v_follower_kmh": 3.6 * own}
-        parts.append(pd.DataFrame({"run": run, "clock": time, **speeds, "gap_ft": gap / 0.3048}))
+        speeds = {"v1": 3.6 * ahead, "v2": 3.6 * own}
+        parts.append(pd.DataFrame({"run": run, "clock": time, **speeds, "d": gap / 0.3048}))
     pd.concat(parts).to_csv(path, index=False)
 
 
@@ -117,6 +117,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "my.csv": table,
     "mine.csv": wide,
     "pairs.parquet": pairs,
+    "ring_pairs.parquet": pairs,
     "outputs/pipeline/<run>/trajectories.parquet": pairs,
     "astazero/*.csv.gz": openacc,
     "drives.parquet": drives,

@@ -201,7 +201,8 @@ class Runner(Reader):
     def shrunk(self, name: str, words: Sequence[str]) -> list[str]:
         """Return further words that make a command a matter of seconds."""
         if name == "clairvoyant":
-            return ["--iterations", "2", "--no-compile", LENGTH, *WINDOWS, *DATA]
+            data = [] if any(word.startswith("leader=") for word in words) else DATA
+            return ["--iterations", "2", "--no-compile", LENGTH, *WINDOWS, *data]
         if name not in console.HYDRA or any(word.startswith("resume=") for word in words):
             return []
         self.count += 1

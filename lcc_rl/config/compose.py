@@ -264,9 +264,7 @@ def _unknown_option(name: str) -> ConfigError:
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in ("out", "output", "folder", "dir"):
-        return ConfigError(
-            f"unknown option {name!r}: hydra.run.dir=… sets the folder"
-        )
+        return ConfigError(f"unknown option {name!r}: hydra.run.dir=… sets the folder")
     return unknown_name("option", name, _top_level() | _groups())
 
 

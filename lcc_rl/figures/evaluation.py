@@ -96,15 +96,16 @@ def study_figures(
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     several = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
+    own = [name for name in cars if name not in UNTRAINED]
     seeds = episodes.groupby("strategy")["training_seed"].count()
     # Human drivers, networks, then the user's own controllers, then the others.
     order = sorted(names, key=lambda x: (x != "human", not seeds[x], x in UNTRAINED))
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and len(tables) == 1 and cars[-1] not in UNTRAINED:
-        yield "overview", overview(episodes, steps, cars[-1], tables[0])
-    for name in [name for name in cars if name not in UNTRAINED] or cars:
+    if len(steps) and len(tables) == 1 and own[-1:] == cars[-1:] != []:
+        yield "overview", overview(episodes, steps, own[-1], tables[0])
+    for name in own or cars:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
