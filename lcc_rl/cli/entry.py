@@ -53,9 +53,8 @@ def entry_point(
         def checked(config: DictConfig) -> Any:
             logging.raiseExceptions = False  # a log that cannot be written ends no run
             cfg = parsed(config, config_name, list(HydraConfig.get().overrides.task), is_sweep())
-            if not is_sweep():
-                with ending_quietly():
-                    import_module(work)
+            with ending_quietly():
+                import_module(work)
             gc.freeze()  # modules stay: later searches for garbage leave them out
             gc.enable()
             return function(cfg)
@@ -73,10 +72,9 @@ def entry_point(
         @wraps(function)
         def main() -> None:
             if HELP.intersection(sys.argv):
-                words = [word for word in sys.argv[1:] if word[:1] != "-" and "=" in word]
-                print(help_text(config_name, words))
+                print(help_text(config_name, sys.argv[1:]))
                 return
-            gc.disable()  # while modules are loaded, a fifth of whose time it would take
+            gc.disable()  # while modules are loaded: a fifth of the time
             try:
                 if SWEEP.intersection(sys.argv):
                     import_module(work)

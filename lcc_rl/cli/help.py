@@ -65,11 +65,12 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
 
     Args:
         entry: ``"train"``, ``"evaluate"``, ``"calibrate"`` or ``"pipeline"``.
-        overrides: settings that were typed, whose effect the defaults show.
+        overrides: what was typed; the defaults show the effect of the settings among it.
     """
     name = NAMES.get(entry, entry)
+    typed = [word for word in overrides if word[:1] != "-" and "=" in word]
     with initialize_config_module(CONF, version_base="1.3"):
-        cfg = compose(entry, overrides=as_meant(overrides), return_hydra_config=True)
+        cfg = compose(entry, overrides=as_meant(typed), return_hydra_config=True)
     wide = max(len(command) for command, _ in EXAMPLES[entry])
     lines = [f"lcc-rl {name}: {HYDRA[name][1]}  (lcc-rl {__version__})", ""]
     lines += [f"  {command:<{wide}}  # {what}" for command, what in EXAMPLES[entry]]

@@ -55,10 +55,8 @@ def official_columns(samples: pd.DataFrame) -> dict[str, NDArray]:
     """Return the 18 official columns of samples in their order, see :func:`write_ngsim`."""
     # Plain text orders recordings the same whatever the categories' own order is.
     frame = samples.astype({"recording": str}).sort_values(KEY, ignore_index=True)
-    start = {
-        name: round(datetime.fromisoformat(name).timestamp() * 1000)
-        for name in frame["recording"].unique()
-    }
+    names = frame["recording"].unique()
+    start = {name: round(datetime.fromisoformat(name).timestamp() * 1000) for name in names}
     clock = frame["recording"].map(start) + 100 * frame["frame"]
     place = pd.MultiIndex.from_frame(frame[KEY])
     row = place.get_indexer(pd.MultiIndex.from_frame(frame[AHEAD]))

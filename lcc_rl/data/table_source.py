@@ -293,23 +293,21 @@ def _samples(
     report: ReadReport,
 ) -> pd.DataFrame:
     """The table of :class:`lcc_rl.data.trajectories.Trajectories`, with leaders and headways."""
-    none, zero = np.full(len(rows), np.nan), np.zeros(len(rows))
-    columns = {str(name): rows[name].to_numpy() for name in rows}
+    columns, zero = {str(name): rows[name].to_numpy() for name in rows}, np.zeros(len(rows))
     leader = columns["leader"] if "leader" in columns else _next_ahead(rows, frame)
-    gap = columns.get("gap", none)
-    if "gap" in columns:  # a vehicle without a gap follows nobody
+    given, gap = "gap" in columns, columns.get("gap", zero)
+    if given:  # a vehicle without a gap follows nobody
         leader = np.where(np.isnan(gap), 0, leader)
     ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
     length = np.nan_to_num(columns.get("length", zero))
     position = columns.get("position", zero)
-    to_leader = gap + length[ahead] if "gap" in columns else position[ahead] - position
+    to_leader = gap + length[ahead] if given else position[ahead] - position
     headway = np.where(ahead >= 0, to_leader, np.nan)
-    seen = int((ahead >= 0).sum())
-    report.headways_given, report.headways_derived = (seen, 0) if "gap" in columns else (0, seen)
+    report.headways_given = given * int((ahead >= 0).sum())
+    report.headways_derived = (not given) * int((ahead >= 0).sum())
     report.headways_unknown = int(((leader > 0) & (ahead < 0)).sum())
-    speed = columns["speed"]
-    rate = np.diff(speed, append=speed[-1]) / FRAME
-    last = np.append(np.diff(segment) != 0, True)
+    speed, last = columns["speed"], np.append(np.diff(segment) != 0, True)
+    rate = np.where(last, 0.0, np.diff(speed, append=speed[-1]) / FRAME)
     return pd.DataFrame(
         {
             "recording": pd.Categorical.from_codes(columns["recording"], pd.Index(names)),
@@ -322,7 +320,7 @@ def _samples(
             "length_m": length.astype(np.float32),
             "vehicle_class": zero.astype(np.int8),
             "speed_mps": speed.astype(np.float32),
-            "acceleration_mps2": np.where(last, 0.0, rate).astype(np.float32),
+            "acceleration_mps2": rate.astype(np.float32),
             "preceding": leader,
             "space_headway_m": headway.astype(np.float32),
         }

@@ -360,9 +360,8 @@ def parse_text(
         text = odd[0].text.encode()
         row = next((n for n, x in enumerate(rows.split(b"\n")) if x.rstrip(b"\r") == text), 0)
         place = f"line {row + first}" if first else f"data row {row + 1}"
-        raise DataError(
-            f"{source}: {place} has {odd[0].actual_columns} columns; expected {width}"
-        ) from error
+        held = odd[0].actual_columns
+        raise DataError(f"{source}: {place} has {held} columns; expected {width}") from error
     # An unclosed quote merges lines without an error.
     lines = rows.count(b"\n") + (not rows.endswith(b"\n"))
     if table.num_rows != lines and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):

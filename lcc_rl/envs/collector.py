@@ -18,7 +18,7 @@ from torchrl.envs.utils import RandomPolicy
 from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.single import SingleAgent, group_key
 from lcc_rl.envs.step import DONE, Step, closure, entries, leaves, pieces_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.pieces.base import NEXT, SEED, STEP, Key, State, StepTransform, as_key, root_key
 
 
@@ -60,39 +60,40 @@ class StringCollector(BaseCollector):
         self.env: TransformedEnv = env
         self.policy: Any = RandomPolicy(env.full_action_spec) if policy is None else policy
         self.requested_frames_per_batch, self.total_frames = frames_per_batch, total_frames
-        self._frames, self._iter, self._iterator = 0, -1, None
-        self.trajs_per_batch = None
+        self._frames, self._iter, self._iterator, self.trajs_per_batch = 0, -1, None, None
         episodes = env.batch_size.numel()
-        if frames_per_batch < 1 or frames_per_batch % episodes:
-            raise ConfigError(
-                f"frames_per_batch ({frames_per_batch}) must be a multiple of the {episodes} "
-                "episodes side by side"
-            )
+        require(
+            frames_per_batch > 0 and not frames_per_batch % episodes,
+            f"frames_per_batch ({frames_per_batch}) must be a multiple of the {episodes} episodes "
+            "side by side",
+        )
         self.steps = frames_per_batch // episodes
         self.single = _is_single(env)
         self.action: Key = as_key(next(iter(env.full_action_spec.keys(True, True))))
-        self.reads = [
-            as_key(key) for key in getattr(policy, "in_keys", []) if as_key(key) != self.action
-        ]
+        reads = map(as_key, getattr(policy, "in_keys", []))
+        self.reads = [key for key in reads if key != self.action]
         state = self._entries(env.reset())
-        rewards = env.full_reward_spec.keys(True, True)
-        moment = [*state, *(as_key(key) for key in rewards)]
-        known = [self._shown(key) for key in [*state, self._inner(self.action)]]
-        asked = keys if keys is not None else [*known, *((NEXT, *self._shown(k)) for k in moment)]
-        every = [*known, *map(as_key, rewards)]
-        self.keys = list(dict.fromkeys(leaf for key in asked for leaf in leaves(key, every)))
+        self.keys = self._asked(keys, list(state))
         wanted = {*(self._inner(root_key(key)) for key in self.keys), DONE}
         wanted |= {self._inner(key) for key in self.reads}
         # Pieces that none of this depends on, which only an evaluation measures, are left out.
         self.step = Step(closure(pieces_of(env), wanted), env.base_env.horizon)
-        # A reset may read more than a step does.
-        self.first = Step(pieces_of(env), env.base_env.horizon)
+        self.first = Step(pieces_of(env), env.base_env.horizon)  # a reset may read more
         self.carried = self._needed()
         self.state = {key: value for key, value in state.items() if key in self.carried}
         self.advance = Compiled(self._advance, "the environment", compiled)
         self.renew = Compiled(self._renewed, "its resets", compiled)
         # A compiled reset takes so many episodes at once, about twice as many as end in a step.
         self.rows = min(episodes, max(32, episodes // 64)) if compiled else 0
+
+    def _asked(self, keys: Sequence[NestedKey] | None, state: list[Key]) -> list[Key]:
+        """Return the leaves that a batch holds; by default all entries before and after a step."""
+        rewards = [as_key(key) for key in self.env.full_reward_spec.keys(True, True)]
+        known = [self._shown(key) for key in [*state, self._inner(self.action)]]
+        after = [(NEXT, *self._shown(key)) for key in [*state, *rewards]]
+        asked = keys if keys is not None else [*known, *after]
+        every = [*known, *rewards]
+        return list(dict.fromkeys(leaf for key in asked for leaf in leaves(key, every)))
 
     def _inner(self, key: Key) -> Key:
         """Return the key under which the pieces know an entry."""

@@ -202,10 +202,8 @@ def hybrid_decision(
         torch.stack([rule, learned]), interval, cap, max_acceleration
     )
 
-    def earned(acceleration: Tensor) -> Tensor:
-        return reward.one_step(
-            speed, last_acceleration, acceleration, leader_next, time_step, place
-        )
+    def earned(x: Tensor) -> Tensor:
+        return reward.one_step(speed, last_acceleration, x, leader_next, time_step, place)
 
     if choice == "better":
         share = (earned(two) > earned(one)).to(one.dtype)
@@ -215,10 +213,8 @@ def hybrid_decision(
     if choice == "first":
         share = share[..., :1, :].expand_as(rule)
     winner = (share > 0.5).to(torch.int64)
-    if last_winner is None:
-        switched = torch.zeros_like(clamped)
-    else:
-        switched = (last_winner >= 0) & (winner != last_winner)
+    before = winner if last_winner is None else last_winner
+    switched = (before >= 0) & (winner != before)
     if choice == "better":
         share = torch.where(switched, 0.5, share)
     chosen = torch.lerp(one, two, share)
