@@ -370,7 +370,7 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
     plan = episodes.plan_of(cfg, inputs)
-    drivers = f"{len(plan.chosen)} drivers"
+    drivers = f"{len(plan.chosen)} driver{'s' * (len(plan.chosen) > 1)}"
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
     drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
     counts = Counter(inputs.evaluation.sources or [""] * plan.profiles)
@@ -378,7 +378,8 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = one.of
         if one.of in counts:
             of = [x for x in (cfg.task and str(cfg.task["name"]), one.of) if x]
-            size = f"{counts[one.of]} held-out profiles × {drivers}, {cfg.scenario.horizon} steps"
+            held = f"{counts[one.of]} held-out profile{'s' * (counts[one.of] > 1)}"
+            size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
         show(one.drawn(title, cfg.table == "all"))
     if words := headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step):
