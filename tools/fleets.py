@@ -46,8 +46,11 @@ SETTINGS = {  # of what is kept for fronts, for readers
     "front": "I-24, windows of 100 s",
     "free": "free driving, 100 s",
     "long": "I-24, windows of 400 s",
+    "long_taught": "I-24, windows of 400 s, trained so",
     "true": "true drivers behind I-24, 100 s",
+    "true_taught": "true drivers behind I-24, 100 s, trained among them",
 }
+TAUGHT = ", trained "  # what makes a setting one whose fleets learned in it
 SHOWN_AS = {
     LEARNED: ("learned", "#0072b2"),
     "idm_acc": ("tuned IDM", "#009e73"),
@@ -123,17 +126,19 @@ def percent(found: Estimate) -> str:
 def drawn_fronts(rows: pd.DataFrame) -> Figure:
     """Draw, for each setting, the learned fleets beside the rule's fronts, a colour per share."""
     figure = new_figure(PAGE, 5.4)
-    axes = dict(zip(SETTINGS.values(), figure.subplots(2, 2).flat, strict=True))
+    titles = [setting for setting in SETTINGS.values() if TAUGHT not in setting]
+    axes = dict(zip(titles, figure.subplots(2, 2).flat, strict=True))
     shares = 100.0 * np.sort(rows[SHARE].unique())
     hues = dict(zip(shares.round(), COLOURS, strict=False))
     for setting, share, part in by_setting(rows):
-        axis, hue = axes[setting], hues[round(share)]
+        axis, hue = axes[setting.partition(TAUGHT)[0]], hues[round(share)]
+        look = {"marker": "D"} if TAUGHT in setting else {"label": f"{share:g} % automated"}
         people = curve(part, HUMAN)[1].iloc[0]
         (saving, flow), (own, point) = curve(part, RULE), curve(part, LEARNED)
         axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue, lw=1.0, ms=4)
         x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, saved)
         axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, lw=2.5, alpha=0.5)
-        axis.plot(x, own, "o", color=hue, mec=INK, ms=7, label=f"{share:g} % automated", zorder=5)
+        axis.plot(x, own, **{"marker": "o"} | look, ls="", color=hue, mec=INK, ms=7, zorder=5)
     for setting, axis in axes.items():
         axis.axhline(0.0, color=INK, lw=0.6)
         axis.axvline(0.0, color=INK, lw=0.6)
@@ -143,8 +148,8 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
     figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
     footnote(
         figure,
-        "large: learned, with the 95 % interval; small: the tuned IDM by its time gap, "
-        "shorter to the right",
+        "large: learned, with the 95 % interval, diamonds in this setting, circles in that of the "
+        "first panel;\nsmall: the tuned IDM by its time gap, shorter to the right",
     )
     return figure
 
