@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from lcc_rl.config.nodes import (
     TARGET,
@@ -167,7 +167,13 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         # Settings may refer to the default of a class.
         whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))
         content: Any = OmegaConf.to_container(whole, resolve=True)
-    except OmegaConfBaseException as error:  # a reference to nothing, or in a circle
+    except InterpolationKeyError as error:
+        missing = re.search("'[^']+'", str(error))
+        raise ConfigError(
+            f"{error.full_key} takes its value from {missing and missing.group()}, which is not "
+            "there: do variant, task, scenario and reward fit each other?"
+        ) from error
+    except OmegaConfBaseException as error:  # a reference in a circle
         raise ConfigError(" ".join(str(error).split())) from error
     if "agent" in content and not _learns(content):
         content["agent"] = None

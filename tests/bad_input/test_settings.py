@@ -42,6 +42,7 @@ WRONG = {
     "scenario.pieces.ttc=5": "ttc: expected a node",
     "data.path=a (copy).csv": r"data\.path=a \(copy\)\.csv.*quotes",
     "+scenario.controllers.human.time_gap=${scenario}": "parent node",
+    "+scenario.controllers.human.time_gap=${reward.no}": "takes its value from 'reward.no'",
     "~drivers": "drivers is required",
     f"~{AUTO}": "names only human",
     # ranges
