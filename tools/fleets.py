@@ -148,8 +148,8 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
     figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
     footnote(
         figure,
-        "large: learned, with the 95 % interval, circles as in the first panel, diamonds as in their "
-        "own;\nsmall: the tuned IDM by its time gap, shorter to the right",
+        "large: learned, with the 95 % interval; circles trained for the first panel, diamonds for "
+        "theirs;\nsmall: the tuned IDM by its time gap, shorter to the right",
     )
     return figure
 
