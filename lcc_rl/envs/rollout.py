@@ -53,27 +53,34 @@ class DifferentiableRollout:
         inside = closure(needed, {OBSERVATION}, recurrent)
         self.after = [piece for piece in needed if piece not in inside]
         self.step = Step(inside, self.horizon, self.graded)
-        self.carried = {SEED, STEP, *written(inside)}
-        entries = {key for piece in needed for _, key in piece.needs} | every
-        self.recorded = sorted(entries & {*self.carried, ACTION})
+        known = {SEED, STEP, ACTION, *written(inside)}
+        kept = known & (
+            {key for piece in self.after for _, key in piece.needs} | every | {STEP, ACTION}
+        )
+        steps = [piece for piece in inside if isinstance(piece, StepTransform)]
+        read = {key for piece in steps for late, key in piece.needs if not late}
+        # A compiled step takes its time for every entry that it returns: only those that are used.
+        self.constants = sorted({SEED}.union(*(piece.constants for piece in steps)))
+        self.moving = sorted((kept | read & known | {STEP}) - {ACTION, *self.constants})
+        self.recorded = sorted(kept)
         self.advance = Compiled(self._advance, "the simulator", compiled)
 
     def start(self, given: TensorDictBase | None = None) -> State:
         """Reset the environment, to given choices or drawn ones; return the first moment."""
         td = self.env.reset(given)
-        return {key: td.get(key) for key in sorted(self.carried)}
+        return {key: td.get(key) for key in (*self.constants, *self.moving)}
 
     def _advance(self, state: State, action: Tensor) -> State:
-        """Return the next state."""
+        """Return what of the next state differs from one step to the next."""
         reached = self.step({**state, ACTION: action})
-        return {key: reached[key] for key in state}
+        return {key: reached[key] for key in self.moving}
 
     @torch.no_grad()
     def skip(self, state: State, steps: int) -> State:
         """Return the moment some steps later; the action is zero, and no gradient is kept."""
         action = self.env.full_action_spec[ACTION].zero()
         for _ in range(steps):
-            state = self.advance(state, action)
+            state = state | self.advance(state, action)
         return state
 
     def play(
@@ -99,7 +106,7 @@ class DifferentiableRollout:
                 action = (action + shifts[step]).clamp(-1.0, 1.0)
             record.append(self._entries(state, action))
             # The first moment carries no gradient; compiled, it would need a graph of its own.
-            state = (self.advance if step else self._advance)(state, action)
+            state = state | (self.advance if step else self._advance)(state, action)
         record.append(self._entries(state, torch.zeros_like(action)))
         return state, record
 
