@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from benchmarks import harness
+from benchmarks.analytic import analytic
 from benchmarks.calibrate import calibrate
 from benchmarks.collect import collect
 from benchmarks.env import env
@@ -40,7 +41,10 @@ from lcc_rl.io.memory import torch_device
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million, Parallel
 
-LISTED = (read, loading, start, env, string, gym, collect, update, train, calibrate, evaluate)
+LISTED = (
+    *(read, loading, start, env, string, gym, collect, update, train, analytic),
+    *(calibrate, evaluate),
+)
 NO_DEVICE = ("read", "loading", "start")  # always on the processor
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
