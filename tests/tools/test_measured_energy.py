@@ -23,16 +23,20 @@ def rates(model, speed: np.ndarray) -> np.ndarray:
     return model.power(*motion).numpy()
 
 
-def test_what_was_measured_by_a_model_is_that_model(tmp_path, capsys) -> None:
-    fuel, car = CirclesFuel(vehicle="Compact"), ElectricCar()
-    bench = pd.concat(
+def on_the_bench(fuel: CirclesFuel) -> pd.DataFrame:
+    """Three drives of which a tenth more is measured."""
+    return pd.concat(
         pd.DataFrame({"setting": "humans", "position": n, "sample": 1, "time_s": TIME}).assign(
             speed_mps=drive(n), fuel_g_per_s=1.1 * rates(fuel, drive(n)) / fuel.heating_value
         )
         for n in (1, 2, 3)
     )
-    # 2 kW of heating in winter; every trip climbs 3 m.
-    trips = pd.concat(
+
+
+def trips(car: ElectricCar) -> pd.DataFrame:
+    """Trips in summer and, with 2 kW of heating, in winter; each climbs 3 m."""
+    lift = car.mass * 9.81 * 3.0 / car.efficiency / 60.0
+    return pd.concat(
         pd.DataFrame({"trip": f"{place}{n}", "time_s": TIME, "speed_mps": drive(n)}).assign(
             elevation_m=np.linspace(0.0, 3.0, len(TIME)),
             battery_v=350.0,
@@ -43,17 +47,15 @@ def test_what_was_measured_by_a_model_is_that_model(tmp_path, capsys) -> None:
         )
         for n in (1, 2, 3)
         for place, warm, heating in (("A", 25.0, 0.0), ("B", 0.0, 2000.0))
-        for lift in (car.mass * 9.81 * 3.0 / car.efficiency / 60.0,)
     )
-    bench.to_parquet(tmp_path / "bench.parquet")
-    trips.to_parquet(tmp_path / "trips.parquet")
+
+
+def test_what_was_measured_by_a_model_is_that_model(tmp_path, capsys) -> None:
+    bench, electric = tmp_path / "bench.parquet", tmp_path / "trips.parquet"
+    on_the_bench(CirclesFuel(vehicle="Compact")).to_parquet(bench)
+    trips(ElectricCar()).to_parquet(electric)
+    given = ["--bench", str(bench), "--electric", str(electric)]
     files = ["--kept", str(tmp_path / "kept.parquet"), "--figure", str(tmp_path / "drawn.png")]
-    given = [
-        "--bench",
-        str(tmp_path / "bench.parquet"),
-        "--electric",
-        str(tmp_path / "trips.parquet"),
-    ]
     assert tool.main([*given, *files]) == 0
     said = capsys.readouterr().out
     table = pd.read_parquet(tmp_path / "kept.parquet").set_index("kind")
