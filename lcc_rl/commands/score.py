@@ -7,7 +7,7 @@
 Prints one table and writes score.json: scores, intervals over drives, limits, and what they were
 measured on: hashes of the windows that leaders drove, of all settings and of the policy's file, and
 versions. The rows of all episodes stand beside it. Words that are no options are further settings
-of every task; they change the hash of the settings.
+of every task, but the variant, which is the task's; they change the hash of the settings.
 """
 
 from __future__ import annotations

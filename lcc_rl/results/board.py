@@ -15,7 +15,7 @@ from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import Shown, in_words, saved
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import DRIVE
-from lcc_rl.results.scores import HEADINGS, LEAST, PER_DISTANCE, Task
+from lcc_rl.results.scores import HEADINGS, LEAST, PER_DISTANCE, Task, keeps
 
 Row = Mapping[str, Any]
 COLUMNS = (
@@ -103,7 +103,7 @@ def _cells(row: Row) -> dict[str, str]:
         "flow": headline.MISSING if flow is None else f"{flow:,.0f}",
         "ratio": headline.MISSING if ratio is None else f"{ratio:.2f}",
         "drives": str(row["drives"]),
-        "kept": "yes" if row["kept"] else broken(row),
+        "kept": "yes" if row["kept"] else ",\n".join(broken(row)),
     }
 
 
@@ -165,16 +165,17 @@ def _markdown_cell(row: Row) -> str:
     """Return saving, flow, and either that all limits are kept, in bold, or which is not."""
     cells = _cells(row)
     share = f"{cells['saved']} %" if cells["saved"] != headline.MISSING else "baseline"
-    share = f"**{share}**" if row["kept"] else f"{share}, not kept: {cells['kept']}"
+    missed = cells["kept"].replace("\n", " ")
+    share = f"**{share}**" if row["kept"] else f"{share}, not kept: {missed}"
     return f"{share}; {cells['flow']}/h"
 
 
-def broken(row: Row) -> str:
-    """Return the limits that are not kept, by their first words, or that there are collisions."""
-    if row["collisions"]:
-        return f"{row['collisions']} coll."
+def broken(row: Row) -> list[str]:
+    """Return the limits that are not kept, by their first words, and the number of collisions."""
+    found = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():
         value, low = limit["value"], name.startswith(LEAST)
-        if value is not None and (value < limit["bound"] if low else value > limit["bound"]):
-            return HEADINGS[name].partition("≥" if low else "≤")[0].replace("\n", " ").strip()
-    return "no"
+        if value is not None and not keeps(name, value, limit["bound"]):
+            words = HEADINGS[name].partition("≥" if low else "≤")[0]
+            found.append(words.replace("\n", " ").strip())
+    return found

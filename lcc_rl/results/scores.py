@@ -150,7 +150,12 @@ def _columns(task: Task, table: pd.DataFrame) -> tuple[Shown, ...]:
     """Return the columns of scores on the terminal: those of every table, and the limits."""
     flows = "flow_vph" in table and table["flow_vph"].notna().any()
     way = Shown("flow_vph", "flow\n[1/h]") if flows else Shown("distance_pct", "dis-\ntance\n[%]")
-    limits = [Shown(name, HEADINGS[name].format(bound)) for name, bound in task.limits.items()]
+    limits = [
+        Shown(name, HEADINGS[name].format(100.0 * bound) + " %")
+        if name.startswith(SHARE)
+        else Shown(name, HEADINGS[name].format(bound))
+        for name, bound in task.limits.items()
+    ]
     return (
         COLUMNS[0],
         Shown("score", task.label.replace(" ", "\n")),
@@ -165,6 +170,7 @@ def _columns(task: Task, table: pd.DataFrame) -> tuple[Shown, ...]:
 def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     """Shorten scores to what a reader asks first, as :func:`lcc_rl.results.headline.headline`."""
     percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
+    percent |= {name: 100.0 * table[name] for name in task.limits if name.startswith(SHARE)}
     words = [in_words(str(name)) for name in table["strategy"]]
     found = table.assign(who=words, distance_pct=-100.0 * table["distance_lost"], **percent)
     shown = _columns(task, found)
