@@ -43,7 +43,7 @@ BENCHMARK := $(BIN)/python tools/benchmarks
 ROWS := outputs/benchmarks
 benchmarks: $(STAMP)
 	mkdir -p $(ROWS)
-	$(BENCHMARK) env collect string start gym evaluate --repeats 3 --out $(ROWS)/1.parquet $(ARGS) & \
+	$(BENCHMARK) env collect string start gym evaluate analytic --repeats 3 --out $(ROWS)/1.parquet $(ARGS) & \
 	$(BENCHMARK) update train calibrate read loading --repeats 3 --out $(ROWS)/2.parquet $(ARGS) & wait
 	$(BENCHMARK) --page $(ROWS)/1.parquet $(ROWS)/2.parquet | tee $(ROWS)/page.md
 
