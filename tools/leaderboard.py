@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
@@ -39,7 +38,7 @@ from lcc_rl.results.board import as_markdown
 from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import in_words, saved
 from lcc_rl.results.runs import load_config
-from lcc_rl.results.scores import HEADINGS, LEAST, SHARE, Task, keeps, scores
+from lcc_rl.results.scores import LEAST, SHARE, Task, keeps, limited, scores
 
 BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
 DECISIONS, WARM_UP = 200, 20
@@ -119,22 +118,17 @@ def drawn(task: Task, table: pd.DataFrame) -> str:
 
 def bounded(column: str, bound: float) -> str:
     """Return a column and its limit in words."""
-    return f"{named(column)} {'≥' if column.startswith(LEAST) else '≤'} {measured(column, bound)}"
+    return f"{limited(column)} {'≥' if column.startswith(LEAST) else '≤'} {measured(column, bound)}"
 
 
 def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
     """Return the limits that are not kept with their values, or the collisions."""
     found = [
-        f"{named(column)} {measured(column, row[column])}"
+        f"{limited(column)} {measured(column, row[column])}"
         for column, bound in task.limits.items()
         if not keeps(column, row[column], bound)
     ]
     return "; ".join(found) or f"{row['collisions']} collisions"
-
-
-def named(column: str) -> str:
-    """Return the words of a limited column without its bound."""
-    return re.split(r"\s*[≤≥]", HEADINGS[column].replace("\n", " "))[0]
 
 
 def measured(column: str, value: float) -> str:

@@ -303,8 +303,8 @@ def _samples(
     position = columns.get("position", zero)
     to_leader = gap + length[ahead] if given else position[ahead] - position
     headway = np.where(ahead >= 0, to_leader, np.nan)
-    report.headways_given = given * int((ahead >= 0).sum())
-    report.headways_derived = (not given) * int((ahead >= 0).sum())
+    seen = int((ahead >= 0).sum())
+    report.headways_given, report.headways_derived = (seen, 0) if given else (0, seen)
     report.headways_unknown = int(((leader > 0) & (ahead < 0)).sum())
     speed, last = columns["speed"], np.append(np.diff(segment) != 0, True)
     rate = np.where(last, 0.0, np.diff(speed, append=speed[-1]) / FRAME)

@@ -103,8 +103,8 @@ def study_figures(
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and len(tables) == 1 and own[-1:] == cars[-1:] != []:
-        yield "overview", overview(episodes, steps, own[-1], tables[0])
+    if len(steps) and len(tables) == 1 and cars and cars[-1] in own:
+        yield "overview", overview(episodes, steps, cars[-1], tables[0])
     for name in own or cars:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)

@@ -15,7 +15,7 @@ from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import Shown, in_words, saved
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import DRIVE
-from lcc_rl.results.scores import HEADINGS, LEAST, PER_DISTANCE, Task, keeps
+from lcc_rl.results.scores import PER_DISTANCE, Task, keeps, limited
 
 Row = Mapping[str, Any]
 COLUMNS = (
@@ -174,8 +174,6 @@ def broken(row: Row) -> list[str]:
     """Return the limits that are not kept, by their first words, and the number of collisions."""
     found = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():
-        value, low = limit["value"], name.startswith(LEAST)
-        if value is not None and not keeps(name, value, limit["bound"]):
-            words = HEADINGS[name].partition("≥" if low else "≤")[0]
-            found.append(words.replace("\n", " ").strip())
+        if limit["value"] is not None and not keeps(name, limit["value"], limit["bound"]):
+            found.append(limited(name))
     return found

@@ -101,7 +101,7 @@ class Windows(NamedTuple):
     """Means over drivers: a row per window, a column per strategy and training seed."""
 
     energy: pd.DataFrame
-    way: pd.DataFrame | None  # what the energy is divided by
+    way: pd.DataFrame  # what the energy is divided by
     drives: pd.Series | None  # the recorded drive of each window
 
     @classmethod
@@ -110,13 +110,13 @@ class Windows(NamedTuple):
         ways = [name for name in per if name in episodes]
         rows = per_window(episodes, [column, *ways])
         rows["training_seed"] = rows["training_seed"].astype(object).fillna(-1)
-        rows = rows.assign(way=rows[ways].sum(axis=1))
+        rows["way"] = rows[ways].sum(axis=1) if ways else 1.0
         energy, way = (
             rows.pivot(index="profile_id", columns=["strategy", "training_seed"], values=name)
             for name in (column, "way")
         )
         drives = rows.groupby("profile_id")[DRIVE].first() if DRIVE in rows else None
-        return cls(energy, way if ways else None, drives)
+        return cls(energy, way, drives)
 
     def saving(self, strategy: str, baseline: str) -> Estimate:
         """Return the share that a strategy saves, see :func:`savings`."""
@@ -125,12 +125,9 @@ class Windows(NamedTuple):
         if table.empty or not {strategy, baseline} <= set(table.columns.get_level_values(0)):
             return NOTHING
         drives = None if self.drives is None else self.drives.reindex(table.index).tolist()
-        own, other = (table[name].to_numpy() for name in (strategy, baseline))
-        way, ways = self.way, None
-        if way is not None:
-            way = way.loc[table.index, table.columns]
-            ways = way[strategy].to_numpy(), way[baseline].to_numpy()
-        return saving(own, other, drives=drives, ways=ways)
+        way = self.way.loc[table.index, table.columns]
+        energies, ways = ((x[strategy].to_numpy(), x[baseline].to_numpy()) for x in (table, way))
+        return saving(energies[0], energies[1], drives=drives, ways=ways)
 
 
 def worse_off(energy: pd.DataFrame, strategy: str, baseline: str) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 
@@ -33,11 +34,11 @@ HEADINGS = {
     "min_gap_m": "gap\n≥ {:g}\n[m]",
     "min_time_gap_s": "time\ngap\n≥ {:g} s",
     "min_ttc_s": "TTC\n≥ {:g} s",
-    "share_leader_faster": "leader\nfaster\n≤ {:g}",
-    "share_time_gap_long": "long\ngaps\n≤ {:g}",
-    "share_time_gap_long_moving": "long\ngaps\n≤ {:g}",
-    "share_ttc_unsafe": "TTC\n< 4 s\n≤ {:g}",
-    "share_ttc_unpromised": "TTC\nbare\n≤ {:g}",
+    "share_leader_faster": "leader\nfaster\n≤ {:g} %",
+    "share_time_gap_long": "long\ngaps\n≤ {:g} %",
+    "share_time_gap_long_moving": "long\ngaps\n≤ {:g} %",
+    "share_ttc_unsafe": "TTC\n< 4 s\n≤ {:g} %",
+    "share_ttc_unpromised": "TTC\nbare\n≤ {:g} %",
 }
 LARGEST, LEAST, SHARE = "max_", "min_", "share_"
 
@@ -146,14 +147,22 @@ def keeps(column: str, value: float, bound: float) -> bool:
     return not (value < bound if column.startswith(LEAST) else value > bound)
 
 
+def limited(column: str) -> str:
+    """Return the words of a column that may have a limit, without its bound."""
+    return re.split(r"\s*[≤≥]", HEADINGS[column].replace("\n", " "))[0]
+
+
+def _scale(column: str) -> float:
+    """Return what a limited column is multiplied by in tables: shares are in per cent."""
+    return 100.0 if column.startswith(SHARE) else 1.0
+
+
 def _columns(task: Task, table: pd.DataFrame) -> tuple[Shown, ...]:
     """Return the columns of scores on the terminal: those of every table, and the limits."""
     flows = "flow_vph" in table and table["flow_vph"].notna().any()
     way = Shown("flow_vph", "flow\n[1/h]") if flows else Shown("distance_pct", "dis-\ntance\n[%]")
     limits = [
-        Shown(name, HEADINGS[name].format(100.0 * bound) + " %")
-        if name.startswith(SHARE)
-        else Shown(name, HEADINGS[name].format(bound))
+        Shown(name, HEADINGS[name].format(_scale(name) * bound))
         for name, bound in task.limits.items()
     ]
     return (
@@ -170,7 +179,7 @@ def _columns(task: Task, table: pd.DataFrame) -> tuple[Shown, ...]:
 def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     """Shorten scores to what a reader asks first, as :func:`lcc_rl.results.headline.headline`."""
     percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
-    percent |= {name: 100.0 * table[name] for name in task.limits if name.startswith(SHARE)}
+    percent |= {name: _scale(name) * table[name] for name in task.limits}
     words = [in_words(str(name)) for name in table["strategy"]]
     found = table.assign(who=words, distance_pct=-100.0 * table["distance_lost"], **percent)
     shown = _columns(task, found)

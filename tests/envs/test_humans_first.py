@@ -11,6 +11,7 @@ from helpers import compose, make_agent
 from lcc_rl.agents.factory import make_trainer
 from lcc_rl.config import load
 from lcc_rl.envs import build_env, load_inputs
+from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import Episodes, evaluate, plan_of
 from lcc_rl.evaluation.strategies import baseline
@@ -42,9 +43,12 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
         assert torch.equal(begun[key], reached[key][:, -1]), key
     # The episode is as long as the scenario says, and the policy drives in it.
     assert (trainer.horizon, trainer.env.base_env.horizon) == (30, 230)
-    after, _ = source.play(begun, lambda seen: -torch.ones_like(seen[..., :1]), 1)
-    driven = after["vehicles", "acceleration"][:, 0]
-    torch.testing.assert_close(driven, torch.full((3, 1), -3.0), atol=1e-4, rtol=0)
+    told = DifferentiableRollout(trainer.env, [("command", "automated")])
+    begun = told.skip(told.start(), trainer.agent.burn_in)
+    after, _ = told.play(begun, lambda seen: -torch.ones_like(seen[..., :1]), 1)
+    torch.testing.assert_close(
+        after["command", "automated"], torch.full((3, 1, 1), -3.0), atol=0, rtol=0
+    )
 
 
 def test_an_evaluation_measures_what_follows() -> None:
