@@ -44,10 +44,10 @@ def collect(options: Namespace) -> list[Row]:
         own, theirs, plain = (
             f"{x}{ending}" for x in ("StringCollector", "Collector", "plain loop")
         )
-        env, compiled = alcc(options, batch, 30), bool(ending)
+        env, compiled = alcc(options, batch, far=True), bool(ending)
         runs[plain] = loop(env, policy.module, steps, compiled, resets=False)
         runs[own] = collector(env, policy, steps, compiled)
-        runs[theirs] = torchrl_collector(alcc(options, batch, 30), policy, steps, compiled)
+        runs[theirs] = torchrl_collector(alcc(options, batch, far=True), policy, steps, compiled)
         against |= {own: [plain], theirs: [plain, own]}
     counts = dict.fromkeys(runs, batch * steps)
     rows = rates(options, runs, "steps/s", counts, against, batch)

@@ -20,8 +20,8 @@ def env(options: Namespace) -> list[Row]:
 
     "step" is what TorchRL's collector calls (``step_and_maybe_reset``) and keeps nothing, like the
     plain loop; "StringCollector" is the training's own, which keeps the rewards; "rollout" stacks
-    every entry of every moment. The vehicles start 30 s apart, so that no
-    episode ends within a run and nobody resets. Both are first checked to be the same physics.
+    every entry of every moment. Every run begins at one first moment, far behind the leader, so
+    that nobody resets. Both are first checked to be the same physics.
     """
     check_physics(options, 20 if options.quick else 250)
     rows: list[Row] = []
@@ -37,7 +37,7 @@ def env(options: Namespace) -> list[Row]:
 
 def ways(options: Namespace, batch: int, steps: int, ending: str) -> dict[str, Run]:
     """Return every way to take so many steps, all eager or, with an ending, all compiled."""
-    env = alcc(options, batch, 30)
+    env = alcc(options, batch, far=True)
     zero = torch.zeros(batch, 1, 1, device=options.device)
     plain, start = PlainLoop(env), env.reset()
     advance = plain.step
@@ -62,7 +62,7 @@ def ways(options: Namespace, batch: int, steps: int, ending: str) -> dict[str, R
         for _ in range(steps):
             state, _ = advance(state, action)
 
-    collect = collecting(alcc(options, batch, 30), zero, steps, bool(ending))
+    collect = collecting(alcc(options, batch, far=True), zero, steps, bool(ending))
     runs = {"rollout": rollout, "StringCollector": collect, "step": step, "plain loop": loop}
     return {f"{name}{ending}": run for name, run in runs.items()}
 
@@ -77,8 +77,10 @@ def collecting(env: TransformedEnv, action: torch.Tensor, steps: int, compiled: 
         compiled=compiled,
     )
 
+    begun = collector.state_dict()
+
     def run() -> None:
-        collector.reset()
+        collector.load_state_dict(begun)
         collector.collect()
 
     return run

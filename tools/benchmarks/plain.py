@@ -46,12 +46,13 @@ def training(options: Namespace, batch: int) -> TransformedEnv:
 
 
 def alcc(
-    options: Namespace, batch: int, initial_time_gap: float = 1.5, followers: int = 1
+    options: Namespace, batch: int, far: bool = False, followers: int = 1
 ) -> TransformedEnv:
-    """Build the ALCC environment; the automated vehicle starts with the given time gap [s]."""
+    """Build the ALCC environment; from ``far`` behind the leader no episode ends by a collision."""
     cfg, inputs = study(options.quick)
     cfg = deepcopy(cfg)
-    cfg.scenario.start["automated"] |= {"time_gap": initial_time_gap, "gap_range": [1.0, 1.0]}
+    start = {"standstill_gap": 500.0, "time_gap": 30.0} if far else {}
+    cfg.scenario.start["automated"] |= {**start, "gap_range": [1.0, 1.0]}
     cfg.scenario.string = f"automated human*{followers}"
     return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 
@@ -224,7 +225,7 @@ def chosen(over: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def check_physics(options: Namespace, steps: int) -> None:
     """Hold the plain loop against the environment, whose episodes go on after a collision."""
     _check_steps(alcc(options, 64), steps)
-    _check_steps(alcc(options, 64, 30, followers=3), steps)
+    _check_steps(alcc(options, 64, far=True, followers=3), steps)
     check_resets(options)
 
 

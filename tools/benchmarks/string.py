@@ -40,7 +40,7 @@ def string(options: Namespace) -> list[Row]:
 def batch(options: Namespace) -> list[Row]:
     """Return the rows of many strings side by side."""
     count, steps = (4, 10) if options.quick else (1024, 30)
-    env = alcc(options, count, 30, SIZE - 1)
+    env = alcc(options, count, True, SIZE - 1)
     start, zero = env.reset(), torch.zeros(count, 1, 1, device=options.device)
     plain, loops = PlainLoop(env), NumbaString(PlainLoop(env), start.cpu())
     runs: dict[str, Run] = {NUMBA: partial(loops.play, steps)}
@@ -55,7 +55,7 @@ def batch(options: Namespace) -> list[Row]:
             return state
 
         own, other = f"StringCollector{ending}", f"plain loop{ending}"
-        again = alcc(options, count, 30, SIZE - 1)
+        again = alcc(options, count, True, SIZE - 1)
         runs |= {own: collecting(again, zero, steps, bool(ending)), other: loop}
         against[own] = [other, NUMBA]
     played, state = loops.play(steps)[0], loop()
