@@ -382,5 +382,6 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
             size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
         show(one.drawn(title, cfg.table == "all"))
-    if words := headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step):
+    length = f" of {cfg.scenario.horizon * cfg.scenario.time_step:g} s"
+    if words := headline.few_windows(plan.profiles, length):
         log.info(words)

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.energy import Fleet
+from lcc_rl.errors import unknown_name
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import KEYS
@@ -48,7 +49,7 @@ FILTERED = "_filtered"  # ends the names of those who drive behind the safety fi
 FEW, WIDEST = 5, 10_000  # windows; characters
 CAPTION = (
     "energy per vehicle and km, without what motion stores; {}shares of the time: "
-    "TTC < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
+    "TTC < 4 s; time gap > 2.5 s above 1 m/s; every measure: table=all, lcc-rl table --all."
 )
 COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
 
@@ -187,19 +188,17 @@ def caption_of(table: pd.DataFrame, more: str = "") -> str:
     return f"{table.attrs['caption']} {more}".strip()
 
 
-def few_windows(episodes: int, steps: float) -> str:
+def few_windows(windows: int, length: str = "") -> str:
     """Return what an evaluation of few windows means; empty for one of enough.
 
     Args:
-        episodes: how many windows were evaluated.
-        steps: their duration [s].
+        windows: how many windows were evaluated.
+        length: how long they are, in words.
     """
-    if episodes >= FEW:
+    if windows >= FEW:
         return ""
-    return (
-        f"{episodes} window(s) of {steps:g} s: these numbers show that everything runs, and mean "
-        "nothing else"
-    )
+    found = f"{windows} window{'s' * (windows > 1)}{length}"
+    return f"{found}: these numbers show that everything runs, and mean nothing else"
 
 
 def as_rich(
@@ -228,11 +227,23 @@ def as_rich(
     return drawn
 
 
-def for_print(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of a headline that are shown, named for a page or a paper."""
-    keys = [column.key for column in table.attrs["shown"]]
+def for_print(table: pd.DataFrame, names: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return columns of a table with their intervals, named for a page or a paper.
+
+    Args:
+        table: a headline, or any other.
+        names: the columns; by default those of a headline that are shown, else all.
+
+    Raises:
+        ConfigError: for a column that is not there, naming the nearest.
+    """
+    for name in names or ():
+        if name not in table:
+            raise unknown_name("column", name, table.columns.astype(str))
+    keys = names or [column.key for column in table.attrs.get("shown", ())] or list(table)
     kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in table]
-    return table[kept].rename(columns={"who": "driven by", "score": table.attrs["label"]})
+    label = table.attrs.get("label", "score")
+    return table[list(dict.fromkeys(kept))].rename(columns={"who": "driven by", "score": label})
 
 
 def _cells(table: pd.DataFrame, name: str) -> list[str]:
