@@ -41,6 +41,7 @@ WHO = {
     "cacc": "CACC",
     "ddpg": "DDPG",
     "hcfs": "HCFS",
+    "constant": "constant speed",
     "direct": "no automated car",
 }
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
@@ -237,11 +238,12 @@ def for_print(table: pd.DataFrame, names: Sequence[str] | None = None) -> pd.Dat
     Raises:
         ConfigError: for a column that is not there, naming the nearest.
     """
+    known = [str(key) for key in table]
     for name in names or ():
-        if name not in table:
-            raise unknown_name("column", name, table.columns.astype(str))
-    keys = names or [column.key for column in table.attrs.get("shown", ())] or list(table)
-    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in table]
+        if name not in known:
+            raise unknown_name("column", name, known)
+    keys = names or [column.key for column in table.attrs.get("shown", ())] or known
+    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
     label = table.attrs.get("label", "score")
     return table[list(dict.fromkeys(kept))].rename(columns={"who": "driven by", "score": label})
 
