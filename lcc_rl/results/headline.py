@@ -47,11 +47,12 @@ WHO = {
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
 RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
 FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
-FEW, WIDEST = 5, 10_000  # windows; characters
+FEW, SHORT, WIDEST = 5, 150.0, 10_000  # windows; seconds of them; characters
 CAPTION = (
     "energy per vehicle and km, without what motion stores; {}shares of the time: "
     "TTC < 4 s; time gap > 2.5 s above 1 m/s; every measure: table=all, lcc-rl table --all."
 )
+BEHIND = "those tuned and trained drive behind the safety filter; "
 COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
 
 
@@ -117,12 +118,15 @@ def resampled(found: pd.DataFrame) -> str:
     return over
 
 
-def headline(found: pd.DataFrame, energy: Fleet | None = None) -> pd.DataFrame:
+def headline(
+    found: pd.DataFrame, energy: Fleet | None = None, filtered: bool = False
+) -> pd.DataFrame:
     """Shorten a summary to what a reader asks first.
 
     Args:
         found: of :func:`lcc_rl.results.tables.summary`.
         energy: the energy models; where all burn one fuel, the table has it in g/km, too.
+        filtered: whether there is a safety filter, for the caption.
 
     Returns:
         A row per strategy with a controlled car, those that draw most first: path energy per
@@ -149,6 +153,7 @@ def headline(found: pd.DataFrame, energy: Fleet | None = None) -> pd.DataFrame:
     table["collisions"] = cars["collisions"]
     table = table.reset_index(drop=True)
     saved = COMPARED.format(in_words(against), resampled(cars)) if against else ""
+    saved += BEHIND if filtered else ""
     table.attrs |= {"against": against, "caption": CAPTION.format(saved), "shown": COLUMNS}
     table.attrs |= {"score": "energy_kj_per_km", "label": "path energy per km [kJ/km]"}
     return table
@@ -189,16 +194,17 @@ def caption_of(table: pd.DataFrame, more: str = "") -> str:
     return f"{table.attrs['caption']} {more}".strip()
 
 
-def few_windows(windows: int, length: str = "") -> str:
-    """Return what an evaluation of few windows means; empty for one of enough.
+def few_windows(windows: int, seconds: float | None = None) -> str:
+    """Return what an evaluation of few windows means; empty for one of enough, or of long ones.
 
     Args:
         windows: how many windows were evaluated.
-        length: how long they are, in words.
+        seconds: how long each of them is, if that is known.
     """
-    if windows >= FEW:
+    if windows >= FEW or windows * (seconds or 0.0) >= SHORT:
         return ""
-    found = f"{windows} window{'s' * (windows > 1)}{length}"
+    found = f"{windows} window{'s' * (windows > 1)}"
+    found += f" of {seconds:g} s" if seconds else ""
     return f"{found}: these numbers show that everything runs, and mean nothing else"
 
 

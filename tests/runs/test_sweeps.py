@@ -15,6 +15,7 @@ from commands import AGENT, NO_AGENT, TINY, run_command, tiny
 
 from lcc_rl import results
 from lcc_rl.commands import training
+from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.states import claim
 
@@ -60,6 +61,21 @@ def test_a_sweep_is_read_as_one_table(tmp_path) -> None:
     rows = results.load(folder, "training")
     assert len(rows) == 2 * 3
     assert rows.groupby("seed")["episode_reward"].first().nunique() == 2
+
+
+def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path, monkeypatch) -> None:
+    words = [*SWEEP, f"{GAP}=1.2,1.3", "seed=0,1", "sweep=mine"]
+    run_command("lcc_rl.cli.train", *words, cwd=tmp_path, check=True)
+    monkeypatch.chdir(tmp_path)
+    names = sorted(
+        path.parent.name for path in Path().glob("outputs/train/mine/*/episodes.parquet")
+    )
+    assert [name.rpartition("_")[0] for name in names] == [
+        f"{GAP}={gap}+seed={seed}" for gap in (1.2, 1.3) for seed in (0, 1)
+    ]
+    paths = [f"outputs/train/mine/{name}" for name in names]
+    assert load("evaluate", [f"compare=[idm,{paths[0]},{paths[1]}]"]).compare == ["idm", *paths[:2]]
+    assert load("evaluate", [f"policy='{paths[0]}'"]).policy == paths[0]
 
 
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
