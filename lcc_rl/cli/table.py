@@ -1,10 +1,10 @@
 """Print the table of an evaluation again, or as rows for a paper or a program.
 
 lcc-rl table outputs/evaluate/<run>
-lcc-rl table outputs/evaluate/<run> --all                  # every measure
-lcc-rl table outputs/evaluate/<run> --format latex > table.tex    # for booktabs
-lcc-rl table outputs/evaluate/<run> --format latex --columns who,energy_kj_per_km
-lcc-rl table outputs/alcc/tables/<table>.parquet --format latex   # any parquet file
+lcc-rl table outputs/evaluate/<run> --all               # every measure
+lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
+lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
+lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 """
 
 from __future__ import annotations
