@@ -20,10 +20,8 @@ class Arguments(ArgumentParser):
     """A parser that keeps the examples in its description and raises a ConfigError."""
 
     def __init__(self, description: str | None = None, **settings: Any) -> None:
-        settings = {
-            "formatter_class": RawDescriptionHelpFormatter,
-            "allow_abbrev": False,
-        } | settings
+        settings.setdefault("formatter_class", RawDescriptionHelpFormatter)
+        settings.setdefault("allow_abbrev", False)
         super().__init__(description=wrapped(description or ""), **settings)
 
     def error(self, message: str) -> NoReturn:
