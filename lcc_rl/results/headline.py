@@ -49,8 +49,8 @@ RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likew
 FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
 FEW, SHORT, WIDEST = 5, 150.0, 10_000  # windows; seconds of them; characters
 CAPTION = (
-    "energy per vehicle and km, without what motion stores; {}shares of the time: "
-    "TTC < 4 s; time gap > 2.5 s above 1 m/s; every measure: table=all, lcc-rl table --all."
+    "Energy per vehicle and km, without what motion stores; {}shares of the time: "
+    "TTC < 4 s; time gap > 2.5 s above 1 m/s; all measures: table=all or --all."
 )
 BEHIND = "those tuned and trained drive behind the safety filter; "
 COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "

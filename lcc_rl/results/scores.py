@@ -188,7 +188,7 @@ def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     caption = (
         f"saved: against {in_words(task.against)}, with the 95 % interval over "
         f"{resampled(table)}; kept: all limits, without a collision; "
-        "every measure: table=all, lcc-rl table --all."
+        "all measures: table=all or --all."
     )
     found.attrs |= {"against": task.against, "caption": caption, "shown": shown}
     found.attrs |= {"score": SCORE, "label": task.label}

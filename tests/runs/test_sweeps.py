@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import subprocess
@@ -12,12 +13,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from commands import AGENT, NO_AGENT, TINY, run_command, tiny
+from omegaconf import OmegaConf
 
 from lcc_rl import results
 from lcc_rl.commands import training
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.states import claim
+from lcc_rl.runs.sweeps import run_name
 
 ROOT = Path(__file__).resolve().parents[2]
 GAP = "scenario.controllers.automated.time_gap"
@@ -63,19 +66,15 @@ def test_a_sweep_is_read_as_one_table(tmp_path) -> None:
     assert rows.groupby("seed")["episode_reward"].first().nunique() == 2
 
 
-def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path, monkeypatch) -> None:
-    words = [*SWEEP, f"{GAP}=1.2,1.3", "seed=0,1", "sweep=mine"]
-    run_command("lcc_rl.cli.train", *words, cwd=tmp_path, check=True)
-    monkeypatch.chdir(tmp_path)
-    names = sorted(
-        path.parent.name for path in Path().glob("outputs/train/mine/*/episodes.parquet")
-    )
-    assert [name.rpartition("_")[0] for name in names] == [
-        f"{GAP}={gap}+seed={seed}" for gap in (1.2, 1.3) for seed in (0, 1)
-    ]
-    paths = [f"outputs/train/mine/{name}" for name in names]
-    assert load("evaluate", [f"compare=[idm,{paths[0]},{paths[1]}]"]).compare == ["idm", *paths[:2]]
-    assert load("evaluate", [f"policy='{paths[0]}'"]).policy == paths[0]
+def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path) -> None:
+    (tmp_path / "sweep.json").write_text(json.dumps({"runs": 4, "varied": [GAP, "seed"]}))
+    told = {"sweep": {"dir": str(tmp_path)}, "job": {"config_name": "train"}}
+    told |= {"overrides": {"task": ["variant=idm", f"{GAP}=1.2", "seed=1"]}}
+    name = run_name(_root_=OmegaConf.create({"hydra": told}))
+    assert name.rpartition("_")[0] == f"{GAP}=1.2+seed=1"
+    for words in (f"compare=[idm,{tmp_path}/{name},mpc]", f"compare=[idm,'{tmp_path}/{name}',mpc]"):
+        assert load("evaluate", [words]).compare == ["idm", f"{tmp_path}/{name}", "mpc"]
+    assert load("evaluate", [f"policy='{tmp_path}/a=1,b=2_3f'"]).policy == f"{tmp_path}/a=1,b=2_3f"
 
 
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
