@@ -43,10 +43,14 @@ class Run:
     cfg: StudyConfig
 
     def __str__(self) -> str:
+        return self.printed()
+
+    def printed(self, full: bool = False) -> str:
+        """Return the tables that commands print, with ``full`` of every measure."""
         console = Console(width=WIDTH)
         with console.capture() as text:
             for one in evaluation.found(self.rows, self.cfg):
-                console.print(one.drawn(one.of))
+                console.print(one.drawn(one.of, full))
         return text.get().rstrip()
 
     @cached_property

@@ -15,13 +15,12 @@ from omegaconf import OmegaConf
 from lcc_rl.cli.console import HYDRA
 from lcc_rl.config import as_meant, choices
 from lcc_rl.config.compose import CONF
-from lcc_rl.version import __version__
 
 HELP, FULL_HELP = {"-h", "--help"}, "--help-all"
 NAMES = {"pipeline": "run"}  # of commands that are not called as their configuration
 EXAMPLES = {
     "pipeline": (
-        ("lcc-rl run", "on recordings in the package: minutes"),
+        ("lcc-rl run", "on data in the package: minutes"),
         ("lcc-rl run data=ngsim data.path=tracks.csv", "on your trajectories"),
         ("lcc-rl run experiment=smoke", "seconds: does everything run?"),
     ),
@@ -31,12 +30,12 @@ EXAMPLES = {
         ("lcc-rl train -m variant=alcc,reference 'seed=range(8)'", "a sweep; it resumes"),
     ),
     "evaluate": (
-        ("lcc-rl evaluate policy=outputs/train/<run>", "beside the baselines"),
+        ("lcc-rl evaluate policy=outputs/train/<run>", "baselines"),
         ("lcc-rl evaluate 'compare=[my_pieces.PID,mpc,pretrained/alcc]'", "rivals"),
         ("lcc-rl evaluate task=ring-22 'compare=[pretrained,pid.yaml]'", "a task"),
     ),
     "calibrate": (
-        ("lcc-rl calibrate", "on synthetic traffic"),
+        ("lcc-rl calibrate", "on a stream"),
         ("lcc-rl calibrate data=ngsim data.path=tracks.csv", "on yours"),
         ("lcc-rl train drivers=calibrated drivers.path=drivers.parquet", "then"),
     ),
@@ -72,7 +71,7 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
     with initialize_config_module(CONF, version_base="1.3"):
         cfg = compose(entry, overrides=as_meant(typed), return_hydra_config=True)
     wide = max(len(command) for command, _ in EXAMPLES[entry])
-    lines = [f"lcc-rl {name}: {HYDRA[name][1]}  (lcc-rl {__version__})", ""]
+    lines = [f"lcc-rl {name}: {HYDRA[name][1]}", ""]
     lines += [f"  {command:<{wide}}  # {what}" for command, what in EXAMPLES[entry]]
     lines += ["", f"{'option=…':<{NAME}}{'default':<{DEFAULT}}choices or meaning"]
     for key in OPTIONS[entry]:
@@ -81,8 +80,8 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
         [
             *lines,
             "",
-            f"All settings with their values: lcc-rl {name} --cfg job; all groups: --help-all;",
-            "pages: docs/settings.md. -m makes a sweep: every combination of a=1,2 b=3,4.",
+            f"All settings with values: lcc-rl {name} --cfg job; all groups: --help-all;",
+            "pages: docs/settings.md. -m makes a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )
 

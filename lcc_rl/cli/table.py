@@ -1,7 +1,10 @@
 """Print the table of an evaluation again, or as rows for a paper or a program.
 
 lcc-rl table outputs/evaluate/<run>
-lcc-rl table outputs/evaluate/<run> --format latex > table.tex
+lcc-rl table outputs/evaluate/<run> --all               # every measure
+lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
+lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
+lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 """
 
 from __future__ import annotations
@@ -9,34 +12,55 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from lcc_rl.api import Run
 from lcc_rl.cli.guard import main_guard
-from lcc_rl.io.files import as_rows
+from lcc_rl.io.files import as_rows, read_parquet
 from lcc_rl.results.cells import as_latex, as_markdown
-from lcc_rl.results.headline import for_print
+from lcc_rl.results.headline import for_print, worded
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, reading
 from lcc_rl.runs.arguments import Arguments
 
-FORMATS: dict[str, Callable[[Run], str]] = {
-    "text": str,
-    "markdown": lambda run: as_markdown(for_print(run.headline)),
-    "latex": lambda run: as_latex(for_print(run.headline)),
-    "csv": lambda run: run.headline.to_csv(index=False).rstrip(),
+FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
+    "text": as_markdown,
+    "markdown": as_markdown,
+    "latex": as_latex,
+    "csv": lambda table: table.to_csv(index=False).rstrip(),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table of a run."""
+    """Print the table of a run, or any table that is kept as a parquet file."""
     parser = Arguments(prog="lcc-rl table", description=__doc__)
-    parser.add_argument("run", type=Path, help="folder of an evaluation, a training or a job")
+    what = "folder of an evaluation, a training or a job; or a parquet file"
+    parser.add_argument("run", type=Path, help=what)
     parser.add_argument("--format", choices=FORMATS, default="text")
+    parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
+    parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options = parser.parse_args(arguments)
-    run: Path = options.run
-    folder = run / FINAL if (run / PARTS).is_dir() else run
-    cfg = load_config(folder, options.trust)
+    names = options.columns.split(",") if options.columns else None
+    if options.run.suffix == ".parquet":
+        table = worded(read_parquet(options.run))
+    else:
+        run = read_run(options.run, options.trust)
+        with reading(run.folder / EPISODES):
+            if options.format == "text" and not names:
+                print(run.printed(full=options.all))
+                return
+            table = worded(run.table) if options.all else run.headline
+    if names or options.format != "csv":
+        table = for_print(table, names)
+    print(FORMATS[options.format](table))
+
+
+def read_run(folder: Path, trust: Sequence[str]) -> Run:
+    """Return a run as its folder holds it; of a job its last part."""
+    folder = folder / FINAL if (folder / PARTS).is_dir() else folder
+    cfg = load_config(folder, trust)
     with reading(folder / EPISODES):
-        print(FORMATS[options.format](Run(folder, as_rows(folder / EPISODES), cfg)))
+        return Run(folder, as_rows(folder / EPISODES), cfg)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Upper bound of the saving, and of what regard for the drivers behind can be worth.
 
-    lcc-rl clairvoyant data=ngsim data.path=...          # beside idm and the policy
-    lcc-rl clairvoyant --policy outputs/train/<run> --iterations 100 evaluation.drivers=3
-    lcc-rl clairvoyant --regard --policy pretrained --policy pretrained/reference ...
+    lcc-rl clairvoyant data=ngsim data.path=...   # beside idm and the policy
+    lcc-rl clairvoyant --policy outputs/train/<run> evaluation.drivers=3
+    lcc-rl clairvoyant --regard --policy pretrained --iterations 100
 
 Plans every held-out episode by the gradient through the simulator, with knowledge of the whole
 profile, starting from a learned policy's actions, and evaluates the plan like any other strategy.

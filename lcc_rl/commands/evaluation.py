@@ -36,6 +36,7 @@ from lcc_rl.evaluation.strategies import (
     studied,
     trained,
 )
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results import headline, scores, string_tables
 from lcc_rl.results.headline import show
@@ -356,6 +357,7 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
                 yield Found(f"{of}{case}", table, string_tables.headline, string_tables.in_full)
         return
     task, energy = task_of(cfg), build_energy(cfg)
+    filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source in sources_of(rows):
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
@@ -363,7 +365,7 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
             short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
             yield Found(source, scores.scores(part, task, energy), short, full)
         else:
-            short = partial(headline.headline, energy=energy)
+            short = partial(headline.headline, energy=energy, filtered=filtered)
             yield Found(source, summary(rows, source), short, headline.in_full)
 
 
@@ -382,5 +384,6 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
             size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
         show(one.drawn(title, cfg.table == "all"))
-    if words := headline.few_windows(plan.profiles, cfg.scenario.horizon * cfg.scenario.time_step):
+    seconds = cfg.scenario.horizon * cfg.scenario.time_step
+    if words := headline.few_windows(plan.profiles, seconds):
         log.info(words)

@@ -36,6 +36,7 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.main_page import held_to, write_page
 from lcc_rl.figures.training import training_figure
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
@@ -151,7 +152,8 @@ def _run(
     if paged and isinstance(rows, pd.DataFrame):
         limit, size = held_to(trainings.values()), sample_of(rows)
         found = summary(rows)
-        table = headline(found, build_energy(final))
+        filtered = final.scenario.filters.get(AUTOMATED) is not None
+        table = headline(found, build_energy(final), filtered)
         write_figures(folder / FINAL, tables=[table])
         words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
         page = write_page(folder, [command], found, words, (size, table))

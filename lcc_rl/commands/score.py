@@ -1,6 +1,6 @@
 """Score a policy or controller on every task that it fits, behind the leaders of every source.
 
-    lcc-rl score policy.onnx                    # or a run folder, pretrained/<name>, idm_acc …
+    lcc-rl score policy.onnx      # or a run, pretrained/<name>, idm_acc …
     lcc-rl score outputs/train/<run> --task i24-follow5 --on everyday
     lcc-rl score idm --source i24 leader=i24 leader.path=i24_leaders.parquet
 

@@ -40,7 +40,7 @@ NOT_IDENTITY = (
 )
 # Launchers and sweepers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
-NAMED = re.compile(r"""(?:(?<=[\[,])|^)([^\[\],"'{}]*=[^\[\],"'{}]*)""")  # text with =
+NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -112,6 +112,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         ['variant=alcc,hcfs', '++reward.terms.safety.margin=0', 'agent=td3']
         >>> as_meant(["compare=[idm,outputs/seed=0_1f]"])
         ['++compare=[idm,"outputs/seed=0_1f"]']
+        >>> as_meant(["compare=['a=1,b=2_1f']"])
+        ["++compare=['a=1,b=2_1f']"]
     """
     found = []
     for item in overrides:
@@ -119,8 +121,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         if key.lstrip("+") in ("variant", "variants"):
             found.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # a sweep's folders are named seed=0_…
-            quoted = NAMED.sub(r'"\1"', value)
-            found.append(f"++{key}{equals}{quoted}")
+            quoted = "'" in value or '"' in value
+            found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
         elif key[:1] in "+~" or not equals or not _is_setting(key):
             found.append(item)
         else:

@@ -184,7 +184,7 @@ def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
         if len(numbers) > 1 and np.ptp(numbers) == 0.0:
             axis.plot([place - 0.25, place + 0.25], numbers[[0, 0]], color=colour, linewidth=2)
             look: dict[str, Any] = {"ha": "center", "fontsize": 7, "color": colour}
-            look |= {"xytext": (0, 5), "textcoords": "offset points"}
+            look |= {"xytext": (0, -10), "textcoords": "offset points"}  # the line may be on top
             axis.annotate(f"held at {numbers[0]:g}", (place, numbers[0]), **look)
             continue
         axis.boxplot(

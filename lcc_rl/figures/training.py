@@ -41,12 +41,12 @@ def training_figure(training: pd.DataFrame) -> Figure:
         training: rows of training.parquet of one or more runs, with ``variant``, ``seed`` and
             their settings (:func:`lcc_rl.results.load`).
     """
-    limits = [name for name in map(str, training) if name.startswith(SHARE)]
-    limits = [name for name in limits if training[name].fillna(0.0).any()]
-    if not limits:
+    held = [name for name in map(str, training) if name.startswith(SHARE)]
+    if not held:
         return learning_curve(training)
-    figure = new_figure(PAGE, 2.7)
-    first, *others = figure.subplots(1, 1 + len(limits))
+    limits = [name for name in held if training[name].fillna(0.0).any()]
+    figure = new_figure(PAGE if limits else COLUMN, 2.7)
+    first, *others = figure.subplots(1, 1 + len(limits), squeeze=False)[0]
     draw_curves(first, training, "loss_actor")
     style(first, "training episodes", "objective, less is better")
     legend_above(first, 1)
@@ -66,7 +66,8 @@ def training_figure(training: pd.DataFrame) -> Figure:
             top = max(top, percent)
         axis.set_ylim(0.0, max(1.2 * top, 1e-3))
         style(axis, "training episodes", f"{LIMITS.get(what, what)} [% of the time]")
-    footnote(figure, BAND.replace("\n", " "))
+    never = [LIMITS.get(name.removeprefix(SHARE), name) for name in held if name not in limits]
+    footnote(figure, "\n".join([BAND, *(f"{what}: in no batch" for what in never)]))
     return figure
 
 

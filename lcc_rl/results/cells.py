@@ -113,5 +113,5 @@ def _cell(value: object, places: int) -> str:
     if isinstance(value, (int, np.integer)):
         return f"{value:,}"
     if isinstance(value, (float, np.floating)) and np.isfinite(value):
-        return signed(float(value), f",.{places}f")
+        return signed(float(value), f"z,.{places}f")  # no negative zero
     return value if isinstance(value, str) else MISSING

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.energy import Fleet
+from lcc_rl.errors import unknown_name
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.savings import KEYS
@@ -40,16 +41,18 @@ WHO = {
     "cacc": "CACC",
     "ddpg": "DDPG",
     "hcfs": "HCFS",
+    "constant": "constant speed",
     "direct": "no automated car",
 }
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
 RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
 FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
-FEW, WIDEST = 5, 10_000  # windows; characters
+FEW, SHORT, WIDEST = 5, 150.0, 10_000  # windows; seconds of them; characters
 CAPTION = (
-    "energy per vehicle and km, without what motion stores; {}shares of the time: "
-    "TTC < 4 s; time gap > 2.5 s above 1 m/s; table=all shows every measure."
+    "Energy per vehicle and km, without what motion stores; {}shares of the time: "
+    "TTC < 4 s; time gap > 2.5 s above 1 m/s; all measures: table=all or --all."
 )
+BEHIND = "those tuned and trained drive behind the safety filter; "
 COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
 
 
@@ -115,12 +118,15 @@ def resampled(found: pd.DataFrame) -> str:
     return over
 
 
-def headline(found: pd.DataFrame, energy: Fleet | None = None) -> pd.DataFrame:
+def headline(
+    found: pd.DataFrame, energy: Fleet | None = None, filtered: bool = False
+) -> pd.DataFrame:
     """Shorten a summary to what a reader asks first.
 
     Args:
         found: of :func:`lcc_rl.results.tables.summary`.
         energy: the energy models; where all burn one fuel, the table has it in g/km, too.
+        filtered: whether there is a safety filter, for the caption.
 
     Returns:
         A row per strategy with a controlled car, those that draw most first: path energy per
@@ -147,6 +153,7 @@ def headline(found: pd.DataFrame, energy: Fleet | None = None) -> pd.DataFrame:
     table["collisions"] = cars["collisions"]
     table = table.reset_index(drop=True)
     saved = COMPARED.format(in_words(against), resampled(cars)) if against else ""
+    saved += BEHIND if filtered else ""
     table.attrs |= {"against": against, "caption": CAPTION.format(saved), "shown": COLUMNS}
     table.attrs |= {"score": "energy_kj_per_km", "label": "path energy per km [kJ/km]"}
     return table
@@ -187,19 +194,18 @@ def caption_of(table: pd.DataFrame, more: str = "") -> str:
     return f"{table.attrs['caption']} {more}".strip()
 
 
-def few_windows(episodes: int, steps: float) -> str:
-    """Return what an evaluation of few windows means; empty for one of enough.
+def few_windows(windows: int, seconds: float | None = None) -> str:
+    """Return what an evaluation of few windows means; empty for one of enough, or of long ones.
 
     Args:
-        episodes: how many windows were evaluated.
-        steps: their duration [s].
+        windows: how many windows were evaluated.
+        seconds: how long each of them is, if that is known.
     """
-    if episodes >= FEW:
+    if windows >= FEW or windows * (seconds or 0.0) >= SHORT:
         return ""
-    return (
-        f"{episodes} window(s) of {steps:g} s: these numbers show that everything runs, and mean "
-        "nothing else"
-    )
+    found = f"{windows} window{'s' * (windows > 1)}"
+    found += f" of {seconds:g} s" if seconds else ""
+    return f"{found}: these numbers show that everything runs, and mean nothing else"
 
 
 def as_rich(
@@ -228,11 +234,24 @@ def as_rich(
     return drawn
 
 
-def for_print(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of a headline that are shown, named for a page or a paper."""
-    keys = [column.key for column in table.attrs["shown"]]
-    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in table]
-    return table[kept].rename(columns={"who": "driven by", "score": table.attrs["label"]})
+def for_print(table: pd.DataFrame, names: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return columns of a table with their intervals, named for a page or a paper.
+
+    Args:
+        table: a headline, or any other.
+        names: the columns; by default those of a headline that are shown, else all.
+
+    Raises:
+        ConfigError: for a column that is not there, naming the nearest.
+    """
+    known = [str(key) for key in table]
+    for name in names or ():
+        if name not in known:
+            raise unknown_name("column", name, known)
+    keys = names or [column.key for column in table.attrs.get("shown", ())] or known
+    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
+    label = table.attrs.get("label", "score")
+    return table[list(dict.fromkeys(kept))].rename(columns={"who": "driven by", "score": label})
 
 
 def _cells(table: pd.DataFrame, name: str) -> list[str]:

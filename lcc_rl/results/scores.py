@@ -187,7 +187,8 @@ def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     found = found[["strategy", *(column.key for column in shown), *ends]]
     caption = (
         f"saved: against {in_words(task.against)}, with the 95 % interval over "
-        f"{resampled(table)}; kept: all limits, without a collision; table=all shows every measure."
+        f"{resampled(table)}; kept: all limits, without a collision; "
+        "all measures: table=all or --all."
     )
     found.attrs |= {"against": task.against, "caption": caption, "shown": shown}
     found.attrs |= {"score": SCORE, "label": task.label}

@@ -100,7 +100,7 @@ def headline(table: pd.DataFrame) -> pd.DataFrame:
     """Shorten a case's table, as :func:`lcc_rl.results.headline.headline`."""
     found = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
     found = found[["strategy", *(column.key for column in COLUMNS)]]
-    caption = f"{CAPTION}; table=all shows every measure."
+    caption = f"{CAPTION}; all measures: table=all or --all."
     found.attrs |= {"caption": caption, "shown": COLUMNS}
     return found
 

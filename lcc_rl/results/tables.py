@@ -71,7 +71,8 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         kilometres = (total["cav_distance_m"] + total["hdv_distance_m"]) / 1e3
         whose = "hdv" if np.isnan(mean["total_energy_kj"]) else "total"
         row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
-        row[PER_KM] = total[PATH] / kilometres if kilometres else np.nan
+        driven = kilometres and not np.isnan(mean[PATH])  # by an automated car among others
+        row[PER_KM] = total[PATH] / kilometres if driven else np.nan
         row["distance_m"] = 1e3 * kilometres / total["rows"]
         for baseline in BASELINES:
             for kind, energy in by_window.items():
@@ -177,5 +178,5 @@ def strategies_side_by_side(
         if table[key].notna().any():
             known = np.isfinite(table[key].astype(float))
             cells = (form.format(x) if k else "–" for x, k in zip(table[key], known, strict=True))
-            drawn.add_row(escape(label), *cells)
+            drawn.add_row(escape(label), *(cell.replace("-", "−") for cell in cells))
     return drawn

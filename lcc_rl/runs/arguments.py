@@ -5,25 +5,34 @@ from __future__ import annotations
 import re
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable
+from textwrap import fill
 from typing import Any, NoReturn
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from lcc_rl.errors import ConfigError
 
+WIDTH = 79
 FINITE = ConfigDict(allow_inf_nan=False)
 
 
 class Arguments(ArgumentParser):
-    """A parser that keeps the lines of its description and raises a ConfigError."""
+    """A parser that keeps the examples in its description and raises a ConfigError."""
 
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(
-            **{"formatter_class": RawDescriptionHelpFormatter, "allow_abbrev": False, **settings}
-        )
+    def __init__(self, description: str | None = None, **settings: Any) -> None:
+        settings.setdefault("formatter_class", RawDescriptionHelpFormatter)
+        settings.setdefault("allow_abbrev", False)
+        super().__init__(description=wrapped(description or ""), **settings)
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} ({self.prog} -h lists what there is)")
+
+
+def wrapped(text: str) -> str:
+    """Return a text whose paragraphs fit 80 columns; those with commands stay as they are."""
+    parts = text.strip().split("\n\n")
+    prose = [part if "lcc-rl " in part else fill(" ".join(part.split()), WIDTH) for part in parts]
+    return "\n\n".join(prose)
 
 
 def typed(kind: Any) -> Callable[[str], Any]:

@@ -67,8 +67,9 @@ def run_name(*, _root_: DictConfig) -> str:
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
     typed, varied = result_overrides(_root_.hydra.overrides.task), read_plan(sweep).varied
-    shown = ",".join(item for item in typed if key_of(item) in varied)
-    text = re.sub(r"[^\w.=,+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
+    # A comma would part two values where a setting names the folder.
+    shown = "+".join(item.lstrip("+") for item in typed if key_of(item) in varied)
+    text = re.sub(r"[^\w.=+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
     return f"{text}_{mark}".lstrip("_")
 
 

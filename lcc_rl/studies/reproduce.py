@@ -1,13 +1,13 @@
 """Reproduce a paper's study, from trajectories to one page: lcc-rl reproduce alcc.
 
-  lcc-rl reproduce alcc                            # embedded stream, 8 seeds, Table III
-  lcc-rl reproduce alcc data=ngsim data.path=...   # real trajectories; any override
-  lcc-rl reproduce alcc --recipe quickstart --parts main   # in an hour, not days
-  lcc-rl reproduce alcc --parts main agent=analytic   # another agent, its settings
-  lcc-rl reproduce alcc --recipe smoke --seeds 1   # everything once, in seconds
-  lcc-rl reproduce hcfs                            # platoon: 8 DDPG parents, hybrids
-  lcc-rl reproduce ring                            # one automated car in a wave on a ring
-  lcc-rl reproduce report outputs/alcc             # tables, figures and page, from parquet
+  lcc-rl reproduce alcc                           # embedded stream, 8 seeds
+  lcc-rl reproduce alcc data=ngsim data.path=...  # trajectories; any override
+  lcc-rl reproduce alcc --recipe quickstart --parts main  # an hour, not days
+  lcc-rl reproduce alcc --parts main agent=analytic       # another agent
+  lcc-rl reproduce alcc --recipe smoke --seeds 1  # everything once, in seconds
+  lcc-rl reproduce hcfs                           # platoon: DDPG, CACC, hybrids
+  lcc-rl reproduce ring                           # one automated car in a wave
+  lcc-rl reproduce report outputs/alcc            # the page anew, from parquet
 
 The same command resumes where it stopped: finished runs are skipped, interrupted trainings are
 resumed, failed ones are listed and do not stop the others.

@@ -52,6 +52,7 @@ def test_who_knows_the_profile_saves() -> None:
     assert told[-1][1] == pytest.approx(after[BOTH].sum(axis=1).mean(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_fleet_saves_at_the_flow_of_the_learned_one() -> None:
     words = ["variant=alcc", "task=i24-mixed", "scenario.string={size: 6, penetration: 0.5}"]
     cfg = load("evaluate", [*words, f"scenario.horizon={STEPS}"])

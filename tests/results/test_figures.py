@@ -29,7 +29,7 @@ from lcc_rl.figures.drawing import COLUMN, PAGE, colour, save
 from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
 from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
-from lcc_rl.figures.training import learning_curve
+from lcc_rl.figures.training import learning_curve, training_figure
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.headline import headline
 from lcc_rl.results.means import Means
@@ -78,6 +78,12 @@ def drivers() -> pd.DataFrame:
 FIGURES = {
     "power_map": (alcc.power_map, ["kW", "speed [m/s]"]),
     "learning_curve": (lambda: learning_curve(training()), ["for all (2 seeds)", "95 % interval"]),
+    "limits_never_reached": (
+        lambda: training_figure(
+            training().assign(loss_actor=1.0, share_efficiency=0.0, limit_efficiency=0.02)
+        ),
+        ["objective, less is better", "long time gap: in no batch"],
+    ),
     "reward_terms": (
         lambda: alcc.reward_terms(training()),
         ["energy of the human driver", "(2 seeds)"],

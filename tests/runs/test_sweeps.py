@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import subprocess
@@ -12,11 +13,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from commands import AGENT, NO_AGENT, TINY, run_command, tiny
+from omegaconf import OmegaConf
 
 from lcc_rl import results
 from lcc_rl.commands import training
+from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.states import claim
+from lcc_rl.runs.sweeps import run_name
 
 ROOT = Path(__file__).resolve().parents[2]
 GAP = "scenario.controllers.automated.time_gap"
@@ -60,6 +64,17 @@ def test_a_sweep_is_read_as_one_table(tmp_path) -> None:
     rows = results.load(folder, "training")
     assert len(rows) == 2 * 3
     assert rows.groupby("seed")["episode_reward"].first().nunique() == 2
+
+
+def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path) -> None:
+    (tmp_path / "sweep.json").write_text(json.dumps({"runs": 4, "varied": [GAP, "seed"]}))
+    told = {"sweep": {"dir": str(tmp_path)}, "job": {"config_name": "train"}}
+    told |= {"overrides": {"task": ["variant=idm", f"{GAP}=1.2", "seed=1"]}}
+    name = run_name(_root_=OmegaConf.create({"hydra": told}))
+    assert name.rpartition("_")[0] == f"{GAP}=1.2+seed=1"
+    for words in (f"compare=[idm,{tmp_path}/{name},mpc]", f"compare=[idm,'{tmp_path}/{name}',mpc]"):
+        assert load("evaluate", [words]).compare == ["idm", f"{tmp_path}/{name}", "mpc"]
+    assert load("evaluate", [f"policy='{tmp_path}/a=1,b=2_3f'"]).policy == f"{tmp_path}/a=1,b=2_3f"
 
 
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:

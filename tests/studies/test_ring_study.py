@@ -18,6 +18,7 @@ SMALL = (
 )
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_one_command_writes_the_page(tmp_path) -> None:
     assert main(["ring", "--out", str(tmp_path / "ring"), *SMALL]) == 0
     table = read_parquet(tmp_path / "ring" / "tables" / "ring.parquet").set_index("driven by")

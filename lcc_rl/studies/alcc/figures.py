@@ -114,6 +114,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
             if name in energy:
                 _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
         rows_of(axis, names if vehicle == "cav" else [""] * len(names))
+        axis.use_sticky_edges = False  # a box may be the outermost
         axis.margins(x=0.12)
         style(axis, "path energy [kJ per episode]")
         axis.set_title(f"{title}, n = {len(energy)} drivers")

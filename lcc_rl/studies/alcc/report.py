@@ -14,7 +14,7 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.headline import few_windows, in_words
 from lcc_rl.results.means import WINDOWS, Means
 from lcc_rl.results.runs import CONFIG, EPISODES
 from lcc_rl.results.savings import LEADER
@@ -128,7 +128,8 @@ def _headline(page: Page, means: Means) -> None:
     if windows["training_seed"].nunique() < 2:
         text += """ Every controller was trained with one seed only: intervals are over windows,
             and single seeds differ by about as much as the controllers do."""
-    text += "".join(f"\n\nWarning: {line}." for line in leader_too_fast(windows))
+    warnings = [*leader_too_fast(windows), few_windows(windows["profile_id"].nunique())]
+    text += "".join(f"\n\nWarning: {line}." for line in warnings if line)
     caption = """Counterpart of Fig. 11: path energy of controlled car and human driver by strategy;
         a driver's value is its mean over profiles and seeds."""
     drawn = [("distributions", caption, figures.distributions(means.drivers))]
@@ -254,9 +255,10 @@ def _people(page: Page) -> None:
     text = "The motor's power map is the paper's polynomial."
     if path.exists():
         drivers = read_parquet(path)
-        text += """ Drivers are calibrated on the study's trajectories; a third of them typically
-            reach the upper bound of the desired speed, which congested traffic does not
-            identify."""
+        local = drivers[drivers["mode"] == "local"]
+        share = local["desired_speed_at_bound"].mean()
+        text += f""" Drivers are calibrated on the study's trajectories; one by one, {share:.0%} of
+            them reach a bound of the desired speed, which congested traffic does not identify."""
         caption = "Counterpart of Fig. 4: calibration error and parameters."
         drawn.append(("calibration", caption, calibration_figure(drivers)))
         caption = "Counterpart of Fig. 5: joint distribution of desired speed and time gap."
