@@ -23,6 +23,7 @@ class ReadReport:
 
     Args:
         files: the files, in the order they were read.
+        read_as: their columns and the units these were read in, where a user names them.
         rows_read: rows in the files; equals ``rows_kept`` plus every ``dropped``.
         rows_kept: rows in the result.
         dropped: rows dropped, by reason.
@@ -38,6 +39,7 @@ class ReadReport:
     """
 
     files: list[str] = field(default_factory=list)
+    read_as: str = ""
     rows_read: int = 0
     rows_kept: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
@@ -52,6 +54,11 @@ class ReadReport:
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
+
+    @property
+    def source(self) -> str:
+        """The files, and how they were read: the subject of messages in which units matter."""
+        return ", ".join(self.files) + self.read_as
 
     def drop(self, reason: str, count: int) -> None:
         """Count dropped rows by reason."""
