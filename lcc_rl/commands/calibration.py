@@ -126,9 +126,7 @@ def _say(console: Console, lines: Sequence[str]) -> None:
 def _summary(drivers: pd.DataFrame) -> Table:
     """Mean and spread of the error and the parameters, by mode."""
     modes = list(drivers["mode"].unique())
-    table = Table(
-        "", *modes, title="calibrated drivers, mean ± standard deviation"
-    )  # of a sample: n − 1
+    table = Table("", *modes, title="calibrated drivers, mean ± standard deviation")
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
     table.add_row("drivers", *(str(len(part)) for part in parts.values()))
     errors = [(column, column, label) for column, label in ERRORS]
@@ -162,4 +160,4 @@ def _with_unit(column: str) -> str:
 def _spread(values: pd.Series) -> str:
     if values.nunique() == 1:
         return f"{values.iloc[0]:.2f} (all)"
-    return f"{values.mean():.2f} ± {values.std():.2f}"
+    return f"{values.mean():.2f} ± {values.std():.2f}"  # of a sample: n − 1

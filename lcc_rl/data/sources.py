@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from glob import glob, has_magic
 from os.path import expanduser
 from pathlib import Path
@@ -128,7 +128,8 @@ def episodes_of(
     if not trajectories.samples["position_m"].to_numpy().any():
         derive_positions(episodes)
         lines.append(DERIVED)
-    return _plausible(plausible, episodes, source, lines, remedy, place)
+    loaded = _plausible(plausible, episodes, source, lines, remedy, place)
+    return replace(loaded, vehicles=report.names)
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -94,24 +93,23 @@ class TableSource(Settings):
                 it must not, no episode is left, or more are implausible than ``plausible`` allows.
         """
         report = ReadReport(find_files(self.path), read_as(FIELDS, self.columns, self.units))
-        rows, recordings, vehicles = self._rows(report)
+        rows, recordings = self._rows(report)
         trajectories = to_trajectories(rows, recordings, report)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
-        place = place_in(rows, recordings, vehicles, self.columns)
-        loaded = episodes_of(trajectories, self.criteria, self.plausible, remedy, place)
-        return replace(loaded, vehicles=vehicles)
+        place = place_in(rows, recordings, report.names, self.columns)
+        return episodes_of(trajectories, self.criteria, self.plausible, remedy, place)
 
-    def _rows(self, report: ReadReport) -> tuple[pd.DataFrame, list[str], dict[int, str]]:
-        """Rows of all files in SI, the names of the recordings, and those of numbered vehicles."""
+    def _rows(self, report: ReadReport) -> tuple[pd.DataFrame, list[str]]:
+        """Rows of all files in SI, and the names of the recordings."""
         parts = []
         for name, label in zip(report.files, labels(report.files), strict=True):
             table = TableFile(name)
             part = table.read(FIELDS, self.columns, self.units, "data.columns")
             report.rows_read += len(part["time"])
             part, rows = without_blank(table, part, MEASURED)
-            report_blank_gaps(table, part, rows)
+            _report_blank_gaps(table, part, rows)
             parts.append({"recording": np.full(len(rows), label), **part, "row": rows})
             report.notes += table.notes
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
@@ -119,15 +117,14 @@ class TableSource(Settings):
         report.drop("blank time, speed or position", report.rows_read - count)
         if not report.rows_read:
             raise DataError(f"{', '.join(report.files)}: has a header but no rows")
-        numbers, vehicles = _vehicles(columns["vehicle"], columns.get("leader"), report)
-        columns |= numbers
+        columns |= _vehicles(columns["vehicle"], columns.get("leader"), report)
         if self.vehicle_length is not None:
             length = columns.get("length", np.zeros(count))
             columns["length"] = np.where(length > 0, length, self.vehicle_length)
         if "lane" in columns:
             columns["lane"] = np.unique(columns["lane"], return_inverse=True)[1]
         names, columns["recording"] = np.unique(columns["recording"], return_inverse=True)
-        return pd.DataFrame(columns), names.tolist(), vehicles
+        return pd.DataFrame(columns), names.tolist()
 
 
 def place_in(
@@ -160,8 +157,8 @@ def place_in(
     return lambda episodes: partial(of, episodes)
 
 
-def report_blank_gaps(table: TableFile, read: Mapping[str, NDArray], rows: Whole) -> None:
-    """Count the vehicles that name a leader but have a blank gap, in the notes of the file."""
+def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray], rows: Whole) -> None:
+    """Count samples that name a leader but have a blank gap, in the notes of the file."""
     if "gap" not in read or "leader" not in read:
         return
     blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NOBODY)
@@ -181,24 +178,23 @@ def labels(files: Sequence[str]) -> list[str]:
 
 def _vehicles(
     vehicle: NDArray, leader: NDArray | None, report: ReadReport
-) -> tuple[dict[str, NDArray[np.int64]], dict[int, str]]:
-    """Vehicles and leaders as positive whole numbers, 0 for no leader; names of the vehicles."""
-    named: dict[int, str] = {}
+) -> dict[str, NDArray[np.int64]]:
+    """Vehicles and leaders as positive whole numbers; 0 for no leader."""
     ahead = np.full(len(vehicle), "") if leader is None else leader
     numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
     if numbers is None or numbers.min() <= 0 or leaders is None:
         names, codes = np.unique(vehicle, return_inverse=True)
-        named = dict(enumerate(names.tolist(), 1))
-        shown = listed([*named.values()])
-        report.notes.append(f"{len(named):,} vehicles are numbered from 1 by name: {shown}")
+        report.names = dict(enumerate(names.tolist(), 1))
+        shown = listed(names.tolist())
+        report.notes.append(f"{len(names):,} vehicles are numbered from 1 by name: {shown}")
         numbers, known = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(ahead) + 1
         none = np.isin(ahead, NOBODY) & (known == 0)
         # A leader without a row is a number that no vehicle has.
         leaders = np.where(none, 0, np.where(known == 0, len(names) + 1, known))
     if leader is None:
-        return {"vehicle": numbers}, named
+        return {"vehicle": numbers}
     leaders = np.where((leaders < 0) | (leaders == numbers), 0, leaders).astype(np.int64)
-    return {"vehicle": numbers, "leader": leaders}, named
+    return {"vehicle": numbers, "leader": leaders}
 
 
 def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) -> Trajectories:
@@ -228,7 +224,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
         row = int(np.argmax(short))
         raise DataError(
             f"{_place(rows, row, names, report)} is {steps[row]:g} s after the sample before it of "
-            f"vehicle {rows.vehicle[row]}; expected steps of about {step:g} s"
+            f"vehicle {_name(rows, row, report)}; expected steps of about {step:g} s"
         )
     first = ~together | (steps > HOLE * step)
     _check_way(rows, first, report.source)
@@ -314,9 +310,14 @@ def _interpolated(
 
 
 def _place(rows: pd.DataFrame, row: int, names: list[str], report: ReadReport) -> str:
-    """Describe a row to the user."""
+    """Where a row is, for messages."""
     files, recording = ", ".join(report.files), names[rows.recording[row]]
     return f"{files}: recording {recording}, data row {rows.row[row] + 1}"
+
+
+def _name(rows: pd.DataFrame, row: int, report: ReadReport) -> str | int:
+    """The vehicle of a row, for messages."""
+    return report.names.get(rows.vehicle[row], rows.vehicle[row])
 
 
 def _once(rows: pd.DataFrame, names: list[str], report: ReadReport) -> pd.DataFrame:
@@ -331,7 +332,7 @@ def _once(rows: pd.DataFrame, names: list[str], report: ReadReport) -> pd.DataFr
         row = int(np.argmax(differ))
         raise DataError(
             f"{_place(rows, row, names, report)} and data row {rows.row[row - 1] + 1} differ, but "
-            f"are of one vehicle ({rows.vehicle[row]}) at one time ({rows.time[row]:g} s); "
+            f"are of one vehicle ({_name(rows, row, report)}) at one time ({rows.time[row]:g} s); "
             "expected one row"
         )
     report.drop(EXACT, int(again.sum()))

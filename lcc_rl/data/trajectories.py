@@ -29,6 +29,7 @@ class ReadReport:
         dropped: rows dropped, by reason.
         recordings: rows kept, by recording.
         vehicles: vehicles, counted per recording.
+        names: those of numbered vehicles, by number, where the files name vehicles.
         segments: stretches without a missing frame.
         headways_given: space headways taken from the file.
         headways_derived: space headways derived from Preceding and Local_Y.
@@ -45,6 +46,7 @@ class ReadReport:
     dropped: dict[str, int] = field(default_factory=dict)
     recordings: dict[str, int] = field(default_factory=dict)
     vehicles: int = 0
+    names: dict[int, str] = field(default_factory=dict)
     segments: int = 0
     headways_given: int = 0
     headways_derived: int = 0

@@ -115,15 +115,14 @@ class DriverPopulation:
         speed = self.desired_speed.double().cpu().numpy()
         gap = self.time_gap.double().cpu().numpy()
         deviations = [float(pd.Series(x).std()) for x in (speed, gap)]  # NaN of a single driver
+        spread = min(deviations) > 0.0
         return {
             "drivers": float(len(self)),
             "desired_speed_mean_mps": float(speed.mean()),
             "desired_speed_std_mps": deviations[0],
             "time_gap_mean_s": float(gap.mean()),
             "time_gap_std_s": deviations[1],
-            "correlation": float(np.corrcoef(speed, gap)[0, 1])
-            if min(deviations) > 0.0
-            else float("nan"),
+            "correlation": float(np.corrcoef(speed, gap)[0, 1]) if spread else float("nan"),
             "share_at_bound": float(self.at_bound.double().mean()),
         }
 
