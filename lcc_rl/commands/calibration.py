@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -21,7 +22,7 @@ from lcc_rl.config.schemas import CalibrateConfig
 from lcc_rl.drivers.calibrator import OUT, Calibration
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
-from lcc_rl.envs.inputs import build_source
+from lcc_rl.envs.inputs import load_episodes
 from lcc_rl.figures.calibration import calibration_figure, joint_figure, twins_figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
@@ -71,7 +72,7 @@ def _run(
     device = prepare_torch(cfg)
     # Settings are checked before the data are read, which may take long.
     calibrator = build(cfg.calibration, "calibration", CALLED)
-    dataset = build_source(cfg.data).load()
+    dataset = load_episodes(cfg.data)
     tell(dataset.report)
     start = perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -84,6 +85,8 @@ def _run(
             bar.update(task, completed=generation, total=total, description=text)
 
         result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=show)
+    if dataset.vehicles:
+        result = _named(result, dataset.vehicles)
     seconds = perf_counter() - start
     save_config(cfg, folder)
     tell(result.report)
@@ -91,6 +94,12 @@ def _run(
     console.print(_summary(result.drivers))
     tell([f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
+
+
+def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
+    """Add the names that the data have for followers and leaders."""
+    names = {who: result.drivers[f"{who}_id"].map(vehicles) for who in ("follower", "leader")}
+    return replace(result, drivers=result.drivers.assign(**names))
 
 
 def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:
@@ -151,4 +160,4 @@ def _with_unit(column: str) -> str:
 def _spread(values: pd.Series) -> str:
     if values.nunique() == 1:
         return f"{values.iloc[0]:.2f} (all)"
-    return f"{values.mean():.2f} ± {values.std(ddof=0):.2f}"
+    return f"{values.mean():.2f} ± {values.std():.2f}"  # of a sample: n − 1

@@ -124,7 +124,10 @@ def extract(
         report.removed[name] = int((keep & ~passes).sum())
         keep &= passes
         if not keep.any():
-            raise DataError(f"no episode is left after the criterion {name!r}:\n{report}")
+            longest = f"the longest candidate lasts {FRAME * (lengths.max() - 1):.3g} s"
+            raise DataError(
+                f"no episode is left after the criterion {name!r}; {longest}:\n{report}"
+            )
     entry = np.flatnonzero(np.repeat(keep, lengths))
     report.kept, report.rows = int(keep.sum()), len(entry)
     number = np.repeat(np.arange(report.kept, dtype=np.int32), lengths[keep])

@@ -23,6 +23,7 @@ LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
 STANDING = 0.5  # both cars stand below it [m/s]
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
+Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
 # Column, words with a place for the number found, these numbers, the threshold's name and which
 # samples are outside of it; both are ``[rows]``.
 Fault = tuple[str, str, NDArray[np.float64], str, Mask]
@@ -58,7 +59,7 @@ class Plausible(Settings):
         self,
         table: pd.DataFrame,
         source: str,
-        place: Callable[[int, str], str],
+        place: Place,
         setting: str = "data.plausible",
         remedy: str = "",
     ) -> tuple[pd.DataFrame, list[str]]:
@@ -106,7 +107,7 @@ class Plausible(Settings):
         self,
         table: pd.DataFrame,
         starts: NDArray[np.intp],
-        place: Callable[[int, str], str],
+        place: Place,
         setting: str,
         remedy: str,
     ) -> tuple[Mask, list[str], str]:
@@ -125,7 +126,7 @@ class Plausible(Settings):
             more = remedy if name == "max_acceleration" else ""
             line = f"left out {int(new.sum()):,} implausible sample(s), the first: {said}"
             lines.append(f"{line}{more and '; to keep it'}{more}")
-            advice = advice or f"{said}; mend the file{more}, or raise that threshold"
+            advice = advice or f"{said}; mend the file or its units{more}, or raise that threshold"
             wrong |= new
         return wrong, lines, advice
 
@@ -256,7 +257,7 @@ def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     return table, [f"{count:,} speeds below 0, the least {least:.3g} m/s, count as 0"]
 
 
-def pair_place(episodes: pd.DataFrame) -> Callable[[int, str], str]:
+def pair_place(episodes: pd.DataFrame) -> Place:
     """Return what describes a sample of an episode table: recording, vehicle, time and column."""
 
     def place(row: int, column: str) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from glob import glob, has_magic
 from os.path import expanduser
 from pathlib import Path
@@ -13,10 +13,10 @@ import pandas as pd
 
 import lcc_rl.assets
 from lcc_rl.data.car_following import Criteria, extract
-from lcc_rl.data.episodes import DERIVED, FIELDS, derive_positions, load_episodes
+from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
-from lcc_rl.data.tables import TEXT_TAKES, check_map, file_size
+from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, pair_place
+from lcc_rl.data.tables import SI, TEXT_TAKES, Column, Names, check_map, file_size
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
@@ -32,10 +32,12 @@ class LoadedEpisodes:
     Args:
         episodes: the episode table, see :data:`lcc_rl.data.episodes.SCHEMA`.
         report: lines on what was read, dropped, filtered and kept.
+        vehicles: names of the numbered vehicles, where the file names them.
     """
 
     episodes: pd.DataFrame
     report: list[str]
+    vehicles: Mapping[int, str] = field(default_factory=dict)
 
     def load(self) -> LoadedEpisodes:
         """Return itself: a table at hand is a source, too."""
@@ -94,6 +96,8 @@ class EpisodesSource(Settings):
         episodes, notes = load_episodes(files, self.columns, self.units)
         count, source = episodes["episode"].nunique(), ", ".join(files)
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
+        named = {**{key: OWN[key] for key in self.units}, **self.columns}
+        source += read_as(FIELDS, named, self.units)
         return _plausible(self.plausible, episodes, source, lines)
 
 
@@ -102,6 +106,7 @@ def episodes_of(
     criteria: Criteria | None,
     plausible: Plausible | None,
     remedy: str = "",
+    place: Callable[[pd.DataFrame], Place] = pair_place,
 ) -> LoadedEpisodes:
     """Extract episodes; positions that no file gives are derived from speeds and gaps.
 
@@ -109,12 +114,12 @@ def episodes_of(
         trajectories: samples and report.
         criteria, plausible: None for the defaults.
         remedy: what a user may do about implausible accelerations.
+        place: makes of an episode table what describes its samples to the user.
 
     Raises:
         DataError: naming the files, if there is none, or too many are implausible.
     """
-    report = trajectories.report
-    source = ", ".join(report.files)
+    report, source = trajectories.report, trajectories.report.source
     try:
         episodes, extraction = extract(trajectories, criteria or Criteria())
     except DataError as error:
@@ -123,7 +128,23 @@ def episodes_of(
     if not trajectories.samples["position_m"].to_numpy().any():
         derive_positions(episodes)
         lines.append(DERIVED)
-    return _plausible(plausible, episodes, source, lines, remedy)
+    loaded = _plausible(plausible, episodes, source, lines, remedy, place)
+    return replace(loaded, vehicles=report.names)
+
+
+def read_as(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -> str:
+    """Return words on measured columns that a user names, and their units, for messages on both.
+
+    Args:
+        columns: those that there may be.
+        names: what the file calls them, by key.
+        units: their units by key; SI for those that are not named.
+    """
+    found = [x for x in columns if x.quantity in SI and names.get(x.key)]
+    if not found:
+        return ""
+    option = ", ".join(f"{x.key}: {units.get(x.key, SI[x.quantity])}" for x in found)
+    return f", with data.units={{{option}}} for {', '.join(repr(names[x.key]) for x in found)}"
 
 
 def _plausible(
@@ -132,10 +153,9 @@ def _plausible(
     source: str,
     lines: list[str],
     remedy: str = "",
+    place: Callable[[pd.DataFrame], Place] = pair_place,
 ) -> LoadedEpisodes:
-    kept, said = (limits or Plausible()).select(
-        episodes, source, pair_place(episodes), remedy=remedy
-    )
+    kept, said = (limits or Plausible()).select(episodes, source, place(episodes), remedy=remedy)
     return LoadedEpisodes(kept, [*lines, *said, medians(kept)])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -10,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
-from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
+from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, without_blank
+from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as
 from lcc_rl.data.tables import Column, TableFile, check_map, stem, whole_numbers
 from lcc_rl.data.trajectories import (
     FRAME,
@@ -19,6 +20,7 @@ from lcc_rl.data.trajectories import (
     ReadReport,
     Trajectories,
     find_leaders,
+    listed,
     step_of,
     stretches,
 )
@@ -37,6 +39,7 @@ FIELDS = (
     Column("recording", "text", required=False),
 )
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
+NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
 MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
 UNEVEN = 0.1  # of a step, by which a time may be off the common grid
 LAST = 2**31 - 1  # frame
@@ -89,13 +92,14 @@ class TableSource(Settings):
             DataError: naming the file, row and column, if a file is missing, damaged or holds what
                 it must not, no episode is left, or more are implausible than ``plausible`` allows.
         """
-        report = ReadReport(files=find_files(self.path))
-        trajectories = to_trajectories(*self._rows(report), report)
+        report = ReadReport(find_files(self.path), read_as(FIELDS, self.columns, self.units))
+        rows, recordings = self._rows(report)
+        trajectories = to_trajectories(rows, recordings, report)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
-        smooth = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
-        remedy = f", name its units (data.units){smooth}"
-        return episodes_of(trajectories, self.criteria, self.plausible, remedy)
+        remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
+        place = place_in(rows, recordings, report.names, self.columns)
+        return episodes_of(trajectories, self.criteria, self.plausible, remedy, place)
 
     def _rows(self, report: ReadReport) -> tuple[pd.DataFrame, list[str]]:
         """Rows of all files in SI, and the names of the recordings."""
@@ -105,6 +109,7 @@ class TableSource(Settings):
             part = table.read(FIELDS, self.columns, self.units, "data.columns")
             report.rows_read += len(part["time"])
             part, rows = without_blank(table, part, MEASURED)
+            _report_blank_gaps(table, part, rows)
             parts.append({"recording": np.full(len(rows), label), **part, "row": rows})
             report.notes += table.notes
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
@@ -122,6 +127,49 @@ class TableSource(Settings):
         return pd.DataFrame(columns), names.tolist()
 
 
+def place_in(
+    rows: pd.DataFrame,
+    recordings: Sequence[str],
+    vehicles: Mapping[int, str],
+    columns: Mapping[str, str | None],
+) -> Callable[[pd.DataFrame], Place]:
+    """Return what describes samples of episodes by the nearest rows of the table they are from.
+
+    Args:
+        rows: see :func:`to_trajectories`.
+        recordings: their names.
+        vehicles: their names, by number; without one, the number is the name.
+        columns: what the table calls its columns, by key.
+    """
+
+    def of(episodes: pd.DataFrame, sample: int, column: str) -> str:
+        entry = episodes.iloc[sample]
+        number = entry["leader_id" if column.startswith("leader") else "follower_id"]
+        name, recording = vehicles.get(number, number), entry["recording"]
+        own = rows[(rows.recording == recordings.index(recording)) & (rows.vehicle == number)]
+        row = own.row[(own.time - entry["time_s"]).abs().idxmin()]
+        key = next(key for key in ("speed", "length", "gap", "time") if key in column)
+        if key == "gap" and not columns.get(key):
+            key = "position"
+        place = f"recording {recording}, data row {row + 1}, vehicle {name}"
+        return f"{place}, column {(columns.get(key) or key)!r}"
+
+    return lambda episodes: partial(of, episodes)
+
+
+def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray], rows: Whole) -> None:
+    """Count samples that name a leader but have a blank gap, in the notes of the file."""
+    if "gap" not in read or "leader" not in read:
+        return
+    blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NOBODY)
+    if blank.any():
+        first = table.fault(int(rows[np.argmax(blank)]), "gap", "is blank")
+        table.notes.append(
+            f"{int(blank.sum()):,} samples with a leader but a blank gap follow nobody, the first: "
+            f"{first}"
+        )
+
+
 def labels(files: Sequence[str]) -> list[str]:
     """Return the names of files' recordings: without their folders, if that is enough."""
     stems = [stem(name) for name in files]
@@ -136,9 +184,11 @@ def _vehicles(
     numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
     if numbers is None or numbers.min() <= 0 or leaders is None:
         names, codes = np.unique(vehicle, return_inverse=True)
-        report.notes.append(f"vehicles are numbered from 1 in the order of {len(names):,} names")
+        report.names = dict(enumerate(names.tolist(), 1))
+        shown = listed(names.tolist())
+        report.notes.append(f"{len(names):,} vehicles are numbered from 1 by name: {shown}")
         numbers, known = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(ahead) + 1
-        none = (ahead == "") | (np.isin(ahead, ("0", "-1", "0.0", "-1.0")) & (known == 0))
+        none = np.isin(ahead, NOBODY) & (known == 0)
         # A leader without a row is a number that no vehicle has.
         leaders = np.where(none, 0, np.where(known == 0, len(names) + 1, known))
     if leader is None:
@@ -168,16 +218,16 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     steps = rows.time.diff().to_numpy()
     if not together.any():
         raise DataError(f"{files}: no vehicle has two samples; expected trajectories")
-    step = step_of(steps[together], files)
+    step = step_of(steps[together], report.source)
     short = together & (steps < step / 2)
     if short.any():
         row = int(np.argmax(short))
         raise DataError(
             f"{_place(rows, row, names, report)} is {steps[row]:g} s after the sample before it of "
-            f"vehicle {rows.vehicle[row]}; expected steps of about {step:g} s"
+            f"vehicle {_name(rows, row, report)}; expected steps of about {step:g} s"
         )
     first = ~together | (steps > HOLE * step)
-    _check_way(rows, first, files)
+    _check_way(rows, first, report.source)
     report.vehicles, report.segments = int((~together).sum()), int(first.sum())
     origin = rows.groupby("recording").time.min().reindex(range(len(names))).to_numpy()
     frames = (rows.time - origin[rows.recording]).to_numpy() / FRAME
@@ -206,7 +256,7 @@ def _sorted(rows: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
     return rows.iloc[order].reset_index(drop=True)
 
 
-def _check_way(rows: pd.DataFrame, first: NDArray[np.bool_], files: str) -> None:
+def _check_way(rows: pd.DataFrame, first: NDArray[np.bool_], source: str) -> None:
     """Check that positions and speeds tell of the same way: direction and units."""
     if "position" not in rows:
         return
@@ -217,7 +267,7 @@ def _check_way(rows: pd.DataFrame, first: NDArray[np.bool_], files: str) -> None
         return
     backward = "; positions must grow in the direction of travel" if way < 0 else ""
     raise DataError(
-        f"{files}: by their positions the vehicles drive {way:.4g} m, by their speeds "
+        f"{source}: by their positions the vehicles drive {way:.4g} m, by their speeds "
         f"{driven:.4g} m{backward}; check data.units and data.columns of time, speed and position"
     )
 
@@ -260,9 +310,14 @@ def _interpolated(
 
 
 def _place(rows: pd.DataFrame, row: int, names: list[str], report: ReadReport) -> str:
-    """Describe a row to the user."""
+    """Where a row is, for messages."""
     files, recording = ", ".join(report.files), names[rows.recording[row]]
     return f"{files}: recording {recording}, data row {rows.row[row] + 1}"
+
+
+def _name(rows: pd.DataFrame, row: int, report: ReadReport) -> str | int:
+    """The vehicle of a row, for messages."""
+    return report.names.get(rows.vehicle[row], rows.vehicle[row])
 
 
 def _once(rows: pd.DataFrame, names: list[str], report: ReadReport) -> pd.DataFrame:
@@ -277,7 +332,7 @@ def _once(rows: pd.DataFrame, names: list[str], report: ReadReport) -> pd.DataFr
         row = int(np.argmax(differ))
         raise DataError(
             f"{_place(rows, row, names, report)} and data row {rows.row[row - 1] + 1} differ, but "
-            f"are of one vehicle ({rows.vehicle[row]}) at one time ({rows.time[row]:g} s); "
+            f"are of one vehicle ({_name(rows, row, report)}) at one time ({rows.time[row]:g} s); "
             "expected one row"
         )
     report.drop(EXACT, int(again.sum()))

@@ -42,12 +42,13 @@ THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
-# Units by quantity, and their size in SI; the first is the SI unit.
+# Units by quantity, and their size; the first is the SI unit.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
     "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
 }
+SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
 Cells = Any  # a pyarrow array, chunked or not
 Names = Mapping[str, str | None]
 Fault = Callable[[int, str], DataError]  # the error for a row and words
@@ -77,7 +78,7 @@ class Column:
     @property
     def expected(self) -> str:
         """Words for messages."""
-        unit = f" {next(iter(UNITS[self.quantity]))}" if self.quantity in UNITS else ""
+        unit = f" {SI[self.quantity]}" if self.quantity in SI else ""
         kind = "a whole number" if self.whole else "a number"
         return f"{kind} from {self.least:g} to {self.most:g}{unit}"
 
@@ -130,6 +131,7 @@ class TableFile:
         self.path = Path(expanduser(path))
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
+        self.comma = False  # whether numbers have a decimal comma
         if not self.path.is_file():
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
         self.parquet = self.path.suffix in PARQUET
@@ -178,7 +180,8 @@ class TableFile:
                 def fault(row: int, words: str, key: str = column.key) -> DataError:
                     return self.fault(row, key, words)
 
-                read[column.key] = checked(cells[self.names[column.key]], column, fault, scale)
+                name = self.names[column.key]
+                read[column.key] = checked(cells[name], column, fault, scale, self.comma)
         return read
 
     def fault(self, row: int, key: str, words: str) -> DataError:
@@ -209,8 +212,8 @@ class TableFile:
         if self.separator != ",":
             words = f"columns are separated by {SEPARATORS[self.separator]}"
             self.notes.append(f"{self.path}: {words}")
-        if self.separator == ";" and b"," in self.rows and b"." not in self.rows:
-            self.rows = self.rows.replace(b",", b".")
+        self.comma = self.separator == ";" and b"," in self.rows and b"." not in self.rows
+        if self.comma:
             self.notes.append(f"{self.path}: numbers have a decimal comma")
 
     def _text_cells(self, names: list[str]) -> Mapping[str, pa.ChunkedArray]:
@@ -234,7 +237,9 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
 # -- cells -----------------------------------------------------------------------------------------
 
 
-def checked(cells: Cells, column: Column, fault: Fault, scale: float = 1.0) -> NDArray:
+def checked(
+    cells: Cells, column: Column, fault: Fault, scale: float = 1.0, comma: bool = False
+) -> NDArray:
     """Return the values of a column, checked.
 
     Args:
@@ -242,6 +247,7 @@ def checked(cells: Cells, column: Column, fault: Fault, scale: float = 1.0) -> N
         column: what they have to be.
         fault: makes the error.
         scale: factor to SI.
+        comma: whether numbers have a decimal comma.
 
     Raises:
         DataError: for the first cell at fault.
@@ -256,7 +262,7 @@ def checked(cells: Cells, column: Column, fault: Fault, scale: float = 1.0) -> N
         if not column.blank and (found == "").any():
             raise fault(int(np.argmax(found == "")), "is blank")
         return found
-    values = numbers_of(cells, fault)
+    values = numbers_of(cells, fault, comma)
     if scale != 1.0:
         values = values * scale
     least, most = (values.min(), values.max()) if len(values) else (column.least, column.most)
@@ -279,8 +285,8 @@ def _shown(cell: pa.Scalar) -> str:
     return "nothing" if value is None else repr(value)[:40]
 
 
-def numbers_of(cells: Cells, fault: Fault) -> NDArray[np.float64]:
-    """Return cells as numbers, NaN for blank ones; numbers may have thousands separators.
+def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.float64]:
+    """Return cells as numbers, NaN for blank ones; with decimal commas or thousands separators.
 
     Raises:
         DataError: for the first cell that is no number.
@@ -288,6 +294,9 @@ def numbers_of(cells: Cells, fault: Fault) -> NDArray[np.float64]:
     if pa.types.is_dictionary(cells.type):
         cells = pc.cast(cells, cells.type.value_type)
     if pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type):
+        given = cells
+        if comma:
+            cells = pc.replace_substring(cells, ",", ".")
         with suppress(pa.ArrowInvalid):
             return np.asarray(pc.cast(cells, pa.float64()), dtype=np.float64)
         cells = pc.utf8_trim_whitespace(cells)
@@ -298,7 +307,7 @@ def numbers_of(cells: Cells, fault: Fault) -> NDArray[np.float64]:
         sound = np.asarray(pc.fill_null(pc.match_substring_regex(cells, NUMBER), True))
         if not sound.all():
             row = int(np.argmin(sound))
-            raise fault(row, f"holds {_shown(cells[row])}; expected a number")
+            raise fault(row, f"holds {_shown(given[row])}; expected a number")
     elif not any(kind(cells.type) for kind in NUMERIC):
         raise fault(0, f"is of type {cells.type}; expected numbers")
     return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)
@@ -357,14 +366,16 @@ def parse_text(
         if not odd:
             reason = str(error).splitlines()[0]
             raise DataError(f"{source}: not a readable table: {reason}") from error
-        text = odd[0].text.encode()
-        row = next((n for n, x in enumerate(rows.split(b"\n")) if x.rstrip(b"\r") == text), 0)
+        text, held = odd[0].text.encode(), odd[0].actual_columns
+        lines = [line.rstrip(b"\r") for line in rows.rstrip(b"\r\n").split(b"\n")]
+        row = lines.index(text) if text in lines else 0
         place = f"line {row + first}" if first else f"data row {row + 1}"
-        held = odd[0].actual_columns
-        raise DataError(f"{source}: {place} has {held} columns; expected {width}") from error
+        last = row == len(lines) - 1 and held < width
+        place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
+        raise DataError(f"{source}: {place} has {held} columns; expected {width}{cut}") from error
     # An unclosed quote merges lines without an error.
-    lines = rows.count(b"\n") + (not rows.endswith(b"\n"))
-    if table.num_rows != lines and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):
+    count = rows.count(b"\n") + (not rows.endswith(b"\n"))
+    if table.num_rows != count and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):
         place = f", from line {first} on" if first else ""
         raise DataError(f"{source}: a quote is not closed, or a line end is stray{place}")
     return table

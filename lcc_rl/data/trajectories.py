@@ -23,11 +23,13 @@ class ReadReport:
 
     Args:
         files: the files, in the order they were read.
+        read_as: their columns and the units these were read in, where a user names them.
         rows_read: rows in the files; equals ``rows_kept`` plus every ``dropped``.
         rows_kept: rows in the result.
         dropped: rows dropped, by reason.
         recordings: rows kept, by recording.
         vehicles: vehicles, counted per recording.
+        names: those of numbered vehicles, by number, where the files name vehicles.
         segments: stretches without a missing frame.
         headways_given: space headways taken from the file.
         headways_derived: space headways derived from Preceding and Local_Y.
@@ -38,11 +40,13 @@ class ReadReport:
     """
 
     files: list[str] = field(default_factory=list)
+    read_as: str = ""
     rows_read: int = 0
     rows_kept: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
     recordings: dict[str, int] = field(default_factory=dict)
     vehicles: int = 0
+    names: dict[int, str] = field(default_factory=dict)
     segments: int = 0
     headways_given: int = 0
     headways_derived: int = 0
@@ -52,6 +56,11 @@ class ReadReport:
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
+
+    @property
+    def source(self) -> str:
+        """The files, and how they were read: the subject of messages in which units matter."""
+        return ", ".join(self.files) + self.read_as
 
     def drop(self, reason: str, count: int) -> None:
         """Count dropped rows by reason."""

@@ -148,7 +148,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
     step = _time_step(frame)
     frame, report = _above(frame, selection)
     frame["least_gap"] = frame.groupby("episode", sort=False)["gap_m"].transform("min")
-    frame = _truncate(frame, selection.max_duration_s)
+    frame, shortened = _truncate(frame, selection.max_duration_s)
     table = _summary(frame, step)
     table, lines = _select(table, selection)
     table = table.sort_values("samples", ascending=False, kind="stable")
@@ -165,7 +165,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
         samples=table["samples"].to_numpy(np.int64),
         identity=table[["episode", *IDENTITY]].reset_index(drop=True),
         time_step=step,
-        report=[*report, *lines],
+        report=[*report, *lines, *shortened],
     )
 
 
@@ -215,12 +215,17 @@ def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, lis
     return kept.reset_index(drop=True), [Concern(line)]
 
 
-def _truncate(frame: pd.DataFrame, duration: float | None) -> pd.DataFrame:
-    """Keep the first seconds of each episode."""
+def _truncate(frame: pd.DataFrame, duration: float | None) -> tuple[pd.DataFrame, list[str]]:
+    """The first seconds of each episode, and a line where that leaves samples out."""
     if duration is None:
-        return frame
+        return frame, []
     elapsed = frame["time_s"] - frame.groupby("episode", sort=False)["time_s"].transform("first")
-    return frame[elapsed <= duration + 1e-6].reset_index(drop=True)
+    kept = frame[elapsed <= duration + 1e-6].reset_index(drop=True)
+    line = (
+        f"fits the first {duration:g} s of each, {100 * len(kept) / len(frame):.0f} % of the "
+        "samples (calibration.selection.max_duration_s=null for all)"
+    )
+    return kept, [line] if len(kept) < len(frame) else []
 
 
 def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:

@@ -49,6 +49,7 @@ class DriverPopulation:
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
         models: the model of every driver; None: the IDM of all.
         reaction: delay and noise, which the drivers share.
+        mode: the calibration of which they are, ``local`` or ``global``, where known.
         own: further parameters by name, ``[drivers]``, where drivers have other models; NaN
             where a driver's model lacks one.
 
@@ -64,6 +65,7 @@ class DriverPopulation:
     models: tuple[str, ...] | None = None
     own: Mapping[str, Tensor] = field(default_factory=dict)
     reaction: Reaction = field(default_factory=Reaction)
+    mode: str | None = None
 
     def __post_init__(self) -> None:
         if not self.ids:
@@ -105,19 +107,21 @@ class DriverPopulation:
             self.models and tuple(self.models[place] for place in index.tolist()),
             {name: values[index] for name, values in self.own.items()},
             self.reaction,
+            self.mode,
         )
 
     def summary(self) -> dict[str, float]:
-        """Mean, standard deviation and correlation of (v0, T), and the share of v0 at a bound."""
+        """Means, standard deviations (n − 1) and correlation of (v0, T), and share at a bound."""
         speed = self.desired_speed.double().cpu().numpy()
         gap = self.time_gap.double().cpu().numpy()
-        spread = len(self) > 1 and speed.std() > 0.0 and gap.std() > 0.0
+        deviations = [float(pd.Series(x).std()) for x in (speed, gap)]  # NaN of a single driver
+        spread = min(deviations) > 0.0
         return {
             "drivers": float(len(self)),
             "desired_speed_mean_mps": float(speed.mean()),
-            "desired_speed_std_mps": float(speed.std()),
+            "desired_speed_std_mps": deviations[0],
             "time_gap_mean_s": float(gap.mean()),
-            "time_gap_std_s": float(gap.std()),
+            "time_gap_std_s": deviations[1],
             "correlation": float(np.corrcoef(speed, gap)[0, 1]) if spread else float("nan"),
             "share_at_bound": float(self.at_bound.double().mean()),
         }
@@ -159,7 +163,8 @@ def bootstrap(
     Raises:
         DataError: if the table is not sound.
     """
-    found = from_table(load_drivers(path, mode))
+    table = load_drivers(path, mode)
+    found = replace(from_table(table), mode=mode_of(table))
     given = {"delay": reaction_delay, "noise": acceleration_noise}
     changes = {name: value for name, value in given.items() if value is not None}
     found = replace(found, reaction=replace(found.reaction, **changes))
@@ -201,6 +206,11 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
         if name in further
     }
     return replace(found, models=tuple(models), own=more)
+
+
+def mode_of(table: pd.DataFrame) -> str | None:
+    """Return the calibration that the drivers of a table are of; None where it does not tell."""
+    return str(table["mode"].iloc[0]) if "mode" in table else None
 
 
 def _tensor(values: np.ndarray | pd.Series) -> Tensor:
@@ -264,7 +274,7 @@ def kde(
     for name, row in zip(names, draws, strict=True):
         drawn[COLUMNS[name]] = row.clip(*getattr(limits, name))
     found = from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
-    return replace(found, reaction=reaction_of(table, "driver table"))
+    return replace(found, reaction=reaction_of(table, "driver table"), mode=mode_of(table))
 
 
 @checked

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -136,7 +136,7 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
     """Build what ``leader`` describes; without it, the leaders of ``data`` divided by ``split``."""
     if cfg.leader is not None:
         return build(cfg.leader, "leader", ("load",))
-    loaded = _load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
+    loaded = load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
     split = build(cfg.split, "split", CALLED)
     # Every window is kept: the low-variation filter is for platoons, whose errors are relative.
     return TrajectoryLeaders(source=loaded, split=split, least_variation=0.0)
@@ -148,7 +148,9 @@ def described(population: Population, cfg: StudyConfig) -> str:
     leaders = cfg.leader if cfg.leader is not None and "source" not in cfg.leader else cfg.data
     whose = leaders.get("path") or "synthetic or shipped traffic"
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
-    who = f"{len(gap)} human drivers ({_origin(cfg.drivers)})"
+    mode = getattr(population, "mode", None)
+    taken = f", drivers.mode={mode}" if mode else ""
+    who = f"{len(gap)} human drivers ({_origin(cfg.drivers)}{taken})"
     line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or not (reaction.delay or reaction.noise):
@@ -174,18 +176,27 @@ def constant_profiles(
 
 # Of the sweep that this process works on: its runs mostly differ in other things than the data.
 _loaded: dict[str, LoadedEpisodes] = {}
+SHARED = "data: read once, by an earlier run of this process; the lines of that reading:"
 
 
-def _load_episodes(node: Mapping[str, Any]) -> LoadedEpisodes:
-    """Load episodes; the runs of a sweep that one process does share those of the same files."""
+def load_episodes(node: Mapping[str, Any]) -> LoadedEpisodes:
+    """Load episodes; the runs of a sweep that one process does share those of the same files.
+
+    Args:
+        node: the node ``data`` of a configuration.
+
+    Raises:
+        DataError, ConfigError: naming the file, row or option at fault.
+    """
     if not is_sweep():
         return build_source(node).load()
     key = json.dumps([node, list(_stamps(node))])
-    if key not in _loaded:
-        loaded = build_source(node).load()
-        _loaded.clear()
-        _loaded[key] = loaded
-    return _loaded[key]
+    if key in _loaded:
+        return replace(_loaded[key], report=[SHARED, *_loaded[key].report])
+    loaded = build_source(node).load()
+    _loaded.clear()
+    _loaded[key] = loaded
+    return loaded
 
 
 def _stamps(value: Any) -> Iterator[tuple[str, int, int]]:

@@ -42,6 +42,7 @@ def csv(frame: pd.DataFrame) -> str:
 
 
 TWICE = csv(pd.concat([pairs(), pairs().assign(gap_m=12.0)]))
+COMMAS = TABLE.to_csv(index=False, sep=";", decimal=",")
 # Reader, content of the file, what is said of it.
 BAD: list[tuple[str, str | bytes, str]] = [
     # Files that are no tables.
@@ -57,8 +58,12 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", b"id,t\r,v\n1,0,5\n", "empty, or names no columns"),
     ("record", "", "not a readable table"),
     # Columns and rows that are missing or twice.
-    ("ngsim", GOOD + "7,21,20,1113", "line 42 has 4 columns; expected 18"),
-    ("ngsim", native_text(pair()) + " 7 21 5\n", "line 41 has 3 columns; expected 18"),
+    (
+        "ngsim",
+        GOOD + "7,21,20,1113",
+        "line 42, the last, has 4 columns; expected 18; is the file cut",
+    ),
+    ("ngsim", native_text(pair()) + " 7 21 5\n", "line 41, the last, has 3 columns"),
     ("ngsim", native_text([row[:17] for row in pair()]), "has 17 columns and no header"),
     ("ngsim", GOOD.replace("v_Vel", "v_Velo"), "lacks the column v_Vel; .*'v_Velo'"),
     ("ngsim", GOOD.replace("v_Width", "V LENGTH"), "has column 'v_Length' twice"),
@@ -66,7 +71,8 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("i-80", portal_text(pair(), "us-101"), r"'i-80'; .*found are us-101 \(40 rows\)"),
     ("table", csv(TABLE.rename(columns={"v": "V"})), r"lacks the column v; .*is it 'V'.*columns="),
     ("table", csv(pd.concat([TABLE, TABLE["v"]], axis=1)), "has column 'v' twice"),
-    ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n", "data row 1 has 5 columns; expected 6"),
+    ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n", "data row 1, the last, has 5 columns"),
+    ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n1,1,1,0,2,3\n", "row 1 has 5 columns; expected 6$"),
     ("table", csv(TABLE.iloc[:0]), "has a header but no rows"),
     ("episodes", csv(pairs().drop(columns="gap_m")), "lacks the column gap_m.*data.columns="),
     ("openacc", openacc_text().replace("IVS", "gap"), "lacks IVS1, IVS2"),
@@ -85,6 +91,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("ngsim", ngsim(Lane_ID="70000"), "line 4, column 'Lane_ID' holds '70000'"),
     ("ngsim", ngsim(v_Vel="x").replace("\n", "\n\n"), "line 7, column 'v_Vel' holds 'x'"),
     ("table", table(v="fast"), "data row 501, column 'v' holds 'fast'; expected a number"),
+    ("table", COMMAS.replace(";11,", ";1l,", 1), "column 'v' holds '1l,"),
     ("table", csv(TABLE.assign(v="")), "data row 1, column 'v' is blank"),
     ("table", table(v=1e20), r"data row 501, column 'v' holds '1e\+20'"),
     ("table", table(gap="-inf"), "data row 501, column 'gap' holds '-inf'"),

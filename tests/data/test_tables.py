@@ -14,6 +14,7 @@ from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.episodes import SCHEMA, read_episodes, validate_episodes, write_episodes
 from lcc_rl.data.openacc import OpenAccSource
+from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
 from lcc_rl.data.table_source import TableSource
@@ -87,6 +88,56 @@ def test_separators_and_decimal_commas(tmp_path, separator, decimal) -> None:
     truth(loaded)
     assert any("columns are separated by" in line for line in loaded.report)
     assert any("decimal comma" in line for line in loaded.report) == (decimal == ",")
+
+
+NAMES = {0: "0", 1: "Audi, A8", 2: "BMW", 3: "Ford"}
+
+
+def named() -> pd.DataFrame:
+    """The table with names of vehicles, in km/h and feet."""
+    frame = long_table(rows=800).replace({"id": NAMES, "ahead": NAMES})
+    return frame.assign(v=3.6 * frame["v"], gap=frame["gap"] / FOOT)
+
+
+def test_names_keep_their_commas_and_number_the_vehicles(tmp_path) -> None:
+    path = written(tmp_path, named(), sep=";", decimal=",")
+    loaded = TableSource(path=path, columns=BY_GAP, units={"speed": "km/h", "gap": "ft"}).load()
+    truth(loaded)
+    assert loaded.vehicles == {1: "Audi, A8", 2: "BMW", 3: "Ford"}
+    assert "3 vehicles are numbered from 1 by name: Audi, A8, BMW, Ford" in loaded.report
+
+
+@pytest.mark.parametrize(
+    ("units", "change", "words"),
+    [
+        ({"gap": "ft"}, {"v": 80.0}, "row 801, vehicle BMW, column 'v' holds 80 m/s"),
+        ({"gap": "ft"}, {}, "speed: m/s, gap: ft} for 't', 'v', 'gap': gaps change by 0"),
+        ({"speed": "km/h"}, {}, "speed: km/h, gap: m} for 't', 'v', 'gap': .*change by 3"),
+        ({"time": "ms"}, {}, "{time: ms, speed: m/s, gap: m} for .*longest .* lasts 0 s"),
+        ({}, {"t": 0.0}, r"and data row 1 differ, but are of one vehicle \(Audi, A8\)"),
+        ({}, {"t": 1e3}, "{time: s, speed: m/s, gap: m} for .* are 100 s apart"),
+    ],
+)
+def test_errors_name_columns_units_and_vehicles(tmp_path, units, change, words) -> None:
+    frame = named()
+    for name, value in change.items():
+        frame[name] = value if name == "v" else value * frame[name]
+    with pytest.raises(DataError, match=rf"my\.csv.*{words}"):
+        TableSource(path=written(tmp_path, frame), columns=BY_GAP, units=units).load()
+
+
+def test_samples_left_out_are_described_by_their_rows(tmp_path) -> None:
+    frame = named().sample(frac=1.0, random_state=0)  # in any order
+    frame.iloc[700, frame.columns.get_loc("v")] = 3.6 * 90.0
+    frame.iloc[[800, 900], frame.columns.get_loc("gap")] = np.nan
+    frame.iloc[[800, 900], frame.columns.get_loc("ahead")] = ["BMW", "0"]
+    path, units = written(tmp_path, frame), {"speed": "km/h", "gap": "ft"}
+    source = TableSource(path=path, columns=BY_GAP, units=units, plausible=Plausible(max_share=0.5))
+    report = "\n".join(source.load().report)
+    vehicle = frame["id"].iloc[700]
+    assert f"data row 701, vehicle {vehicle}, column 'v' holds 90 m/s" in report
+    blank = f"the first: {path}: data row 801, column 'gap' is blank"
+    assert f"1 samples with a leader but a blank gap follow nobody, {blank}" in report
 
 
 @pytest.mark.parametrize("step", [0.04, 1.0])

@@ -9,10 +9,12 @@ import torch
 from commands import run_command
 from helpers import slow_but
 from rich.console import Console
+from table_text import long_table
 
 from lcc_rl.commands import calibration
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs.inputs import SHARED
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
@@ -105,3 +107,26 @@ def test_command_writes_into_the_run_folder(source, command):
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
     assert "v0 on a bound" in done.stdout
+    sweep = [*own[:3], "hydra.sweep.dir=there", "-m", "seed=0,1"]
+    assert command(*sweep, *quick, check=True).stdout.count(SHARED) == 1  # by the second run
+
+
+def test_drivers_keep_the_names_of_the_data(cfg, tmp_path):
+    names = {0: "", 1: "Audi", 2: "BMW", 3: "Ford"}
+    table = long_table().replace({"id": names, "ahead": names})
+    table.to_csv(tmp_path / "named.csv", index=False)
+    columns = "{vehicle: id, time: t, speed: v, leader: ahead, gap: gap}"
+    path = f"data.path={tmp_path / 'named.csv'}"
+    named = load("calibrate", ["data=table", path, f"data.columns={columns}"])
+    cfg.data = named.data
+    calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
+    drivers = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
+    pairs = drivers.groupby("mode")[["follower", "leader"]].agg(list)
+    assert pairs["follower"].tolist() == [["BMW", "Ford"]] * 2
+    assert pairs["leader"].tolist() == [["Audi", "BMW"]] * 2
+    assert len(bootstrap(tmp_path / "run" / "drivers.parquet")) == 2
+
+
+def test_spreads_are_those_of_a_sample():
+    assert calibration._spread(pd.Series([0.0, 2.0])) == "1.00 ± 1.41"  # n − 1
+    assert calibration._spread(pd.Series([2.0, 2.0])) == "2.00 (all)"

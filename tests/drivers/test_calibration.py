@@ -210,6 +210,9 @@ def test_unfit_episodes_are_dropped_and_counted(make_episodes):
     counted = [line for line in result.report if line.startswith("1 of 6 episodes dropped: ")]
     assert len(counted) == 5
     cut = observe(episodes, Selection(max_duration_s=15.0))
+    assert cut.report[-1].startswith("fits the first 15 s of each, 80 % of the samples (cal")
+    whole = observe(episodes, Selection(max_duration_s=None))
+    assert not any("fits the first" in line for line in whole.report)
     assert dict(zip(cut.identity["episode"], cut.samples, strict=True)) == {0: 151, 1: 150}
     assert cut.gap[1] == episodes["gap_m"][at[1][51]]
     assert "1 of 6 episodes cut where the gap is below 1 m" in cut.report[0]

@@ -217,7 +217,8 @@ def own_drivers() -> DriverPopulation:
 @pytest.mark.parametrize(
     ("words", "origin"),
     [
-        ("drivers=i80", "fitted to NGSIM I-80, shipped"),
+        ("drivers=i80", "fitted to NGSIM I-80, shipped, drivers.mode=local"),
+        ("drivers=kde", "fitted to NGSIM I-80, shipped, drivers.mode=local"),
         ("drivers=fixed", "fixed"),
         (f"drivers._target_={__name__}.own_drivers", "own_drivers"),
     ],

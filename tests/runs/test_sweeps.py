@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from lcc_rl import results
 from lcc_rl.commands import training
 from lcc_rl.config import load
+from lcc_rl.envs import inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.states import claim
 from lcc_rl.runs.sweeps import run_name
@@ -55,8 +56,10 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
 
 
 def test_a_sweep_is_read_as_one_table(tmp_path) -> None:
+    inputs._loaded.clear()  # what other sweeps of this process have read
     words = [*TINY, "variant=alcc", "seed=0,1", "sweep=mine"]
-    run_command("lcc_rl.cli.train", "-m", *words, cwd=tmp_path, check=True)
+    done = run_command("lcc_rl.cli.train", "-m", *words, cwd=tmp_path, check=True)
+    assert done.stdout.count(inputs.SHARED) == 1  # by the second run
     folder = tmp_path / "outputs" / "train" / "mine"
     frame = results.load(folder, settings=["seed", "agent.gamma", "reward.*"])
     assert frame.groupby("seed")["run"].nunique().tolist() == [1, 1]
