@@ -38,7 +38,7 @@ from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.episodes import any_leader
-from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy
+from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, baseline, trained
 from lcc_rl.functional.pattern import HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
@@ -107,8 +107,7 @@ def scored(who: str, trust: Sequence[str] = ()) -> Scored:
     if is_policy(who):
         return Scored(who, who, load_policy(who, trust=trust))
     controller_of(who)
-    # The name of a file never stands for a rule of that name.
-    return Scored(Path(who).name if who.endswith((*YAML, ONNX)) else who, who, None)
+    return Scored(label_of(who), who, None)
 
 
 def roads(

@@ -86,8 +86,8 @@ def _speeds(axis: Axes, profile: Profiles) -> np.ndarray:
 def _in_record(profile: Profiles) -> str:
     """Return a profile's record, and where in it the profile begins."""
     record, _, start = profile.names[0].partition("@")
-    name = in_words(record).upper()
-    return name if start == "0s" else f"{name} from {in_words(start)} on"
+    name = record.replace("_", " ").upper()
+    return name if start == "0s" else f"{name} from {start.removesuffix('s')} s on"
 
 
 @paper

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -20,7 +19,17 @@ from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
 from lcc_rl.results.units import burns_one_fuel, per_distance
 
 HUMAN, NETWORK = "human", "alcc"
-WHO = {
+# Who learns, or has several gains: further words of a name, if any, say which.
+SEVERAL = {
+    "reference": "network, for itself",
+    "own_energy": "network, for itself, weighted",
+    NETWORK: "network, for all",
+    "rule": "IDM, tuned on these data",
+    "cacc": "CACC",
+    "ddpg": "DDPG",
+    "hcfs": "HCFS",
+}
+WHO = SEVERAL | {
     "idm": "one driver (IDM)",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
@@ -31,15 +40,11 @@ WHO = {
     "mpc_far": "MPC, longer gaps",
     "acc tuned": "ACC, tuned on I-80",
     "idm tuned": "IDM, tuned on I-80",
-    "rule": "IDM, tuned on these data",
-    "reference": "network, for itself",
-    "own_energy": "network, for itself, weighted",
-    NETWORK: "network, for all",
     "follower_stopper": "FollowerStopper",
     "pi_saturation": "PI with saturation",
-    "cacc": "CACC",
-    "ddpg": "DDPG",
-    "hcfs": "HCFS",
+    "fvdm": "FVDM",
+    "gipps": "Gipps",
+    "ovm": "OVM",
     "direct": "no automated car",
 }
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
@@ -73,18 +78,20 @@ COLUMNS = (
 
 
 def in_words(name: str) -> str:
-    """Return a strategy's name, or another one, as it stands in tables, figures and pages.
+    """Return a strategy's name as it stands in tables, figures and pages.
+
+    A name that is not of this package, such as that of a user's file, stays as it is.
 
     Examples:
-        >>> in_words("alcc"), in_words("alcc ddpg"), in_words("preview_10s")
-        ('network, for all', 'network, for all (ddpg)', 'preview 10 s')
+        >>> in_words("alcc"), in_words("alcc ddpg"), in_words("my_idm_1.1")
+        ('network, for all', 'network, for all (ddpg)', 'my_idm_1.1')
     """
     if name.endswith(FILTERED) and name not in WHO:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"
     first, _, rest = name.partition(" ")
-    if name in WHO or first in WHO:
-        return WHO.get(name) or f"{WHO[first]} ({rest.replace('_', ' ')})"
-    return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
+    if name not in WHO and first in SEVERAL:
+        return f"{SEVERAL[first]} ({rest.replace('_', ' ')})"
+    return WHO.get(name, name)
 
 
 def worded(table: pd.DataFrame) -> pd.DataFrame:

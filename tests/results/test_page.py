@@ -135,7 +135,8 @@ def test_names_are_words_in_tables_and_figures() -> None:
         "alcc": "network, for all",
         "alcc analytic": "network, for all (analytic)",
         "idm tuned": "IDM, tuned on I-80",
-        "my_pid_filtered": "my pid, filtered",
+        "my_pid_filtered": "my_pid, filtered",
+        "idm 1.1": "idm 1.1",
     }
     assert {name: in_words(name) for name in words} == words
 

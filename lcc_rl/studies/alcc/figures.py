@@ -215,7 +215,7 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
         grid(axis, "x")
         style(axis, label)
         axis.tick_params(axis="y", length=0)
-    rows_of(axes[0], list(map(str, names)))
+    rows_of(axes[0], [str(name).replace("_", " ") for name in names])
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
     seeds = _how_many(table["seeds"])
