@@ -18,8 +18,8 @@ from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import NonNegative, Whole

@@ -39,6 +39,7 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results import headline, scores, string_tables
 from lcc_rl.results.headline import show
+from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
@@ -310,7 +311,7 @@ def _play_missing(
         there = len(counts) - len(missing)
         log.info("%s: %d of %d blocks are there already", strategy.name, there, len(counts))
     where = folder if len(plan.own) > 1 else None
-    title = f"evaluate {strategy.name} ({place + 1} of {len(store.marks)})"
+    title = f"evaluate {in_words(strategy.name)} ({place + 1} of {len(store.marks)})"
     with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
         for block in missing:
             store.put(place, block, player.play(block))

@@ -19,7 +19,7 @@ from lcc_rl.errors import ConfigError, require, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
-from lcc_rl.results.headline import FILTERED
+from lcc_rl.results.names import FILTERED
 from lcc_rl.results.policies import PRETRAINED
 
 PLACE = f"controller@{AUTO}"

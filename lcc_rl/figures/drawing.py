@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
 COLUMN, PAGE = 3.5, 7.2  # widths of one column of a journal, and of two [in]

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.figures.drawing import INK, PAGE, legend_above, new_figure, paper, style, unbox
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 
 SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
 HYBRIDS = ("hcfs", "hcfs oracle")

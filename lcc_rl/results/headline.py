@@ -6,50 +6,22 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import pandas as pd
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from lcc_rl.energy import Fleet
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.intervals import LEAST_DRIVES
+from lcc_rl.results.names import HUMAN, NETWORK, in_words
 from lcc_rl.results.savings import KEYS
 from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
 from lcc_rl.results.units import burns_one_fuel, per_distance
+from lcc_rl.runs.output import PLAIN
 
-HUMAN, NETWORK = "human", "alcc"
-# Who learns, or has several gains: further words of a name, if any, say which.
-SEVERAL = {
-    "reference": "network, for itself",
-    "own_energy": "network, for itself, weighted",
-    NETWORK: "network, for all",
-    "rule": "IDM, tuned on these data",
-    "cacc": "CACC",
-    "ddpg": "DDPG",
-    "hcfs": "HCFS",
-}
-WHO = SEVERAL | {
-    "idm": "one driver (IDM)",
-    HUMAN: "simulated drivers",
-    "recorded": "the recorded drivers",
-    "constant_filtered": "safety filter alone",
-    "idm_acc": "tuned IDM",
-    "acc": "tuned ACC",
-    "mpc": "MPC",
-    "mpc_far": "MPC, longer gaps",
-    "acc tuned": "ACC, tuned on I-80",
-    "idm tuned": "IDM, tuned on I-80",
-    "follower_stopper": "FollowerStopper",
-    "pi_saturation": "PI with saturation",
-    "fvdm": "FVDM",
-    "gipps": "Gipps",
-    "ovm": "OVM",
-    "direct": "no automated car",
-}
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
 RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
-FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
 FEW, WIDEST = 5, 10_000  # windows; characters
 CAPTION = (
     "energy per vehicle and km, without what motion stores; {}shares of the time: "
@@ -75,29 +47,6 @@ COLUMNS = (
     Shown("long_time_gap_pct", "long\ngap\n[%]"),
     Shown("collisions", "colli-\nsions"),
 )
-
-
-def in_words(name: str) -> str:
-    """Return a strategy's name as it stands in tables, figures and pages.
-
-    A name that is not of this package, such as that of a user's file, stays as it is.
-
-    Examples:
-        >>> in_words("alcc"), in_words("alcc ddpg"), in_words("my_idm_1.1")
-        ('network, for all', 'network, for all (ddpg)', 'my_idm_1.1')
-    """
-    if name.endswith(FILTERED) and name not in WHO:
-        return f"{in_words(name.removesuffix(FILTERED))}, filtered"
-    first, _, rest = name.partition(" ")
-    if name not in WHO and first in SEVERAL:
-        return f"{SEVERAL[first]} ({rest.replace('_', ' ')})"
-    return WHO.get(name, name)
-
-
-def worded(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with the names of strategies, where it has any, in words."""
-    names = [name for name in ("strategy", "behind", "against") if name in table]
-    return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
 
 
 def baseline_of(strategies: Iterable[object]) -> str | None:
@@ -167,8 +116,8 @@ def verdict(found: pd.DataFrame) -> str:
         return ""
     windows = rows[NETWORK]["windows"]
     if windows < FEW:
-        both = (f"{rows[name][PER_KM]:.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
-        return f"Per vehicle and km: {', '.join(both)}; {windows} window(s) allow no finding."
+        both = (f"{rows[name][PER_KM]:,.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
+        return f"Per vehicle and km: {', '.join(both)}; {counted(windows)} allow no finding."
     key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"
     saved, low, high = (100.0 * rows[NETWORK][f"{key}{end}"] for end in ("", "_low", "_high"))
     less = "less"
@@ -181,6 +130,11 @@ def verdict(found: pd.DataFrame) -> str:
         f"{high:.1f}) {less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
         f"the time against {theirs:.2f} %."
     )
+
+
+def counted(windows: int) -> str:
+    """Return a number of windows in words."""
+    return f"{windows} window{'s' * (windows != 1)}"
 
 
 def sample_of(episodes: pd.DataFrame) -> str:
@@ -204,7 +158,7 @@ def few_windows(episodes: int, steps: float) -> str:
     if episodes >= FEW:
         return ""
     return (
-        f"{episodes} window(s) of {steps:g} s: these numbers show that everything runs, and mean "
+        f"{counted(episodes)} of {steps:g} s: these numbers show that everything runs, and mean "
         "nothing else"
     )
 
@@ -223,9 +177,7 @@ def as_rich(
     drawn = Table(
         title=escape(title),
         caption=escape(caption),
-        box=box.SIMPLE_HEAD,
-        padding=0,
-        show_edge=False,
+        **PLAIN,
     )
     shown = [column for column in shown or table.attrs["shown"] if column.key in table]
     for place, column in enumerate(shown):
@@ -267,8 +219,8 @@ def in_full(found: pd.DataFrame, title: str) -> Table:
     return strategies_side_by_side(found, ROWS, title, caption)
 
 
-def show(table: Table) -> None:
-    """Print a table, as wide as the terminal or, without one, as its content."""
+def show(table: Table | Text) -> None:
+    """Print a table or a text, as wide as the terminal or, without one, as its content."""
     console = Console()
     if not console.is_terminal:
         wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width

@@ -14,8 +14,8 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import in_words
 from lcc_rl.results.means import WINDOWS, Means
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, EPISODES
 from lcc_rl.results.savings import LEADER
 from lcc_rl.results.tables import leader_too_fast
