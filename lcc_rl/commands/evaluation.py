@@ -240,7 +240,7 @@ def evaluate_and_write(
     folder: Path,
     quiet: bool = False,
 ) -> Rows:
-    """Evaluate strategies on the held-out profiles, write the rows and print the summary.
+    """Evaluate strategies on the held-out windows, write the rows and print the summary.
 
     Of an evaluation of several blocks each block is written when it is played, and those that
     the folder has are not played again.
@@ -379,7 +379,7 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = one.of
         if one.of in counts:
             of = [x for x in (cfg.task and str(cfg.task["name"]), one.of) if x]
-            held = f"{counts[one.of]} held-out profile{'s' * (counts[one.of] > 1)}"
+            held = f"{counts[one.of]} held-out window{'s' * (counts[one.of] > 1)}"
             size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
         show(one.drawn(title, cfg.table == "all"))

@@ -119,7 +119,7 @@ ROWS = (
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
     ("windows", "windows", "{:d}"),
-    ("drives or recordings", "drives", "{:d}"),
+    ("drives", "drives", "{:d}"),
     ("training seeds", "seeds", "{:d}"),
     ("episodes", "episodes", "{:d}"),
 )

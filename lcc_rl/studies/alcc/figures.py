@@ -101,7 +101,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
 def distributions(drivers: pd.DataFrame) -> Figure:
     """Path energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
 
-    A driver's value is its mean over the held-out profiles and seeds. Boxes span the quartiles,
+    A driver's value is its mean over the held-out windows and seeds. Boxes span the quartiles,
     whiskers the 5th to 95th percentile; a diamond marks the mean.
     """
     names = list(dict.fromkeys(drivers["strategy"]))
@@ -137,7 +137,7 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
 def generalization_figure(
     windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> Figure:
-    """Path energy of both vehicles on every held-out profile, and its saving (Fig. 12)."""
+    """Path energy of both vehicles on every held-out window, and its saving (Fig. 12)."""
     table = generalization(windows, strategy, baseline).sort_values("path_saving_pct")
     figure = new_figure(PAGE, 4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
@@ -156,7 +156,7 @@ def generalization_figure(
     below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
     below.set_xticks([])
-    words = f"held-out profiles, sorted by the saving (n = {len(table)}); right: the paper's"
+    words = f"held-out windows, sorted by the saving (n = {len(table)}); right: the paper's"
     style(below, words, f"saved by {in_words(strategy)}\nagainst {in_words(baseline)} [%]")
     legend_above(below, 2)
     return figure

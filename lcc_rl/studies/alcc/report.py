@@ -172,9 +172,9 @@ def _generalization(page: Page, windows: pd.DataFrame) -> None:
     caption = "Saving of alcc against reference over profiles, beside the paper's 4"
     shown = [
         ("generalization_row", caption, paper_tables.generalization_row(windows)),
-        ("generalization", "Every held-out profile", paper_tables.generalization(windows)),
+        ("generalization", "Every held-out window", paper_tables.generalization(windows)),
     ]
-    caption = "Counterpart of Fig. 12: energies and saving on every held-out profile."
+    caption = "Counterpart of Fig. 12: energies and saving on every held-out window."
     figure = figures.generalization_figure(windows)
     page.add("Generalization", text, shown, [("generalization", caption, figure)])
 
