@@ -49,9 +49,8 @@ from lcc_rl.results.policies import load_policy, policy_file
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.results.scores import scores
 from lcc_rl.runs.arguments import Arguments
+from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
-
-log = logging.getLogger("lcc_rl")
 
 # Where leaders come from, and human drivers who keep up with them.
 SOURCES: dict[str, tuple[str, ...]] = {
@@ -204,7 +203,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     document = {**about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
-    log.info("scores in %s", folder / FILE)
+    tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for name in own:
         require(name in played, f"--source {name} could not be played: {'; '.join(left_out)}")
@@ -255,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options, further = parser.parse_known_args(arguments)
     check_overrides(further, GIVEN, "each task has its own; --task and --source choose")
-    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    logging.basicConfig(level=HEADLINE, format="%(message)s")  # no detail of every task
     document = run(options, further)
     show(as_rich(document["name"], document["results"]))
     for line in document["left_out"]:

@@ -236,7 +236,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
 def _sorted_bars(axis: Axes, saving: pd.Series, hue: str) -> None:
     """Draw one bar per driver, sorted; below zero means worse off."""
     ordered = 100 * np.sort(saving.to_numpy())
-    axis.bar(np.arange(len(ordered)), ordered, width=1.0, color=hue, alpha=0.8)
+    axis.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=hue, alpha=0.8)
     axis.axhline(0.0, color=INK, lw=0.6)
     axis.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
 

@@ -152,7 +152,7 @@ def generalization_figure(
     below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
     below.axhline(0.0, color=INK, lw=0.8)
     together = 100 * savings(windows, "total_path_energy_kj", strategy, baseline).value
-    line = f"all profiles together {signed(together)} %"
+    line = f"all windows together {signed(together)} %"
     below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
     below.set_xticks([])
