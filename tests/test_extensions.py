@@ -62,7 +62,7 @@ def test_models_and_controllers_serve_every_strategy(tmp_path) -> None:
     assert plain.loc[plain["strategy"] == "idm", "cav_energy_kj"].notna().all()
     assert double["min_ttc_s"].equals(plain["min_ttc_s"])
     # A controller of one's own stands beside the baselines, which it does not change.
-    assert list(own["strategy"].unique()) == [*UNTRAINED, "keepdistance"]
+    assert list(own["strategy"].unique()) == [*UNTRAINED, "KeepDistance"]
     one, two = (rows[rows["strategy"] == "idm"].reset_index(drop=True) for rows in (own, plain))
     assert one[two.columns].equals(two)
 

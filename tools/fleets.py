@@ -43,12 +43,12 @@ SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean sp
 HUMAN, RULE = "human", "idm_acc"
 FRONTS = "fleets_fronts.parquet"
 SETTINGS = {  # of what is kept for fronts, for readers
-    "front": "I-24, windows of 100 s",
+    "front": "I-24, 100 s",
     "free": "free driving, 100 s",
-    "long": "I-24, windows of 400 s",
-    "long_taught": "I-24, windows of 400 s, trained so",
-    "true": "true drivers behind I-24, 100 s",
-    "true_taught": "true drivers behind I-24, 100 s, trained among them",
+    "long": "I-24, 400 s",
+    "long_taught": "I-24, 400 s, trained so",
+    "true": "true drivers, I-24, 100 s",
+    "true_taught": "true drivers, trained among them",
 }
 TAUGHT = ", trained "  # what makes a setting one whose fleets learned in it
 SHOWN_AS = {

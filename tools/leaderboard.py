@@ -36,7 +36,8 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces import Controller
 from lcc_rl.results.board import as_markdown
 from lcc_rl.results.cells import signed
-from lcc_rl.results.headline import in_words, saved
+from lcc_rl.results.headline import saved
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import load_config
 from lcc_rl.results.scores import LEAST, SHARE, Task, keeps, limited, scores
 

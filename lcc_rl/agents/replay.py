@@ -57,7 +57,8 @@ class Trainer(TrainingLoop[OffPolicy]):
         policy = TensorDictSequential(shared_policy(self.agent.policy), self.exploration)
         frames = steps * self.env.batch_size.numel()
         if self.settings.collector == "torchrl":
-            return Collector(self.env, policy, frames_per_batch=frames, total_frames=-1)
+            how = {"total_frames": -1, "auto_register_policy_transforms": False}
+            return Collector(self.env, policy, frames_per_batch=frames, **how)
         keys = (*LEARNED_FROM, *REPORTED)
         return StringCollector(
             self.env, policy, frames_per_batch=frames, keys=keys, compiled=compiled

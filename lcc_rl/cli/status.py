@@ -11,7 +11,7 @@ from rich.console import Console
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.arguments import Arguments
-from lcc_rl.runs.overview import counts, draw, headline, live, note, progress
+from lcc_rl.runs.overview import counts, draw, headline, left, live, progress
 from lcc_rl.runs.states import clean, survey
 from lcc_rl.runs.sweeps import read_plan
 
@@ -23,7 +23,7 @@ def show(root: Path, console: Console) -> None:
         console.print(draw(root, states, planned))
         return
     for state in states:
-        line = f"{state.state:<9}{progress(state):>12}  {state.name}  {note(state)}"
+        line = f"{state.state:<9}{progress(state):>12}  {state.name}  {left(state) or state.error}"
         console.print(line.rstrip(), markup=False, soft_wrap=True)
     console.print(headline(root, states, planned), markup=False, soft_wrap=True)
 

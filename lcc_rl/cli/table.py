@@ -18,7 +18,8 @@ from lcc_rl.api import Run
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.io.files import as_rows, read_parquet
 from lcc_rl.results.cells import as_latex, as_markdown
-from lcc_rl.results.headline import for_print, worded
+from lcc_rl.results.headline import for_print
+from lcc_rl.results.names import worded
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, reading
 from lcc_rl.runs.arguments import Arguments
 

@@ -1,4 +1,4 @@
-"""Entry point: train a variant and evaluate it on held-out profiles, ``lcc-rl train``."""
+"""Entry point: train a variant and evaluate it on held-out windows, ``lcc-rl train``."""
 
 from __future__ import annotations
 

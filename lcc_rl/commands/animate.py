@@ -18,8 +18,8 @@ from lcc_rl.figures.animation import FORMS, animate, check_ending
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import NonNegative, Whole
@@ -39,8 +39,9 @@ def run(
 
     Args:
         folder: of an evaluation, a training or a main job.
-        strategies: who drives, each a name of the table, or ``"<name>: <words for the reader>"``;
-            none for the last one of the table. An ``.svg`` shows several beside each other.
+        strategies: who drives, each a name of the table or of its rows, or
+            ``"<name>: <words for the reader>"``; none for the last one of the table. An ``.svg``
+            shows several beside each other.
         episode: which of their sample episodes, from 0.
         out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
             run's folder ``figures``.
@@ -64,9 +65,11 @@ def run(
     with reading(folder):
         known = list(dict.fromkeys(map(str, steps["strategy"])))
         named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
-        for strategy, words in named:
-            if strategy not in known:
-                raise unknown_name("strategy", strategy, known)
+        stored = {in_words(name): name for name in known} | {name: name for name in known}
+        for given, words in named:
+            if given not in stored:
+                raise unknown_name("strategy", given, known)
+            strategy = stored[given]
             label, rows = _episode(steps, strategy, episode)
             scenario = stored_config(folder)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)

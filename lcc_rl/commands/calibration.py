@@ -28,6 +28,7 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.cells import MISSING
 from lcc_rl.results.runs import check_folder, save_config
+from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import claim
 
@@ -126,7 +127,7 @@ def _say(console: Console, lines: Sequence[str]) -> None:
 def _summary(drivers: pd.DataFrame) -> Table:
     """Mean and spread of the error and the parameters, by mode."""
     modes = list(drivers["mode"].unique())
-    table = Table("", *modes, title="calibrated drivers, mean ± standard deviation")
+    table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
     table.add_row("drivers", *(str(len(part)) for part in parts.values()))
     errors = [(column, column, label) for column, label in ERRORS]

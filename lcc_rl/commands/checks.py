@@ -47,7 +47,8 @@ OBJECTIVES = {
     # Of the table of windows; it has no energies, the default is read as the first.
     "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
 }
-MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": ("communication",)}
+MESSAGES = "communication"  # the piece by which connected vehicles hear of each other
+MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
 MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
 RECORD = 4096  # bytes of an iteration's row in the record
 
@@ -145,11 +146,21 @@ def build_logger(cfg: TrainConfig) -> Any:
 
 
 def check_variant(cfg: StudyConfig) -> None:
-    """Refuse a learner under the name of a variant that learns nothing, and the reverse."""
+    """Refuse a variant that the scenario does not fit.
+
+    A learner does not go under the name of a variant that learns nothing, or the reverse, and
+    connected vehicles need messages.
+    """
     try:
         own = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a variant of the user's own, known to this command line only
         return
+    talks, heard = (MESSAGES in part.scenario.pieces for part in (own, cfg))
+    if talks and not heard:
+        raise ConfigError(
+            f"variant={cfg.variant} is of connected vehicles, and scenario {cfg.scenario.name} has "
+            "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
+        )
     if learns(cfg) and not learns(own):  # it has no automated vehicle, and the task has
         raise ConfigError(f"variant={cfg.variant} learns nothing: use compare=[{cfg.variant}]")
     if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):

@@ -40,6 +40,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results import headline, scores, string_tables
 from lcc_rl.results.headline import show
+from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
@@ -240,7 +241,7 @@ def evaluate_and_write(
     folder: Path,
     quiet: bool = False,
 ) -> Rows:
-    """Evaluate strategies on the held-out profiles, write the rows and print the summary.
+    """Evaluate strategies on the held-out windows, write the rows and print the summary.
 
     Of an evaluation of several blocks each block is written when it is played, and those that
     the folder has are not played again.
@@ -311,7 +312,7 @@ def _play_missing(
         there = len(counts) - len(missing)
         log.info("%s: %d of %d blocks are there already", strategy.name, there, len(counts))
     where = folder if len(plan.own) > 1 else None
-    title = f"evaluate {strategy.name} ({place + 1} of {len(store.marks)})"
+    title = f"evaluate {in_words(strategy.name)} ({place + 1} of {len(store.marks)})"
     with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
         for block in missing:
             store.put(place, block, player.play(block))
@@ -380,7 +381,7 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = one.of
         if one.of in counts:
             of = [x for x in (cfg.task and str(cfg.task["name"]), one.of) if x]
-            held = f"{counts[one.of]} held-out profile{'s' * (counts[one.of] > 1)}"
+            held = f"{counts[one.of]} held-out window{'s' * (counts[one.of] > 1)}"
             size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
         show(one.drawn(title, cfg.table == "all"))

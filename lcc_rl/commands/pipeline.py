@@ -16,6 +16,7 @@ from typing import Any
 
 import pandas as pd
 from rich.console import Console
+from rich.text import Text
 
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
@@ -159,7 +160,7 @@ def _run(
         page = write_page(folder, [command], found, words, (size, table))
         title = f"Leader, car, human behind it: {size}"
         show(as_rich(table, title, caption_of(table, limit)))
-        tell(verdict(found))
+        show(Text(verdict(found)))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

@@ -38,7 +38,7 @@ from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.episodes import any_leader
-from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy
+from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, baseline, trained
 from lcc_rl.functional.pattern import HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
@@ -49,9 +49,8 @@ from lcc_rl.results.policies import load_policy, policy_file
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.results.scores import scores
 from lcc_rl.runs.arguments import Arguments
+from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
-
-log = logging.getLogger("lcc_rl")
 
 # Where leaders come from, and human drivers who keep up with them.
 SOURCES: dict[str, tuple[str, ...]] = {
@@ -107,8 +106,7 @@ def scored(who: str, trust: Sequence[str] = ()) -> Scored:
     if is_policy(who):
         return Scored(who, who, load_policy(who, trust=trust))
     controller_of(who)
-    # The name of a file never stands for a rule of that name.
-    return Scored(Path(who).name if who.endswith((*YAML, ONNX)) else who, who, None)
+    return Scored(label_of(who), who, None)
 
 
 def roads(
@@ -205,7 +203,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     document = {**about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
-    log.info("scores in %s", folder / FILE)
+    tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for name in own:
         require(name in played, f"--source {name} could not be played: {'; '.join(left_out)}")
@@ -256,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options, further = parser.parse_known_args(arguments)
     check_overrides(further, GIVEN, "each task has its own; --task and --source choose")
-    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    logging.basicConfig(level=HEADLINE, format="%(message)s")  # no detail of every task
     document = run(options, further)
     show(as_rich(document["name"], document["results"]))
     for line in document["left_out"]:

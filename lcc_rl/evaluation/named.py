@@ -13,13 +13,13 @@ from typing import Any
 from hydra.core.global_hydra import GlobalHydra
 
 from lcc_rl.config import choices, load, own_file
-from lcc_rl.config.nodes import TARGET, build, find_target, short_name
+from lcc_rl.config.nodes import TARGET, build, find_target
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.errors import ConfigError, require, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
-from lcc_rl.results.headline import FILTERED
+from lcc_rl.results.names import FILTERED
 from lcc_rl.results.policies import PRETRAINED
 
 PLACE = f"controller@{AUTO}"
@@ -94,14 +94,16 @@ def controller_of(who: Any, behind: bool = False) -> Any:
 
 
 def label_of(who: Any) -> str:
-    """Return what tables call a controller: its name, or that of its file, class or function."""
+    """Return what tables call a controller: its name, or that of its file, class or function.
+
+    A file whose name is one of the package's keeps its ending: ``idm_acc.yaml``.
+    """
     if isinstance(who, Mapping):
-        return short_name(who.get("law") or who.get(TARGET))
-    if who in rules() or who in choices("variant"):
-        return str(who)
-    if who.endswith(ONNX):
-        return Path(who).name
-    return Path(who).stem if who.endswith(YAML) else short_name(who)
+        who = str(who.get("law") or who.get(TARGET))
+    known, file = {*rules(), *choices("variant")}, Path(who)
+    if file.suffix in (*YAML, ONNX):
+        return file.name if file.stem in known else file.stem
+    return who if who in known else str(who).rpartition(".")[2]
 
 
 def _words(who: str, behind: bool) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ from lcc_rl.evaluation.named import (
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.headline import FILTERED
+from lcc_rl.results.names import FILTERED
 
 log = logging.getLogger("lcc_rl")
 

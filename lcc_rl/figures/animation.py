@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image  # comes with matplotlib
 
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.figures.drawing import INK, new_figure, style
+from lcc_rl.figures.drawing import INK, legend_above, new_figure, style
 from lcc_rl.figures.ring_picture import ring_picture
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
@@ -114,6 +114,9 @@ def frames(motion: Motion, title: str) -> Iterator[Figure]:
     figure.suptitle(f"{title}\n{faster:.1f} × as fast" if faster > 1.05 else title, fontsize=10)
     _lines(speeds, motion, motion.speed, "speed [m/s]", motion.leader)
     _lines(gaps, motion, motion.gap, "gap ahead [m]", None)
+    for line in legend_above(speeds).get_lines():
+        line.set(linewidth=1.4, alpha=1.0)
+    gaps.set_xlabel("time [s]")
     cursors = [axis.axvline(motion.time[0], color="#b00020", lw=0.8) for axis in (speeds, gaps)]
     cars = LineCollection([], linewidths=9.0, capstyle="butt")
     road.add_collection(cars)
@@ -136,6 +139,8 @@ def _hues(motion: Motion) -> list[str]:
 
 def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Series | None) -> None:
     """Draw an entry of all vehicles over time, automated ones above all others."""
+    if leader is not None:
+        axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
     named = set()
     for vehicle, (role, hue) in enumerate(zip(motion.roles, _hues(motion), strict=True)):
         bold = role == AUTOMATED or len(motion.roles) <= FEW
@@ -143,11 +148,9 @@ def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Serie
         name = None if hue in named else NAMES[role == AUTOMATED]
         named.add(hue)
         axis.plot(motion.time, values[:, vehicle], color=hue, label=name, **look)
-    if leader is not None:
-        axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
-        axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+    axis.set_xlim(motion.time[0], motion.time[-1])
     axis.set_ylim(0.0, 1.05 * max(float(values.max()), 1.0))
-    style(axis, "time [s]", label)
+    style(axis, "", label)
 
 
 def _along(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:
@@ -159,7 +162,8 @@ def _along(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> Non
     axis.set_xlim(front - longest - 2 * motion.length, front + motion.length)
     axis.set_ylim(-1.0, 1.0)
     axis.set_yticks([])
-    axis.set_xlabel("position [m]", fontsize=9)
+    axis.spines[["left", "right", "top"]].set_visible(False)
+    axis.set_xlabel("position [m]")
 
 
 def _around(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:

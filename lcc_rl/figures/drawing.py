@@ -14,9 +14,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
 COLUMN, PAGE = 3.5, 7.2  # widths of one column of a journal, and of two [in]
@@ -88,9 +89,9 @@ def footnote(figure: Figure, text: str) -> None:
     figure.supxlabel(text, fontsize=7, color=INK)
 
 
-def legend_above(axis: Axes, columns: int = 3) -> None:
+def legend_above(axis: Axes, columns: int = 3) -> Legend:
     """Put the legend above the frame, where it covers no data."""
-    axis.legend(
+    return axis.legend(
         frameon=False,
         ncols=columns,
         loc="lower left",

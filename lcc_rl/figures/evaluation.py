@@ -32,9 +32,9 @@ from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import column_cells, signed
-from lcc_rl.results.headline import in_words
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver
 
@@ -236,7 +236,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
 def _sorted_bars(axis: Axes, saving: pd.Series, hue: str) -> None:
     """Draw one bar per driver, sorted; below zero means worse off."""
     ordered = 100 * np.sort(saving.to_numpy())
-    axis.bar(np.arange(len(ordered)), ordered, width=1.0, color=hue, alpha=0.8)
+    axis.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=hue, alpha=0.8)
     axis.axhline(0.0, color=INK, lw=0.6)
     axis.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
 

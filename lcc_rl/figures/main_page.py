@@ -11,7 +11,8 @@ from lcc_rl.agents.limits import RECORDED
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
-from lcc_rl.results.headline import AGAINST, for_print, in_words
+from lcc_rl.results.headline import AGAINST, for_print
+from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import UNTRAINED
 from lcc_rl.results.tables import ROWS
 

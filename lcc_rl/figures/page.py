@@ -23,7 +23,7 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import PROCESSOR, parquet_metadata, write_parquet
 from lcc_rl.results.cells import as_markdown, columns
-from lcc_rl.results.headline import worded
+from lcc_rl.results.names import worded
 
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.figures.drawing import INK, PAGE, legend_above, new_figure, paper, style, unbox
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 
 SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
 HYBRIDS = ("hcfs", "hcfs oracle")
@@ -86,8 +86,8 @@ def _speeds(axis: Axes, profile: Profiles) -> np.ndarray:
 def _in_record(profile: Profiles) -> str:
     """Return a profile's record, and where in it the profile begins."""
     record, _, start = profile.names[0].partition("@")
-    name = in_words(record).upper()
-    return name if start == "0s" else f"{name} from {in_words(start)} on"
+    name = record.replace("_", " ").upper()
+    return name if start == "0s" else f"{name} from {start.removesuffix('s')} s on"
 
 
 @paper

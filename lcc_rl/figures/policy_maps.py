@@ -14,8 +14,8 @@ from scipy.spatial import ConvexHull, QhullError
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import INK, footnote, legend_above, new_figure, paper, unbox
 from lcc_rl.figures.platoon import PARENTS, WHO_DRIVES
-from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import motion_of, sample_episodes, visited
+from lcc_rl.results.names import in_words
 
 NEAR = 1.0  # of a map's speed: what an outline shows [m/s]
 NOTE = f"black line: no acceleration; dashed: what the sample episodes visit within {NEAR:g} m/s"

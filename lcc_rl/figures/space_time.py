@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import COLUMN, PAGE, new_figure, paper, unbox
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.results.headline import in_words
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.names import in_words
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
 EVERY = 5  # steps between the points of a line

@@ -12,8 +12,9 @@ from rich.table import Table
 from lcc_rl.errors import require
 from lcc_rl.results import headline
 from lcc_rl.results.cells import signed
-from lcc_rl.results.headline import Shown, in_words, saved
+from lcc_rl.results.headline import Shown, saved
 from lcc_rl.results.intervals import LEAST_DRIVES
+from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import DRIVE
 from lcc_rl.results.scores import PER_DISTANCE, Task, keeps, limited
 
@@ -28,6 +29,7 @@ COLUMNS = (
     Shown("drives", "dri-\nves"),
     Shown("kept", "limits\nkept"),
 )
+HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "limits not kept"]
 SHARE = ("saving", "saving_low", "saving_high")
 COPIED = ("score", *SHARE, "distance_lost", "flow_vph", "string_ratio", "final_speed_spread_mps")
 
@@ -108,7 +110,7 @@ def _cells(row: Row) -> dict[str, str]:
 
 
 def as_markdown(documents: Sequence[Mapping[str, Any]]) -> str:
-    """Return a Markdown table for each task: who was scored, and what was saved on each source.
+    """Return a Markdown table for each task: on each source, who was scored and what was saved.
 
     Args:
         documents: contents of the files of ``lcc-rl score``.
@@ -122,15 +124,11 @@ def as_markdown(documents: Sequence[Mapping[str, Any]]) -> str:
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
         sources = list(dict.fromkeys(row["source"] for row in rows))
-        head = [
-            "",
-            *(f"{x}, {next(_sample(r) for r in rows if r['source'] == x)}" for x in sources),
+        lines = [
+            [f"{row['source']}, {_sample(row)}", f"`{row['who']}`", *_markdown(row)]
+            for row in sorted(rows, key=lambda x: sources.index(x["source"]))
         ]
-        lines = [head, ["---"] * len(head)]
-        for who in dict.fromkeys(row["who"] for row in rows):
-            own = {row["source"]: row for row in rows if row["who"] == who}
-            cells = (_markdown_cell(own[x]) if x in own else "" for x in sources)
-            lines.append([f"`{who}`", *cells])
+        lines = [HEAD, ["---"] * len(HEAD), *lines]
         text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         parts.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
     return "\n".join(parts)
@@ -161,13 +159,11 @@ def _sample(row: Row) -> str:
     )
 
 
-def _markdown_cell(row: Row) -> str:
-    """Return saving, flow, and either that all limits are kept, in bold, or which is not."""
+def _markdown(row: Row) -> list[str]:
+    """Return saving, flow, and the limits that are not kept; the saving in bold where all are."""
     cells = _cells(row)
-    share = f"{cells['saved']} %" if cells["saved"] != headline.MISSING else "baseline"
-    missed = cells["kept"].replace("\n", " ")
-    share = f"**{share}**" if row["kept"] else f"{share}, not kept: {missed}"
-    return f"{share}; {cells['flow']}/h"
+    share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
+    return [share, cells["flow"], ", ".join(broken(row))]
 
 
 def broken(row: Row) -> list[str]:

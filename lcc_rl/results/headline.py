@@ -2,51 +2,27 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import pandas as pd
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import unknown_name
 from lcc_rl.results.cells import MISSING, column_cells
 from lcc_rl.results.intervals import LEAST_DRIVES
+from lcc_rl.results.names import HUMAN, NETWORK, in_words
 from lcc_rl.results.savings import KEYS
 from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
 from lcc_rl.results.units import burns_one_fuel, per_distance
+from lcc_rl.runs.output import PLAIN
 
-HUMAN, NETWORK = "human", "alcc"
-WHO = {
-    "idm": "one driver (IDM)",
-    HUMAN: "simulated drivers",
-    "recorded": "the recorded drivers",
-    "constant_filtered": "safety filter alone",
-    "idm_acc": "tuned IDM",
-    "acc": "tuned ACC",
-    "mpc": "MPC",
-    "mpc_far": "MPC, longer gaps",
-    "acc tuned": "ACC, tuned on I-80",
-    "idm tuned": "IDM, tuned on I-80",
-    "rule": "IDM, tuned on these data",
-    "reference": "network, for itself",
-    "own_energy": "network, for itself, weighted",
-    NETWORK: "network, for all",
-    "follower_stopper": "FollowerStopper",
-    "pi_saturation": "PI with saturation",
-    "cacc": "CACC",
-    "ddpg": "DDPG",
-    "hcfs": "HCFS",
-    "constant": "constant speed",
-    "direct": "no automated car",
-}
 AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
 RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
-FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
 FEW, SHORT, WIDEST = 5, 150.0, 10_000  # windows; seconds of them; characters
 CAPTION = (
     "Energy per vehicle and km, without what motion stores; {}shares of the time: "
@@ -75,27 +51,6 @@ COLUMNS = (
 )
 
 
-def in_words(name: str) -> str:
-    """Return a strategy's name, or another one, as it stands in tables, figures and pages.
-
-    Examples:
-        >>> in_words("alcc"), in_words("alcc ddpg"), in_words("preview_10s")
-        ('network, for all', 'network, for all (ddpg)', 'preview 10 s')
-    """
-    if name.endswith(FILTERED) and name not in WHO:
-        return f"{in_words(name.removesuffix(FILTERED))}, filtered"
-    first, _, rest = name.partition(" ")
-    if name in WHO or first in WHO:
-        return WHO.get(name) or f"{WHO[first]} ({rest.replace('_', ' ')})"
-    return re.sub(r"(?<=\d)s\b", " s", name.replace("_", " "))
-
-
-def worded(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with the names of strategies, where it has any, in words."""
-    names = [name for name in ("strategy", "behind", "against") if name in table]
-    return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
-
-
 def baseline_of(strategies: Iterable[object]) -> str | None:
     """Return the strategy that tables and figures compare with; None without one."""
     known = set(strategies)
@@ -114,7 +69,7 @@ def resampled(found: pd.DataFrame) -> str:
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
     if drives < min(LEAST_DRIVES, windows):
-        over += f" (too narrow: windows of {drives} recording{'s' * (drives > 1)} are alike)"
+        over += f" (too narrow: windows of {drives} drive{'s' * (drives > 1)} are alike)"
     return over
 
 
@@ -167,8 +122,8 @@ def verdict(found: pd.DataFrame) -> str:
         return ""
     windows = rows[NETWORK]["windows"]
     if windows < FEW:
-        both = (f"{rows[name][PER_KM]:.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
-        return f"Per vehicle and km: {', '.join(both)}; {windows} window(s) allow no finding."
+        both = (f"{rows[name][PER_KM]:,.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
+        return f"Per vehicle and km: {', '.join(both)}; {counted(windows)} allow no finding."
     key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"
     saved, low, high = (100.0 * rows[NETWORK][f"{key}{end}"] for end in ("", "_low", "_high"))
     less = "less"
@@ -181,6 +136,11 @@ def verdict(found: pd.DataFrame) -> str:
         f"{high:.1f}) {less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
         f"the time against {theirs:.2f} %."
     )
+
+
+def counted(windows: int) -> str:
+    """Return a number of windows in words."""
+    return f"{windows} window{'s' * (windows != 1)}"
 
 
 def sample_of(episodes: pd.DataFrame) -> str:
@@ -203,8 +163,7 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
     """
     if windows >= FEW or windows * (seconds or 0.0) >= SHORT:
         return ""
-    found = f"{windows} window{'s' * (windows > 1)}"
-    found += f" of {seconds:g} s" if seconds else ""
+    found = counted(windows) + (f" of {seconds:g} s" if seconds else "")
     return f"{found}: these numbers show that everything runs, and mean nothing else"
 
 
@@ -222,9 +181,7 @@ def as_rich(
     drawn = Table(
         title=escape(title),
         caption=escape(caption),
-        box=box.SIMPLE_HEAD,
-        padding=0,
-        show_edge=False,
+        **PLAIN,
     )
     shown = [column for column in shown or table.attrs["shown"] if column.key in table]
     for place, column in enumerate(shown):
@@ -279,8 +236,8 @@ def in_full(found: pd.DataFrame, title: str) -> Table:
     return strategies_side_by_side(found, ROWS, title, caption)
 
 
-def show(table: Table) -> None:
-    """Print a table, as wide as the terminal or, without one, as its content."""
+def show(table: Table | Text) -> None:
+    """Print a table or a text, as wide as the terminal or, without one, as its content."""
     console = Console()
     if not console.is_terminal:
         wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width

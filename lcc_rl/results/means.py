@@ -83,7 +83,7 @@ class Means:
     def size(self) -> str:
         """Return the number of windows and drivers, in words."""
         windows = self.windows["profile_id"].nunique()
-        return f"{windows} held-out profiles × {self.drivers['driver_id'].nunique()} drivers"
+        return f"{windows} held-out windows × {self.drivers['driver_id'].nunique()} drivers"
 
 
 def _per_km(table: pd.DataFrame) -> pd.DataFrame:

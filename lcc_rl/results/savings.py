@@ -25,7 +25,7 @@ WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
 # and with it what ending slower saves; and as drawn (A2).
 KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
 LEADER = ("leader_path_energy_kj", "leader_speed_mps")
-DRIVE = "drive"  # what a row's window is cut from: a drive or a recording
+DRIVE = "drive"  # what a row's window is cut from; windows of one are alike
 SOURCE = "source"  # of a row's leader, if a mixture has several
 TERCILES = ("lower", "middle", "upper")
 

@@ -12,7 +12,8 @@ from rich.table import Table
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.results.cells import heading
-from lcc_rl.results.headline import COLUMNS, Shown, in_words, resampled
+from lcc_rl.results.headline import COLUMNS, Shown, resampled
+from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import DRIVE, NOTHING, WAYS, savings
 from lcc_rl.results.tables import strategies_side_by_side
 from lcc_rl.results.units import check_unit, per_distance
@@ -200,7 +201,7 @@ def in_full(table: pd.DataFrame, title: str, task: Task) -> Table:
     limits = sorted(task.limits, key=lambda column: column.startswith(SHARE))
     rows = (
         (task.label, "score", "{:.2f}"),
-        (f"saved against {task.against}", "saving", "{:+.2%}"),
+        (f"saved against {in_words(task.against)}", "saving", "{:+.2%}"),
         ("  95 % interval, low", "saving_low", "{:+.2%}"),
         ("    high", "saving_high", "{:+.2%}"),
         ("distance lost", "distance_lost", "{:+.2%}"),

@@ -8,7 +8,8 @@ from rich.table import Table
 
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import intervals
-from lcc_rl.results.headline import Shown, in_words
+from lcc_rl.results.headline import Shown
+from lcc_rl.results.names import in_words
 from lcc_rl.results.tables import strategies_side_by_side
 
 COUNTS = ("switches", "clamps", "cap_interventions")

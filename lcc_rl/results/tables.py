@@ -10,8 +10,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.io.files import Rows
+from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import BASELINES, DRIVE, NOTHING, WAYS, Windows
 from lcc_rl.results.totals import Totals, frames
+from lcc_rl.runs.output import PLAIN
 
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 PER_KM = "path_energy_kj_per_km"  # and vehicle; who falls back gains nothing by it
@@ -90,7 +92,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
 def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
     name = f"saving_vs_{baseline}"
     return (
-        (f"path energy per km saved against {baseline}", f"km_{name}", "{:+.1%}"),
+        (f"path energy per km saved against {in_words(baseline)}", f"km_{name}", "{:+.1%}"),
         ("  95 % interval, low", f"km_{name}_low", "{:+.1%}"),
         ("    high", f"km_{name}_high", "{:+.1%}"),
         ("  as drawn, per episode", name, "{:+.1%}"),
@@ -118,7 +120,7 @@ ROWS = (
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
     ("windows", "windows", "{:d}"),
-    ("drives or recordings", "drives", "{:d}"),
+    ("drives", "drives", "{:d}"),
     ("training seeds", "seeds", "{:d}"),
     ("episodes", "episodes", "{:d}"),
 )
@@ -170,10 +172,11 @@ def strategies_side_by_side(
         title: above the table.
         caption: below it.
     """
-    drawn = Table(title=escape(title), caption=caption)
+    drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
     drawn.add_column("")
     for strategy in table["strategy"]:
-        drawn.add_column(str(strategy), justify="right")
+        name = escape(in_words(str(strategy)))
+        drawn.add_column(name, justify="right", max_width=len("automated"), overflow="fold")
     for label, key, form in rows:
         if table[key].notna().any():
             known = np.isfinite(table[key].astype(float))

@@ -10,9 +10,15 @@ from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdo
 from io import TextIOWrapper
 from typing import Any, cast
 
+from rich import box
+
 # Between INFO, the details, and WARNING: what somebody who waits wants to know.
 HEADLINE = 25
 logging.addLevelName(HEADLINE, "NOTE")
+
+# Looks of every table on the terminal, which has room for 80 characters.
+PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False}
+PLAIN |= {"caption_justify": "left"}
 
 log = logging.getLogger("lcc_rl")
 

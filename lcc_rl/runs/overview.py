@@ -10,6 +10,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.progress import clock
 from lcc_rl.runs.states import STATES, RunState, survey
 
@@ -49,11 +50,11 @@ def headline(root: Path, states: Sequence[RunState], planned: int) -> str:
     return f"{root}: {max(planned, len(states))} runs: {', '.join(parts) or 'none'}{eta}"
 
 
-def note(state: RunState) -> str:
-    """Return the remaining time or the error of a run."""
-    if state.state == "running" and state.total and state.eta_s is not None:
-        return f"ETA {clock(state.eta_s)}" if state.done < state.total else "evaluating"
-    return state.error
+def left(state: RunState) -> str:
+    """Return the remaining time of a run, as far as it is known."""
+    if state.state != "running" or not state.total or state.eta_s is None:
+        return ""
+    return f"ETA {clock(state.eta_s)}" if state.done < state.total else "evaluating"
 
 
 def progress(state: RunState) -> str:
@@ -71,11 +72,16 @@ def draw(root: Path, states: Sequence[RunState], planned: int, most: int | None 
         most: number of rows; running and failed runs come first. None for all.
     """
     shown = sorted(states, key=lambda state: URGENCY.index(state.state)) if most else states
-    table = Table("run", "state", "iteration", "")
+    table = Table(**PLAIN)
+    table.add_column("run", overflow="fold")
+    for heading in ("state", "iteration", "left"):
+        table.add_column(heading)
     for state in shown[:most]:
         colour = COLOURS[state.state]
         kind = f"[{colour}]{state.state}[/]"
-        table.add_row(escape(state.name), kind, progress(state), escape(note(state)))
+        # An error below the name, where it has room.
+        name = f"{state.name}\n  {state.error}" if state.error else state.name
+        table.add_row(escape(name), kind, progress(state), left(state))
     if most and len(shown) > most:
         table.add_row(f"… {len(shown) - most} more")
     return Group(table, escape(headline(root, states, planned)))

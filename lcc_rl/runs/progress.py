@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def bar(console: Console, shown: bool) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
+        TextColumn("{task.fields[note]}"),
         TimeElapsedColumn(),
         console=console,
         disable=not shown,
@@ -68,13 +69,16 @@ class ProgressReporter:
         self.title, self.total, self.unit, self.start = title, total, unit, start
         self.folder, self.every = folder, every
         self.console = console or Console(stderr=True)
-        self.live = self.console.is_terminal and not is_sweep()
+        # A training of the main job has the bar that its parent draws.
+        alone = not is_sweep() and parent_process() is None
+        self.live = self.console.is_terminal and alone
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
         self.begun = self.last_line = time.monotonic()
         self.marks: list[tuple[float, int]] = []  # when how many units were done
         self.bar = bar(self.console, self.live)
-        self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note="")
+        note = f"{start}/{total}"
+        self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note=note)
 
     def __enter__(self) -> ProgressReporter:
         self.bar.start()
@@ -88,14 +92,16 @@ class ProgressReporter:
         rate = self._rate(done)
         remaining = (self.total - done) / rate if rate > 0 else 0.0
         values = dict(values or {})
-        note = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
-        note = f"{note}  {rate:.2f} {self.unit}s/s  ETA {clock(remaining)}"
-        self.bar.update(self.task, completed=done, note=note)
+        shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
+        eta = f"ETA {clock(remaining)}"
+        # The bar has room for no rate: lines of 80 characters.
+        self.bar.update(self.task, completed=done, note=f"{done}/{self.total}  {shown}  {eta}")
         if len(self.marks) < 2 and done < self.total:
             return  # the first one compiles and fills buffers: it tells nothing of the others
         self._write_state(done, remaining, values)
         if time.monotonic() - self.last_line >= self.every or done >= self.total:
             self.last_line = time.monotonic()
+            note = f"{shown}  {rate:.2f} {self.unit}s/s  {eta}"
             self._line(f"{self.title}: {self.unit} {done}/{self.total}  {note}")
 
     def _rate(self, done: int) -> float:
@@ -140,7 +146,9 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
     futures = [future for _, future in jobs.values()]
     with bar(console, console.is_terminal) as shown:
         tasks = {name: shown.add_task(name, total=None, note="starting") for name in jobs}
-        while wait(futures, 1.0, FIRST_EXCEPTION).not_done:
+        running = True
+        while running:
+            running = bool(wait(futures, 1.0, FIRST_EXCEPTION).not_done)
             due = not console.is_terminal and time.monotonic() - last >= every
             last = time.monotonic() if due else last
             told = []
@@ -148,10 +156,13 @@ def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> 
                 state = read_progress(folder)
                 if state is None:
                     continue
-                note = f"reward {state.get('reward', 0.0):.4g}  ETA {clock(state['eta_s'])}"
-                shown.update(tasks[name], completed=state["done"], total=state["total"], note=note)
+                reward = f"reward {state.get('reward', 0.0):.4g}  ETA {clock(state['eta_s'])}"
+                done, total = state["done"], state["total"]
+                count = f"{done}/{total}"
+                note = f"{count}  {reward}"
+                shown.update(tasks[name], completed=int(done), total=total, note=note)
                 if not future.done():
-                    told.append(f"{name} {state['done']}/{state['total']}, {note}")
+                    told.append(f"{name} {count}, {reward}")
             if due and told:
                 tell("; ".join(told))
             if any(future.done() and future.exception() for future in futures):

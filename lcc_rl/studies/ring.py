@@ -16,7 +16,7 @@ from lcc_rl.config import load
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS, stored_config
 from lcc_rl.studies.runner import note, read_notes
 

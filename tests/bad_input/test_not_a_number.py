@@ -75,7 +75,7 @@ FILTER = ("+filter=cbf",)
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (CONTROL, "strategy nancontrol: command.automated is nan at step 4"),
+        (CONTROL, "strategy NanControl: command.automated is nan at step 4"),
         (DRIVER, "strategy direct: command.human is nan at step 4"),
         (POWER, "strategy direct: vehicles.power is -?inf at step 1"),
     ],

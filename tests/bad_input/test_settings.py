@@ -62,6 +62,8 @@ WRONG = {
     "scenario.string='automated bus'": "role 'bus', but .* only automated, human",
     "scenario.string='automated (human*2'": "never closed at character 11",
     "scenario.string={size: 10, penetration: 0}": "nobody is automated",
+    "variant=hcfs task=i80-follow": "hcfs is of connected vehicles.* task=platoon-us06",
+    "variant=cacc task=i80-follow": "cacc is of connected vehicles.* task=platoon-us06",
     "~scenario.pieces.ttc": "'ttc'.*, which the evaluation measures",
     "~scenario.pieces.predicted_power": r"reads human\.predicted_power, which no piece",
     # sizes that no machine has

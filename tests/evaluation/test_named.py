@@ -14,7 +14,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.errors import LccError
-from lcc_rl.evaluation.named import controller_of
+from lcc_rl.evaluation.named import controller_of, label_of
 from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
@@ -57,6 +57,23 @@ def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, mo
     assert found["slow"] != found["class"]
 
 
+@pytest.mark.parametrize(
+    ("who", "label"),
+    [
+        ("mine/my_idm_1.1.yaml", "my_idm_1.1"),
+        ("idm_acc.yaml", "idm_acc.yaml"),  # not the tuned IDM, which idm_acc means
+        ("alcc.onnx", "alcc.onnx"),
+        ("follow.onnx", "follow"),
+        ("lcc_rl.pieces.IDM", "IDM"),
+        ({TARGET: PATH, "gain": 0.3}, "Steady"),
+        ({TARGET: "lcc_rl.pieces.Law", "law": f"{__name__}.steady"}, "steady"),
+        ("idm_acc", "idm_acc"),
+    ],
+)
+def test_an_own_controller_never_has_the_name_of_a_shipped_one(who, label: str) -> None:
+    assert label_of(who) == label
+
+
 def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None:
     full = ConstantAcceleration(acceleration=3.0)
     both = {"full": full, "full_filtered": full}
@@ -96,7 +113,7 @@ def test_constants_tuned_behind_a_filter_need_its_longest_gap(longest: str, own:
 def test_an_own_controller_has_its_row_on_every_variant_and_task(words, tmp_path) -> None:
     size = ["experiment=smoke", "scenario.horizon=20"]
     rows = evaluation.run(load("evaluate", [*size, *words]), tmp_path, quiet=True)
-    assert "steady" in set(rows["strategy"])
+    assert "Steady" in set(rows["strategy"])
 
 
 @pytest.mark.slow
@@ -142,7 +159,7 @@ def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
     for who in (lambda gap: gap, partial(steady, gain=0.1)):
         with pytest.raises(LccError, match="at the top of a module"):
             lcc_rl.compare([who], overrides=SMALL, folder=tmp_path)
-    with pytest.raises(LccError, match="two steady: give each a name"):
+    with pytest.raises(LccError, match="two Steady: give each a name"):
         evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)
 
 

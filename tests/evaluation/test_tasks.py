@@ -15,7 +15,7 @@ from lcc_rl.commands import evaluation
 from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 
 TASKS = sorted(path.stem for path in Path("conf/task").glob("*.yaml"))
 QUICK = ("i80-follow", "i24-mixed", "ring-22")

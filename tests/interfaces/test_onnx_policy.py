@@ -28,7 +28,7 @@ from lcc_rl.evaluation.strategies import driven_by, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.interfaces.driver import Driver, Measured, entries
 from lcc_rl.interfaces.export import ExportedPolicy, Remembering
-from lcc_rl.interfaces.onnx_policy import OnnxPolicy
+from lcc_rl.interfaces.onnx_policy import OnnxPolicy, Program
 from lcc_rl.pieces import Action, Observation
 from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.pieces.knowledge import ObservationMemory
@@ -122,6 +122,28 @@ def test_an_exported_policy_that_remembers_drives_as_the_policy(tmp_path) -> Non
     shown = ["cav_net_energy_kj", "mean_gap_m", "hdv_distance_m"]
     rows = [evaluate(one, inputs, 2, 10, seed=1)[0][shown] for one in (policy, program)]
     pd.testing.assert_frame_equal(*rows, rtol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_program_with_memory_brakes_after_a_nan_until_it_begins_anew(tmp_path) -> None:
+    pytest.importorskip("onnxscript", reason="extra interfaces")
+    program = Program(str(lcc_rl.export("pretrained/i24-follow5", tmp_path / "follow.onnx")))
+    usual = {"self.gap": 25.0, "behind.gap": 20.0, "behind.present": 1.0}
+    speeds = dict.fromkeys(("self.speed", "ahead.speed", "behind.speed"), 12.0)
+    one = torch.tensor([(usual | speeds).get(name, 0.0) for name in program.names])
+    good = one.repeat(len(one), 1)
+    bad = good.clone()
+    bad.fill_diagonal_(torch.nan)  # one measurement of each row
+    kept = torch.tensor([[name == "ahead.speed"] for name in program.names])  # all it remembers
+    zeros = torch.zeros(len(one), program.memory)
+    first, memory = program(good, zeros)
+    assert first.abs().max() < 1.0
+    braking = torch.full_like(first, -3.0)
+    for state, expected in ((bad, braking), *2 * [(good, torch.where(kept, braking, first))]):
+        found, memory = program(state, memory)
+        torch.testing.assert_close(found, expected)
+    again, _ = program(good, zeros)
+    torch.testing.assert_close(again, first)
 
 
 @pytest.mark.parametrize("kind", ["filtered", "stacked"])

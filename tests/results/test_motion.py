@@ -16,7 +16,7 @@ from PIL import Image
 
 from lcc_rl.commands import animate as command
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.figures.animation import COLOURS, LARGEST, animate, page
+from lcc_rl.figures.animation import COLOURS, LARGEST, animate, frames, page
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes, visited
 
@@ -125,6 +125,17 @@ def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
         assert near.sum() > 30, role
 
 
+@pytest.mark.parametrize("ring", [False, True])
+def test_every_colour_and_axis_of_a_film_is_named(ring) -> None:
+    *_, figure = frames(drifting(9, ring), "title")
+    _, speeds, gaps = figure.axes
+    names = [text.get_text() for text in speeds.get_legend().get_texts()]
+    assert names == ["leader", "controlled car", "human driver"][ring:]
+    assert [axis.get_ylabel() for axis in (speeds, gaps)] == ["speed [m/s]", "gap ahead [m]"]
+    assert gaps.get_xlabel() == "time [s]"
+    assert all(line.get_alpha() == 1.0 for line in speeds.get_legend().get_lines())
+
+
 def test_an_svg_turns_each_car_by_its_way_and_shows_rings_side_by_side(tmp_path) -> None:
     moved = drifting(3, ring=True, seconds=6.0)
     path = animate({"a < b": moved, "c": moved}, tmp_path / "ring.svg")
@@ -159,7 +170,16 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     assert name == str(run_folder / "figures" / "animation_alcc_0.html")
     assert "network, for all: profile p, driver 0" in Path(name).read_text()
     out = run_folder.parent / "there.html"
-    words = ["--strategy", "idm", "--episode", "1", "--start", "1", "--duration", "0.5"]
+    words = [
+        "--strategy",
+        "one driver (IDM)",
+        "--episode",
+        "1",
+        "--start",
+        "1",
+        "--duration",
+        "0.5",
+    ]
     assert command.main([str(run_folder), *words, "--out", str(out)]) == 0
     found = data_of(out.read_text())
     assert (found["title"], found["time"]) == ("one driver (IDM): profile p, driver 1", [1.0, 1.5])

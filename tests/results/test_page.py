@@ -17,15 +17,9 @@ from lcc_rl.figures.drawing import new_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.cells import as_markdown, heading
-from lcc_rl.results.headline import (
-    as_rich,
-    caption_of,
-    headline,
-    in_words,
-    sample_of,
-    verdict,
-)
+from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, verdict
 from lcc_rl.results.means import Means
+from lcc_rl.results.names import in_words
 from lcc_rl.results.tables import summary
 
 TABLE = pd.DataFrame(
@@ -135,7 +129,8 @@ def test_names_are_words_in_tables_and_figures() -> None:
         "alcc": "network, for all",
         "alcc analytic": "network, for all (analytic)",
         "idm tuned": "IDM, tuned on I-80",
-        "my_pid_filtered": "my pid, filtered",
+        "my_pid_filtered": "my_pid, filtered",
+        "idm 1.1": "idm 1.1",
     }
     assert {name: in_words(name) for name in words} == words
 
@@ -154,5 +149,5 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     assert "within the uncertainty" in verdict(found.assign(km_saving_vs_rule_low=-1.0))
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
     few = verdict(summary(frame[frame["profile_id"] < 4]))
-    assert few.endswith("; 4 window(s) allow no finding.")
+    assert few.endswith("; 4 windows allow no finding.")
     assert "%" not in few

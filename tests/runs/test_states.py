@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import os
 import signal
+from io import StringIO
 from pathlib import Path
 
 import pytest
 from commands import run_command
+from rich.console import Console
 
 from lcc_rl.cli.status import main
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
-from lcc_rl.runs.states import Busy, claim, inspect_run, is_claimed, survey, working
+from lcc_rl.runs.overview import draw
+from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.runs.states import Busy, RunState, claim, inspect_run, is_claimed, survey, working
 
 
 def status(folder: Path) -> list[str]:
@@ -121,3 +125,28 @@ def test_progress_that_is_none(tmp_path, text) -> None:
         (tmp_path / name).write_text(text)
     assert "stopped" in status(tmp_path)[0]
     assert [run.total for run in survey(tmp_path)] == [0]
+
+
+def shown(drawn) -> str:
+    """Return what a terminal of 80 columns shows, without spaces and ends of lines."""
+    console = Console(width=80, file=StringIO(), force_terminal=True, color_system=None)
+    console.print(drawn)
+    return "".join(console.file.getvalue().split())
+
+
+def test_names_and_errors_are_whole_on_80_columns() -> None:
+    name, error = f"score/{'a' * 60}/highway", "loss_actor became nan in iteration 3; " * 5
+    states = [RunState(name, "failed", 3, 3, error=error), RunState("b", "running", 1, 3, 65.0)]
+    text = shown(draw(Path("outputs"), states, 2))
+    assert text.count("became") == 5
+    for whole in ("a" * 40, "ETA1:05", "failed3/3"):
+        assert whole in text
+    assert "…" not in text
+
+
+def test_the_bar_of_a_training_fits_80_columns() -> None:
+    console = Console(width=80, file=StringIO(), force_terminal=True, color_system=None)
+    with ProgressReporter("train own_energy", 240, console=console) as progress:
+        for done in (1, 240):
+            progress.update(done, {"reward": -1234.0, "loss": 1234.0})
+        assert "240/240reward-1234loss1234ETA0:000:00:00" in shown(progress.bar)

@@ -45,9 +45,7 @@ def training(options: Namespace, batch: int) -> TransformedEnv:
     return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
 
 
-def alcc(
-    options: Namespace, batch: int, far: bool = False, followers: int = 1
-) -> TransformedEnv:
+def alcc(options: Namespace, batch: int, far: bool = False, followers: int = 1) -> TransformedEnv:
     """Build the ALCC environment; from ``far`` behind the leader no episode ends by a collision."""
     cfg, inputs = study(options.quick)
     cfg = deepcopy(cfg)

@@ -28,7 +28,7 @@ from lcc_rl.figures.drawing import (
 from lcc_rl.figures.training import BAND, draw_curves
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.cells import signed
-from lcc_rl.results.headline import in_words
+from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 from lcc_rl.studies.alcc.tables import comparison
@@ -101,7 +101,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
 def distributions(drivers: pd.DataFrame) -> Figure:
     """Path energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
 
-    A driver's value is its mean over the held-out profiles and seeds. Boxes span the quartiles,
+    A driver's value is its mean over the held-out windows and seeds. Boxes span the quartiles,
     whiskers the 5th to 95th percentile; a diamond marks the mean.
     """
     names = list(dict.fromkeys(drivers["strategy"]))
@@ -138,7 +138,7 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
 def generalization_figure(
     windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> Figure:
-    """Path energy of both vehicles on every held-out profile, and its saving (Fig. 12)."""
+    """Path energy of both vehicles on every held-out window, and its saving (Fig. 12)."""
     table = generalization(windows, strategy, baseline).sort_values("path_saving_pct")
     figure = new_figure(PAGE, 4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
@@ -153,11 +153,11 @@ def generalization_figure(
     below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
     below.axhline(0.0, color=INK, lw=0.8)
     together = 100 * savings(windows, "total_path_energy_kj", strategy, baseline).value
-    line = f"all profiles together {signed(together)} %"
+    line = f"all windows together {signed(together)} %"
     below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
     below.set_xticks([])
-    words = f"held-out profiles, sorted by the saving (n = {len(table)}); right: the paper's"
+    words = f"held-out windows, sorted by the saving (n = {len(table)}); right: the paper's"
     style(below, words, f"saved by {in_words(strategy)}\nagainst {in_words(baseline)} [%]")
     legend_above(below, 2)
     return figure
@@ -216,7 +216,7 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
         grid(axis, "x")
         style(axis, label)
         axis.tick_params(axis="y", length=0)
-    rows_of(axes[0], list(map(str, names)))
+    rows_of(axes[0], [str(name).replace("_", " ") for name in names])
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
     seeds = _how_many(table["seeds"])

@@ -95,7 +95,7 @@ def holistic(means: Means, strategy: str = "alcc", baseline: str = "reference") 
 def generalization(
     windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
-    """Energies and savings on every held-out profile (Fig. 12).
+    """Energies and savings on every held-out window (Fig. 12).
 
     Returns:
         One row per profile: path energy of both vehicles under the baseline and the strategy
@@ -119,7 +119,7 @@ def generalization(
 def generalization_row(
     windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
 ) -> pd.DataFrame:
-    """Distribution of the savings over held-out profiles, beside the paper's four profiles.
+    """Distribution of the savings over held-out windows, beside the paper's four profiles.
 
     Returns:
         Rows for this study's path energy and energy as drawn and for the paper:

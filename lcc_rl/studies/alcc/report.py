@@ -14,8 +14,9 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.headline import few_windows, in_words
+from lcc_rl.results.headline import few_windows
 from lcc_rl.results.means import WINDOWS, Means
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, EPISODES
 from lcc_rl.results.savings import LEADER
 from lcc_rl.results.tables import leader_too_fast
@@ -173,9 +174,9 @@ def _generalization(page: Page, windows: pd.DataFrame) -> None:
     caption = "Saving of alcc against reference over profiles, beside the paper's 4"
     shown = [
         ("generalization_row", caption, paper_tables.generalization_row(windows)),
-        ("generalization", "Every held-out profile", paper_tables.generalization(windows)),
+        ("generalization", "Every held-out window", paper_tables.generalization(windows)),
     ]
-    caption = "Counterpart of Fig. 12: energies and saving on every held-out profile."
+    caption = "Counterpart of Fig. 12: energies and saving on every held-out window."
     figure = figures.generalization_figure(windows)
     page.add("Generalization", text, shown, [("generalization", caption, figure)])
 

@@ -1,0 +1,60 @@
+"""Names of strategies as they stand in tables, figures and pages."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+HUMAN, NETWORK = "human", "alcc"
+# Who learns, or has several gains: further words of a name, if any, say which.
+SEVERAL = {
+    "reference": "network, for itself",
+    "own_energy": "network, for itself, weighted",
+    NETWORK: "network, for all",
+    "rule": "IDM, tuned on these data",
+    "cacc": "CACC",
+    "ddpg": "DDPG",
+    "hcfs": "HCFS",
+}
+WHO = SEVERAL | {
+    "idm": "one driver (IDM)",
+    HUMAN: "simulated drivers",
+    "recorded": "the recorded drivers",
+    "constant_filtered": "safety filter alone",
+    "idm_acc": "tuned IDM",
+    "acc": "tuned ACC",
+    "mpc": "MPC",
+    "mpc_far": "MPC, longer gaps",
+    "acc tuned": "ACC, tuned on I-80",
+    "idm tuned": "IDM, tuned on I-80",
+    "follower_stopper": "FollowerStopper",
+    "pi_saturation": "PI with saturation",
+    "fvdm": "FVDM",
+    "gipps": "Gipps",
+    "ovm": "OVM",
+    "constant": "constant speed",
+    "direct": "no automated car",
+}
+FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
+
+
+def in_words(name: str) -> str:
+    """Return a strategy's name as it stands in tables, figures and pages.
+
+    A name that is not of this package, such as that of a user's file, stays as it is.
+
+    Examples:
+        >>> in_words("alcc"), in_words("alcc ddpg"), in_words("my_idm_1.1")
+        ('network, for all', 'network, for all (ddpg)', 'my_idm_1.1')
+    """
+    if name.endswith(FILTERED) and name not in WHO:
+        return f"{in_words(name.removesuffix(FILTERED))}, filtered"
+    first, _, rest = name.partition(" ")
+    if name not in WHO and first in SEVERAL:
+        return f"{SEVERAL[first]} ({rest.replace('_', ' ')})"
+    return WHO.get(name, name)
+
+
+def worded(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with the names of strategies, where it has any, in words."""
+    names = [name for name in ("strategy", "behind", "against") if name in table]
+    return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
