@@ -11,7 +11,9 @@ ARGS ?=
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test test-all extras coverage lint size benchmarks docs clean
+.PHONY: install run test test-all extras coverage lint size benchmarks docs clean
+
+install: $(STAMP)
 
 run: $(STAMP)
 	$(BIN)/python -m lcc_rl.cli.pipeline $(ARGS)

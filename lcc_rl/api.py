@@ -14,13 +14,11 @@ from rich.console import Console
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
-from lcc_rl.config.nodes import TARGET, path_of
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.evaluation.named import setting_of
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.pieces.controllers import Controller
 from lcc_rl.results.headline import Shown
 from lcc_rl.results.tables import summary
-from lcc_rl.settings import values
 
 WIDTH = 80  # characters
 
@@ -35,12 +33,16 @@ class Run:
             dataset that is not read yet.
         cfg: its configuration.
 
-    ``print(run)`` shows the tables that commands print.
+    ``print(run)`` shows the tables that commands print; where a path is expected, a run is that of
+    its folder.
     """
 
     folder: Path
     rows: Rows
     cfg: StudyConfig
+
+    def __fspath__(self) -> str:
+        return str(self.folder)
 
     def __str__(self) -> str:
         return self.printed()
@@ -139,21 +141,10 @@ def compare(
     target = _folder("evaluate", variant, folder)
     cfg = load("evaluate", [f"variant={variant}", *overrides])
     if isinstance(strategies, Mapping):
-        cfg.compare = {name: _setting(who) for name, who in strategies.items()}
+        cfg.compare = {name: setting_of(who) for name, who in strategies.items()}
     else:
-        cfg.compare = [_setting(who) for who in strategies]
+        cfg.compare = [setting_of(who) for who in strategies]
     return Run(target, evaluation.run(cfg, target, own=False, quiet=True), cfg)
-
-
-def _setting(who: Any) -> Any:
-    """Return what a configuration calls a policy or a controller."""
-    if isinstance(who, Run):
-        return str(who.folder)
-    if isinstance(who, Controller):
-        return {TARGET: path_of(type(who)), **values(who)}
-    if isinstance(who, Mapping):
-        return dict(who)
-    return path_of(who) if callable(who) else str(who)
 
 
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:

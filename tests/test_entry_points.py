@@ -91,6 +91,13 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     # The trainings used the drivers calibrated from the data, not the shipped ones.
     drivers = read_parquet(job / "calibration" / "drivers.parquet")
     assert rows["desired_speed_mps"].isin(drivers["desired_speed_mps"].astype("float32")).all()
+    # The same table with a row more, as docs/extend.md has it.
+    own = f"compare=[{job}/alcc,lcc_rl.pieces.ConstantAcceleration]"
+    people = ["drivers=calibrated", f"drivers.path={job}/calibration/drivers.parquet"]
+    beside = evaluation.run(tiny("evaluate", own, *people), tmp_path / "beside", quiet=True)
+    added = beside["strategy"] == "constantacceleration"
+    assert added.any()
+    pd.testing.assert_frame_equal(beside[~added].reset_index(drop=True)[rows.columns], rows)
     # Completing a complete job changes nothing, and no place to write that a file names is used.
     for path in job.rglob("config.yaml"):
         path.write_text(path.read_text().replace("keep: null", "keep: x.csv"))

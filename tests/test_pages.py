@@ -35,6 +35,7 @@ NOT_RUN = {
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
     "python tools/sumo_ring.py": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
     "lcc-rl animate": "tests/results/test_motion.py runs it",
+    "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
     "lcc-rl score": "tests/evaluation/test_score.py runs it",
     "lcc-rl maps": "tests/results/test_figures.py runs it",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",

@@ -23,7 +23,7 @@ from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.evaluation.episodes import any_leader, plan_of
 from lcc_rl.evaluation.named import DIRECT, controller_of
-from lcc_rl.evaluation.strategies import applies, deployed
+from lcc_rl.evaluation.strategies import Strategy, applies, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
@@ -89,6 +89,16 @@ def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:
     own, profiles = deployed(any_leader(cfg)), inputs.evaluation
     env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
     require_memory(evaluation_bytes(cfg, env.reset(), inputs), cfg.device)
+
+
+def check_strategies(strategies: Sequence[Strategy], inputs: Inputs) -> None:
+    """Check that the controllers of all strategies fit their strings, before anything is written.
+
+    Raises:
+        ConfigError: naming the controller, and the entry or shape at fault.
+    """
+    for cfg in (any_leader(one.cfg) for one in strategies):
+        build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
 
 
 def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]:

@@ -14,7 +14,13 @@ import pandas as pd
 from rich.table import Table
 
 from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import check_evaluation, check_installed, check_measured, check_variant
+from lcc_rl.commands.checks import (
+    check_evaluation,
+    check_installed,
+    check_measured,
+    check_strategies,
+    check_variant,
+)
 from lcc_rl.config import identity
 from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
@@ -122,6 +128,7 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
     if own:
         check_variant(cfg)
     strategies, inputs = strategies_of(cfg, own)
+    check_strategies(strategies, inputs)
     if replace:  # rows of other settings must never stand beside this configuration
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)

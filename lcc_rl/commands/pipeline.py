@@ -43,6 +43,7 @@ from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
 from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, save_config
+from lcc_rl.results.savings import RULE
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
@@ -58,7 +59,7 @@ log = logging.getLogger("lcc_rl")
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
 EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
-NETWORKS, RULE = ("reference", "alcc"), "rule"  # trained by default; the rule by the gradient
+NETWORKS = ("reference", "alcc")  # trained by default, and the rule by the gradient
 ANALYTIC = "lcc_rl.agents.Analytic"
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 

@@ -13,6 +13,7 @@ of every task, but the variant, which is the task's; they change the hash of the
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import logging
 import platform
@@ -31,7 +32,7 @@ from rich.console import Console
 from lcc_rl.commands.checks import check_evaluation, check_installed
 from lcc_rl.commands.evaluation import evaluate_and_write, task_of
 from lcc_rl.config import check_overrides, choices, identity, load, root_key
-from lcc_rl.config.nodes import TARGET
+from lcc_rl.config.nodes import TARGET, find_target
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env, load_inputs
@@ -89,11 +90,19 @@ class Scored(NamedTuple):
         build_env(any_leader(found.cfg), road, population, 1, nominal=True)
         return found
 
-    def file(self) -> Path | None:
-        """Return the file that it was read from; None of a controller of the package."""
+    def files(self) -> list[Path]:
+        """Return the files that it is made of; none of a controller of the package.
+
+        Those are a policy or a program; or a yaml file, and the module of an own class or function.
+        """
         if self.policy is not None:
-            return policy_file(self.who)
-        return Path(self.who) if self.who.endswith((*YAML, ONNX)) else None
+            return [policy_file(self.who)]
+        node = controller_of(self.who)
+        target = str(node.get("law", node[TARGET]))
+        found = [Path(self.who)] if self.who.endswith((*YAML, ONNX)) else []
+        if not target.startswith("lcc_rl."):
+            found.append(Path(inspect.getfile(inspect.unwrap(find_target(target, self.who)))))
+        return found
 
 
 def scored(who: str, trust: Sequence[str] = ()) -> Scored:
@@ -165,15 +174,15 @@ def hash_of(windows: Profiles) -> str:
 
 
 def about(who: Scored) -> dict[str, Any]:
-    """Return who is scored, the hash of its file, and versions."""
-    file = who.file()
+    """Return who is scored, the hash of its files, and versions."""
+    contents = [file.read_bytes() for file in who.files()]
     found: dict[str, str | None] = {}
     for name in ("lcc_rl", *PACKAGES):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             found[name] = None
-    digest = None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+    digest = hashlib.sha256(b"".join(contents)).hexdigest() if contents else None
     versions = {"python": platform.python_version(), **found}
     return {"name": who.label, "sha256": digest, "versions": versions}
 

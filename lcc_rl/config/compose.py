@@ -29,6 +29,7 @@ from lcc_rl.config.nodes import (
 )
 from lcc_rl.config.schemas import KINDS, SECTIONS, as_plain, parse_config
 from lcc_rl.config.unused import check_used
+from lcc_rl.config.words import key_of
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 
@@ -41,6 +42,11 @@ NOT_IDENTITY = (
 # Launchers and sweepers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
+# Hydra's keys are without quotes.
+NAMES = (
+    "; names before a colon have no quotes but letters, digits, spaces and _-+./%*@?|, and begin "
+    "with a letter; lcc_rl.compare takes any"
+)
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -249,9 +255,11 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         key, equals, value = str(error.override).lstrip("+").partition("=")
         if not equals:
             return ConfigError(f"{key}: settings are written key=value; -h shows the help")
+        typed = next((word for word in overrides if key_of(word) == key), f"{key}={value}")
+        names = NAMES if key == "compare" and "{" in value else ""
         return ConfigError(
-            f"{key}={value}: cannot be read as a setting. Brackets must be closed, and text "
-            f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\""
+            f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
+            f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
         )
     found = re.search(
         r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)

@@ -105,8 +105,8 @@ def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
         ):
             raise ConfigError(
                 f"{type(piece).__name__} remembers in its attribute {name!r}, which all episodes "
-                "share; what lasts from step to step must be an entry: give its key in writes=… "
-                "and reads, see docs/extend.md"
+                "share; what lasts from step to step must be an entry, which a controller names in "
+                "remembers, see docs/extend.md"
             )
 
 
@@ -117,8 +117,12 @@ def _attempt(piece: Piece, action: object) -> None:
     except LccError:
         raise
     except Exception as error:
-        where = type(piece).__name__
-        raise ConfigError(f"{where} does not fit the string of vehicles: {error}") from error
+        shape = ", ".join(map(str, ("batch", *piece.event_shape)))
+        returned = " and ".join(".".join(key) for key in piece.targets)
+        raise ConfigError(
+            f"{piece.title} does not fit the string of vehicles: {error}; it must return "
+            f"{returned} as tensors [{shape}]"
+        ) from error
 
 
 def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
@@ -130,7 +134,7 @@ def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
             continue
         if value.shape != spec.shape or value.dtype != spec.dtype:
             raise ConfigError(
-                f"{type(piece).__name__} writes {'.'.join(key)} as {list(value.shape[1:])} "
+                f"{piece.title} writes {'.'.join(key)} as {list(value.shape[1:])} "
                 f"{value.dtype} {when}; expected {list(spec.shape[1:])} {spec.dtype}, one row per "
                 "vehicle"
             )
@@ -158,10 +162,12 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
                 continue
             if key[-1] == "action":
                 raise ConfigError(
-                    f"{type(piece).__name__} reads {'.'.join(key)}, but only automated vehicles "
+                    f"{piece.title} reads {'.'.join(key)}, but only automated vehicles "
                     "have an action"
                 )
+            near = ", ".join(sorted(".".join(other) for other in known if other[0] == key[0]))
             raise ConfigError(
-                f"{type(piece).__name__} reads {'.'.join(key)}, which no piece of the "
-                "scenario writes; was a piece removed, or does it belong to another scenario=…?"
+                f"{piece.title} reads {'.'.join(key)}, which no piece of the scenario writes"
+                f"{near and f', only {near}'}; was a piece removed, or does it belong to another "
+                "scenario=…?"
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
@@ -15,7 +15,11 @@ ACTION = (AUTOMATED, "action")
 
 
 def check_numbers(
-    entries: Mapping[Key, Tensor], running: Tensor, first: int = 1, who: str = ""
+    entries: Mapping[Key, Tensor],
+    running: Tensor,
+    first: int = 1,
+    who: str = "",
+    named: Callable[[int], str] = str,
 ) -> bool:
     """Check that the entries of a batch of episodes are finite numbers.
 
@@ -25,6 +29,7 @@ def check_numbers(
             count.
         first: number of the first step.
         who: who drives, for the message.
+        named: what the message calls the episode of a number.
 
     Returns:
         Whether an entry may hold something else after the end of an episode.
@@ -46,4 +51,4 @@ def check_numbers(
     values = entries[key][step, episode]
     number = values[~values.isfinite()][0].item()
     where = f"{who}: {'.'.join(key)}" if who else ".".join(key)
-    raise Diverged(f"{where} is {number} at step {first + step} of episode {episode}")
+    raise Diverged(f"{where} is {number} at step {first + step} of episode {named(episode)}")

@@ -33,6 +33,7 @@ from lcc_rl.evaluation.rows import (
     traffic,
 )
 from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.tables import FASTER
 
@@ -184,7 +185,12 @@ class Episodes:
         options = reset_options(
             self.player.env, profile, driver, self.seed, plan.population, repeat
         )
-        record, alive = self.player.play(options)
+
+        def named(number: int) -> str:
+            name, met = inputs.evaluation.names[int(profile[number])], int(driver[number])
+            return f"{number} (profile {name}, driver {met}, seed {int(options[SEED][number])})"
+
+        record, alive = self.player.play(options, named)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         groups = grouped(record, self.cfg.scenario.vehicles)
         described = describe(

@@ -7,13 +7,14 @@ import re
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 
 from lcc_rl.config import choices, load, own_file
-from lcc_rl.config.nodes import TARGET, build, find_target
+from lcc_rl.config.nodes import TARGET, build, find_target, path_of
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.errors import ConfigError, require, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
@@ -21,6 +22,7 @@ from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
 from lcc_rl.results.names import FILTERED
 from lcc_rl.results.policies import PRETRAINED
+from lcc_rl.settings import values
 
 PLACE = f"controller@{AUTO}"
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
@@ -40,7 +42,7 @@ RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the
 PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
-YAML = (".yaml", ".yml")
+YAML, MODULE = (".yaml", ".yml"), ".py"
 ONNX, ONNX_POLICY = ".onnx", "lcc_rl.interfaces.onnx_policy.OnnxPolicy"
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
 OTHERS = (
@@ -59,9 +61,35 @@ def rules() -> tuple[str, ...]:
     return tuple(dict.fromkeys([DIRECT, PEOPLE, *BASELINES, *found]))
 
 
+def is_shipped(name: str) -> bool:
+    """Whether a name in tables is that of a baseline or a controller of the package.
+
+    A variant's, such as ``alcc``, says who learned; a user's own controller never has such a name.
+    """
+    return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *BASELINES, *_files()}
+
+
+def setting_of(who: Any) -> Any:
+    """Return what a configuration calls a policy or a controller that a program names.
+
+    Args:
+        who: a name; a path, such as a run's; a node; or a controller as object, class or function.
+
+    Raises:
+        ConfigError: if a class or function is not at the top of a module.
+    """
+    if isinstance(who, Controller):
+        return {TARGET: path_of(type(who)), **values(who)}
+    if isinstance(who, Mapping):
+        return dict(who)
+    if isinstance(who, PathLike):
+        return fspath(who)
+    return path_of(who) if callable(who) else str(who)
+
+
 def is_policy(who: Any) -> bool:
     """Whether a name is that of a trained policy's file or folder."""
-    if not isinstance(who, str) or who.endswith((*YAML, ONNX)):
+    if not isinstance(who, str) or who.endswith((*YAML, ONNX, MODULE)):
         return False
     path = Path(who)
     return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"
@@ -117,10 +145,16 @@ def _words(who: str, behind: bool) -> tuple[str, ...]:
 
 
 @cache
+def _files() -> frozenset[str]:
+    """Return the names of the package's files of controllers."""
+    folder = Path(str(files("lcc_rl.conf"))) / "controller"
+    return frozenset(path.stem for path in folder.glob("*.yaml"))
+
+
+@cache
 def _shipped(_hydra: int) -> dict[str, Any]:
     """Compose the controllers of the package, all at once: an evaluation has several of them."""
-    folder = Path(str(files("lcc_rl.conf"))) / "controller"
-    names = sorted({path.stem for path in folder.glob("*.yaml")} - {"action", "human", "hcfs"})
+    names = sorted(_files() - {"action", "human", "hcfs"})
     nodes = [f"+controller@scenario.controllers.{name}={name}" for name in names]
     return dict(load("evaluate", ["variant=idm", "+gains=tuned", *nodes]).scenario.controllers)
 
@@ -147,6 +181,9 @@ def _node(who: Any) -> Any:
         return {TARGET: ONNX_POLICY, "path": who}
     if who.endswith(YAML):
         return parse_yaml(read_text(Path(who)), who)
+    if who.endswith(MODULE):
+        inside = Path(who).stem
+        raise ConfigError(f"{who} is a module: name a class or function in it, {inside}.<Class>")
     if DOTTED.fullmatch(who) is None:
         error = unknown_name("strategy", who, [*rules(), *OTHERS])
         raise ConfigError(f"{error} {own_file('controller', who)}")

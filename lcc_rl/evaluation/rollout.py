@@ -75,11 +75,14 @@ class Player:
         self.advance = Compiled(self._advance, "the evaluation", compiled)
 
     @torch.no_grad()
-    def play(self, given: TensorDictBase) -> tuple[Record, Tensor]:
+    def play(
+        self, given: TensorDictBase, named: Callable[[int], str] = str
+    ) -> tuple[Record, Tensor]:
         """Play one batch.
 
         Args:
             given: reset options.
+            named: what messages call the episode of a number.
 
         Returns:
             The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
@@ -103,7 +106,7 @@ class Player:
                     record[key][0] = before[key]
                 record[key][step + first] = value
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if check_numbers(after, torch.stack(alive), who=self.who):
+        if check_numbers(after, torch.stack(alive), who=self.who, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         return {key: record[key] for key in self.kept}, torch.stack(alive)

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from lcc_rl.evaluation.named import is_shipped
 from lcc_rl.figures.drawing import (
     COLUMN,
     INK,
@@ -36,7 +37,7 @@ from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import stored_config
-from lcc_rl.results.savings import BASELINES, UNTRAINED, by_driver
+from lcc_rl.results.savings import BASELINES, RULE, by_driver
 
 VEHICLES = {
     "leader": ("leader", INK),
@@ -85,7 +86,7 @@ def study_figures(
 ) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of all that an evaluation with a row per episode shows.
 
-    Those that networks are compared with have no figures of their own beside a network's.
+    Networks and the user's own controllers have figures of their own; the package's have none.
 
     Args:
         episodes: rows of episodes.parquet.
@@ -96,16 +97,16 @@ def study_figures(
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     several = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
-    own = [name for name in cars if name not in UNTRAINED]
     seeds = episodes.groupby("strategy")["training_seed"].count()
+    own = [name for name in cars if name != RULE and (seeds[name] or not is_shipped(name))]
     # Human drivers, networks, then the user's own controllers, then the others.
-    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x in UNTRAINED))
+    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x not in own))
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and len(tables) == 1 and cars and cars[-1] in own:
-        yield "overview", overview(episodes, steps, cars[-1], tables[0])
-    for name in own or cars:
+    if len(steps) and len(tables) == 1 and own:
+        yield "overview", overview(episodes, steps, own[-1], tables[0])
+    for name in own:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
@@ -113,7 +114,7 @@ def study_figures(
         # Who collides, and so drives less of an episode, saves nothing.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
         for baseline in BASELINES if several and whole else ():
-            if baseline in names and baseline != name and name not in UNTRAINED:
+            if baseline in names and baseline != name:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure
 
@@ -213,7 +214,8 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
         whose: energy, for the label of the axis.
     """
     baseline, strategy = names
-    energy = by_driver(means.drivers, column)[[baseline, strategy]].dropna()
+    # Rounded to joules: bins have a width also where drivers are alike.
+    energy = by_driver(means.drivers, column)[[baseline, strategy]].dropna().round(3)
     figure = new_figure(PAGE, 2.7)
     left, right = figure.subplots(1, 2)
     bins = np.histogram_bin_edges(energy.to_numpy(), 30)

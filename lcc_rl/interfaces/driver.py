@@ -6,8 +6,7 @@ memory that it observes, or the controller.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.named import controller_of, is_policy
+from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
@@ -74,8 +73,9 @@ class Driver:
     """Computes accelerations of any number of vehicles, and updates their memories.
 
     Args:
-        name: a run folder, a policy file, ``pretrained/<name>``, a rule (``"idm_acc"``), or the
-            node of a controller as in ``conf/controller``.
+        name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
+            (``"idm_acc"``), as object, class, function, file or node, as :func:`lcc_rl.compare`
+            takes it.
         time_step: duration of a step of the other simulator [s].
         trust: modules outside this package that a policy may name.
 
@@ -87,15 +87,13 @@ class Driver:
             entry that is not measured.
     """
 
-    def __init__(
-        self, name: str | Path | Mapping[str, Any], time_step: float, trust: Sequence[str] = ()
-    ) -> None:
-        self.name, self.time_step = str(name), time_step
+    def __init__(self, name: Any, time_step: float, trust: Sequence[str] = ()) -> None:
+        who = setting_of(name)
+        self.name, self.time_step = str(who), time_step
         self.module: ExportedPolicy | None = None
         pieces: list[StepTransform] = []
-        who = dict(name) if isinstance(name, Mapping) else str(name)
         if is_policy(who):
-            pieces += self._policy(str(who), trust)
+            pieces += self._policy(who, trust)
         else:
             pieces.append(self._build(Controller, controller_of(who), AUTOMATED))
         self.pieces = pieces
@@ -103,7 +101,7 @@ class Driver:
         self.kept = [key for key in self.kept if key != COMMAND]
         self._check()
 
-    def _policy(self, name: str | Path, trust: Sequence[str]) -> list[StepTransform]:
+    def _policy(self, name: str, trust: Sequence[str]) -> list[StepTransform]:
         self.module, (_, cfg) = exported_policy(name, trust), load_policy(name, trust=trust)
         trained = float(cfg.scenario.time_step)
         if abs(trained - self.time_step) > 1e-9:

@@ -11,9 +11,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+import os
+from collections.abc import Callable, Sequence
 from typing import Any
+from unittest.mock import patch
 
 import torch
 
@@ -25,13 +26,15 @@ EXACT, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed tha
 
 
 def load_sumo() -> Any:
-    """Return the module ``libsumo``.
+    """Return the module ``libsumo``, imported without its line about pyarrow's version.
 
     Raises:
         ConfigError: if it is not installed.
     """
     try:
-        import libsumo
+        # Only meanwhile: in the environment it would also replace SUMO's module traci.
+        with patch.dict(os.environ, {"LIBSUMO_AS_TRACI": "quiet"}):
+            import libsumo
     except ImportError as error:
         raise ConfigError("libsumo is not installed; pip install 'lcc_rl[sumo]'") from error
     return libsumo
@@ -46,8 +49,9 @@ class Bridge:
     not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
 
     Args:
-        driver: a run folder, a policy file, ``pretrained/<name>``, a rule (``"idm_acc"``), or the
-            node of a controller as in ``conf/controller``.
+        driver: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
+            (``"idm_acc"``), as object, class, function, file or node, as :func:`lcc_rl.compare`
+            takes it.
         vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
         sight: distance at which a vehicle ahead is seen, bumper to bumper [m].
         trust: modules outside this package that a policy may name.
@@ -59,7 +63,7 @@ class Bridge:
 
     def __init__(
         self,
-        driver: str | Path | Mapping[str, Any],
+        driver: Any,
         vehicles: str | Sequence[str] | Callable[[str], bool],
         sight: float = 150.0,
         trust: Sequence[str] = (),

@@ -72,6 +72,11 @@ class Piece(Part, TensorDictModuleBase, Transform):
     # Maps the entries read to the entries written; a pure function of tensors.
     compute: ClassVar[Callable[..., Any]]
 
+    @property
+    def title(self) -> str:
+        """What messages call it."""
+        return type(self).__name__
+
     def settled(self) -> None:
         """Make it a transform, which reads and writes nothing before :meth:`wire`."""
         Transform.__init__(self, in_keys=[], out_keys=[])

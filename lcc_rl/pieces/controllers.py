@@ -64,8 +64,10 @@ class Controller(StepTransform):
 
     name: ClassVar[str] = AUTOMATED
     reads: ClassVar[Sequence[str]] = ()
-    # Maps what is read, one row per vehicle of the role, to the commands [*batch, n, 1], or to a
-    # tuple of them and the further entries written.
+    # Names of what it remembers, each an entry (role, name) of one number per vehicle, 0 at first.
+    remembers: ClassVar[Sequence[str]] = ()
+    # Maps what is read and remembered, one row per vehicle of the role, to the commands
+    # [*batch, n, 1], or to a tuple of them and what is remembered next.
     command: ClassVar[Callable[..., Any]]
 
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
@@ -75,7 +77,8 @@ class Controller(StepTransform):
 
     def setup(self, world: World) -> None:
         """Derive from a world what depends on it; one that overrides this calls it or drive."""
-        self.drive(world, self.reads)
+        own = [(self.name, entry) for entry in self.remembers]
+        self.drive(world, [*self.reads, *map(".".join, own)], own)
 
     def drive(
         self,
@@ -142,6 +145,11 @@ class Law(Controller):
     """
 
     law: str  # dotted path of the function, as in my_pieces.keep_distance
+
+    @property
+    def title(self) -> str:
+        """The function."""
+        return self.law
 
     def setup(self, world: World) -> None:
         """Find the function, and read what its parameters name."""

@@ -163,7 +163,7 @@ def driven_by(group: str, name: str, node: dict) -> None:
 @pytest.mark.parametrize("how", ["last", "seen", "total"])
 def test_a_controller_that_remembers_in_an_attribute_is_refused(how) -> None:
     node = {"_target_": f"{__name__}.Remembering", "how": how}
-    words = f"Remembering remembers in its attribute '{how}'.* writes=… and reads"
+    words = f"Remembering remembers in its attribute '{how}'.* names in remembers"
     with pytest.raises(ConfigError, match=words):
         driven_by("controllers", "automated", node)
 

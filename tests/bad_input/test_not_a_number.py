@@ -82,7 +82,8 @@ FILTER = ("+filter=cbf",)
 )
 def test_an_evaluation_names_strategy_entry_step_and_episode(overrides, words, tmp_path) -> None:
     cfg = tiny("evaluate", "variant=idm", *overrides, agent=False)
-    with pytest.raises(Diverged, match=rf"{words} of episode \d+"):
+    which = r"of episode \d+ \(profile \S.*, driver \d+, seed \d+\)$"
+    with pytest.raises(Diverged, match=f"{words} {which}"):
         evaluation.run(cfg, tmp_path / "run", quiet=True)
     assert not list(tmp_path.glob("run/*.parquet"))
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 
 import pytest
 import torch
 from commands import NO_AGENT, UNTRAINED, run_command, tiny
+from helpers import POPULATION, compose, wavy_profiles
 
 import lcc_rl
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import AUTO
+from lcc_rl.envs import build_env
 from lcc_rl.errors import LccError
 from lcc_rl.evaluation.named import controller_of, label_of
 from lcc_rl.evaluation.strategies import baseline
@@ -145,6 +148,7 @@ scenario: {{controllers: {{automated: {node}}}}}
         ("idm_ac", "'idm_ac'.*'idm_acc'.*--config-dir"),
         ("rule", "learned: .* lcc-rl train variant=rule"),
         ("nowhere.yaml", "nowhere.yaml: no such file"),
+        ("my_pid.py", r"my_pid.py is a module: name a class or function in it, my_pid.<Class>"),
         ({"gain": 3}, "expected _target_"),
         ({TARGET: PATH, "gian": 3}, "'gian'.*'gain'"),
         ({TARGET: "lcc_rl.pieces.TimeGap"}, "expected Controller"),
@@ -161,6 +165,79 @@ def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
             lcc_rl.compare([who], overrides=SMALL, folder=tmp_path)
     with pytest.raises(LccError, match="two Steady: give each a name"):
         evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)
+
+
+def unknown(gap, velocity):
+    return gap - velocity
+
+
+def plain_number(gap):
+    return 0.5
+
+
+class Wide(Steady):
+    def command(self, *entries):
+        return super().command(*entries).expand(-1, -1, 2)
+
+
+class Unwritten(Steady):
+    reads = ("self.gap", "self.speed", "my.last")
+
+
+@pytest.mark.parametrize(
+    ("who", "words"),
+    [
+        (unknown, r"\.unknown reads vehicles.velocity, .* only .*vehicles.gap, .*vehicles.speed"),
+        (
+            plain_number,
+            r"\.plain_number .*: 'float' .* must return command.automated as tensors \[",
+        ),
+        (Wide, r"Wide writes command.automated as \[1, 2\]"),
+        (Unwritten, r"Unwritten reads my.last, which no piece of the scenario writes;"),
+    ],
+)
+def test_a_controller_that_does_not_fit_is_named_and_leaves_no_folder(who, words, tmp_path) -> None:
+    with pytest.raises(LccError, match=words):
+        lcc_rl.compare([who], overrides=SMALL, folder=tmp_path / "a")
+    typed = [*SMALL, f"compare=[{__name__}.{who.__name__}]", "hydra.run.dir=b"]
+    assert run_command("lcc_rl.cli.evaluate", *typed, cwd=tmp_path).returncode == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_rows_on_the_command_line(tmp_path) -> None:
+    named = {"IDM T_1.8 s": "idm", "a-b+c/d%e*f@g?h|i": "acc"}
+    text = ", ".join(f"{name}: {who}" for name, who in named.items())
+    assert load("evaluate", [*SMALL, f"compare={{{text}}}"]).compare == named
+    typed = f'compare={{"IDM, T = 1.8 s": {PATH}}}'
+    with pytest.raises(LccError, match=re.escape(typed) + ".*: names before a colon|no quotes"):
+        load("evaluate", [*SMALL, typed])
+    rows = lcc_rl.compare({"IDM, T = 1.8 s": Steady}, overrides=SMALL, folder=tmp_path / "a").rows
+    assert "IDM, T = 1.8 s" in set(rows["strategy"])
+
+
+class Counting(Controller):
+    """Accelerates by the number of steps driven."""
+
+    reads = ("self.speed",)
+    remembers = ("steps", "first_speed")
+
+    def command(self, speed, steps, first):
+        first = torch.where(steps == 0, speed, first)
+        return 0.01 * steps + 0.0 * speed, steps + 1.0, first
+
+
+def test_what_a_controller_remembers_is_its_roles_entry_from_zero_on() -> None:
+    node = f"{{_target_: {__name__}.Counting}}"
+    roles = [f"scenario.controllers.{role}={node}" for role in (AUTOMATED, "human")]
+    start = "scenario.start.human=${scenario.start.automated}"
+    env = build_env(compose("idm", *roles, start), wavy_profiles(), POPULATION, 2)
+    data = env.rollout(4)
+    for role in (AUTOMATED, "human"):
+        found = data["next", role, "steps"][..., 0, 0]
+        assert torch.equal(found, torch.arange(1.0, 5.0).expand(2, 4))
+        assert torch.equal(data["next", "command", role][..., 0, 0], 0.01 * (found - 1.0))
+        first = data["vehicles", "speed"][:, :1, int(role == "human"), 0]
+        assert (data["next", role, "first_speed"][..., 0, 0] == first).all()
 
 
 def test_a_law_reads_what_its_parameters_name() -> None:

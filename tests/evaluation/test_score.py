@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
 import lcc_rl
-from lcc_rl.commands.score import main
+from lcc_rl.commands.score import about, main, scored
 from lcc_rl.errors import ConfigError
 from lcc_rl.results import board
 
@@ -55,6 +57,21 @@ def test_a_controller_is_played_where_it_fits_and_the_rest_is_named(tmp_path, ca
     one, other = found["results"]
     assert (one["data"], one["settings"]) != (other["data"], other["settings"])
     assert "left out: i80-follow: " in capsys.readouterr().out
+
+
+def test_the_hash_is_of_the_code_of_an_own_controller(tmp_path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    code = "def law(gap, speed): return 0.2 * (gap - 2.0 - {} * speed)\n"
+    (tmp_path / "law.yaml").write_text("{_target_: lcc_rl.pieces.Law, law: own_law.law}\n")
+    hashes = []
+    for seconds in (1.3, 1.4):
+        (tmp_path / "own_law.py").write_text(code.format(seconds))
+        monkeypatch.delitem(sys.modules, "own_law", raising=False)
+        hashes += [about(scored(who))["sha256"] for who in ("own_law.law", "law.yaml")]
+    assert len({*hashes}) == 4
+    assert hashes[2] == hashlib.sha256((tmp_path / "own_law.py").read_bytes()).hexdigest()
+    assert about(scored("idm_acc"))["sha256"] is None
 
 
 @pytest.mark.parametrize(

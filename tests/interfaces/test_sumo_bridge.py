@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,9 @@ from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.interfaces.sumo import Bridge
+from lcc_rl.pieces import Controller
 from lcc_rl.results.policies import load_policy
+from lcc_rl.settings import Positive
 
 libsumo = pytest.importorskip("libsumo", reason="extra sumo")
 STEP, STEPS, LENGTH = 0.1, 600, 5.0
@@ -143,6 +147,39 @@ def test_a_command_is_executed_beyond_what_sumo_thinks_safe(tmp_path) -> None:
     bridge.release()
     libsumo.simulationStep()
     assert libsumo.vehicle.getAcceleration("own") < 0.0
+
+
+class Counting(Controller):
+    gain: Positive = 0.1
+    reads = ("self.gap",)
+    remembers = ("steps",)
+
+    def command(self, gap, steps):
+        return self.gain * steps + 0.0 * gap, steps + 1.0
+
+
+def steady(gap, speed):
+    return 0.01 * gap - 0.02 * speed
+
+
+def test_whatever_compare_takes_drives(tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
+    (tmp_path / "counting.yaml").write_text(f"_target_: {__name__}.Counting\ngain: 0.2\n")
+    node = {"_target_": f"{__name__}.Counting"}
+    alike = [Bridge(who, "own") for who in (Counting, node["_target_"], node, Counting(gain=0.1))]
+    twice = Bridge(tmp_path / "counting.yaml", "own")
+    for step in range(3):
+        expected = pytest.approx(0.1 * step)
+        assert [one.command(execute=False)["own"] for one in alike] == [expected] * len(alike)
+        assert twice.command(execute=False)["own"] == pytest.approx(0.2 * step)
+    assert Bridge(steady, "own").command()["own"] == pytest.approx(0.01 * 15.0 - 0.2, abs=1e-4)
+
+
+def test_sumo_is_imported_without_its_line_about_pyarrow() -> None:
+    words = "import os; from lcc_rl.interfaces.sumo import load_sumo; load_sumo(); "
+    words += "print(os.environ.get('LIBSUMO_AS_TRACI'))"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
+    assert done.stdout == "None\n"
 
 
 def test_the_ring_in_sumo_writes_trajectories_and_a_figure(tmp_path) -> None:

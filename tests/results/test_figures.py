@@ -331,6 +331,27 @@ def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm tuned"}
 
 
+@pytest.mark.usefixtures("blank_figures")
+def test_networks_and_own_controllers_have_figures_and_those_of_the_package_none(tmp_path) -> None:
+    own = "lcc_rl.pieces.LinearACC"  # as a user's class, under a name of its own
+    rivals = f"compare={{mine: {own}, acc_filtered: acc_filtered, mpc: mpc}}"
+    words = ("variant=alcc", "policy=pretrained", "+filter=cbf", rivals, "evaluation.drivers=3")
+    evaluation.run(tiny("evaluate", *words, agent=False), tmp_path)
+    drawn = {path.stem for path in (tmp_path / "figures").iterdir()} - {"overview", "space_time"}
+    whose = {
+        re.match(r"(?:episode|human_energy|improvement)_(\w+?)(?:_vs_\w+)?$", x)[1] for x in drawn
+    }
+    assert whose == {"alcc", "mine"}
+    assert {"episode_mine", "human_energy_mine", "improvement_mine_vs_idm_tuned"} <= drawn
+
+
+def test_drivers_that_are_alike_make_a_histogram() -> None:
+    alike = episodes()
+    column = "hdv_path_energy_kj"
+    alike[column] = 300.0 + 1e-12 * np.arange(len(alike))
+    run_figures.human_energy(Means.of(alike), "reference")
+
+
 def test_the_human_behind_is_behind_the_car_at_its_place() -> None:
     table = steps().drop(columns=["hdv_speed", "hdv_acceleration", "hdv_gap"])
     table = table.assign(cav_place=1, hdv1_speed=6.0, hdv2_speed=4.0, hdv2_gap=8.0)
