@@ -95,7 +95,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     own = f"compare=[{job}/alcc,lcc_rl.pieces.ConstantAcceleration]"
     people = ["drivers=calibrated", f"drivers.path={job}/calibration/drivers.parquet"]
     beside = evaluation.run(tiny("evaluate", own, *people), tmp_path / "beside", quiet=True)
-    added = beside["strategy"] == "constantacceleration"
+    added = beside["strategy"] == "ConstantAcceleration"
     assert added.any()
     pd.testing.assert_frame_equal(beside[~added].reset_index(drop=True)[rows.columns], rows)
     # Completing a complete job changes nothing, and no place to write that a file names is used.
