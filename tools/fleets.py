@@ -48,7 +48,7 @@ SETTINGS = {  # of what is kept for fronts, for readers
     "long": "I-24, 400 s",
     "long_taught": "I-24, 400 s, trained so",
     "true": "true drivers, I-24, 100 s",
-    "true_taught": "true drivers, trained among them",
+    "true_taught": "true drivers, I-24, 100 s, trained so",
 }
 TAUGHT = ", trained "  # what makes a setting one whose fleets learned in it
 SHOWN_AS = {
