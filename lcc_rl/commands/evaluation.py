@@ -210,14 +210,7 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     for line in inputs.report:
         log.info(line)
     check_evaluation(cfg, inputs)
-    lacking = _lacking_record(cfg, inputs)
-    require(
-        not lacking or RECORDED not in rivals,
-        f"compare={RECORDED}: {lacking}; use trajectories of several vehicles",
-    )
-    if lacking and RECORDED in cfg.evaluation.baselines:
-        log.warning("%s is left out: %s", RECORDED, lacking)
-    strategies = [one for one in baselines(cfg, rivals) if not lacking or one.name != RECORDED]
+    strategies = _rules(cfg, rivals, inputs)
     for name, path in paths.items():
         one = trained(cfg, path, policies[name], inputs.population)
         named = isinstance(cfg.compare, Mapping)
@@ -231,6 +224,18 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     strategies = named_apart(strategies)
     check_distinct(strategies)
     return strategies, inputs
+
+
+def _rules(cfg: EvaluateConfig, rivals: Mapping[str, Any], inputs: Inputs) -> list[Strategy]:
+    """Return the baselines and named controllers; nobody drives as recorded where nobody was."""
+    lacking = _lacking_record(cfg, inputs)
+    require(
+        not lacking or RECORDED not in rivals,
+        f"compare={RECORDED}: {lacking}; use trajectories of several vehicles",
+    )
+    if lacking and RECORDED in cfg.evaluation.baselines:
+        log.warning("%s is left out: %s", RECORDED, lacking)
+    return [one for one in baselines(cfg, rivals) if not lacking or one.name != RECORDED]
 
 
 def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:

@@ -12,15 +12,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.data.plausible import without_blank
-from lcc_rl.data.tables import (
-    LARGEST_ID,
-    Column,
-    TableFile,
-    checked,
-    lacking,
-    stem,
-    whole_numbers,
-)
+from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, whole_numbers
+from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import FRAME, HOLE, divided, step_of, stretches
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet

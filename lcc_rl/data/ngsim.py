@@ -21,17 +21,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
-from lcc_rl.data.tables import (
-    LARGEST_ID,
-    Column,
-    cells_of,
-    checked,
-    is_text,
-    lacking,
-    parse_text,
-    reading,
-    single_spaces,
-)
+from lcc_rl.data.tables import LARGEST_ID, Column, checked, lacking
+from lcc_rl.data.text import cells_of, is_text, parse_text, reading, single_spaces
 from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
 from lcc_rl.errors import Concern, DataError
 

@@ -22,7 +22,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from lcc_rl.data.tables import stem
+from lcc_rl.data.text import stem
 
 JITTER = 5_000  # ms; recordings of one site start at least 11,700 clock units apart
 SPREAD = 300_000  # ms; periods last 15 min, and a float32 clock is off by up to 66 s

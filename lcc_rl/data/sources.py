@@ -16,7 +16,8 @@ from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, pair_place
-from lcc_rl.data.tables import SI, TEXT_TAKES, Column, Names, check_map, file_size
+from lcc_rl.data.tables import SI, Column, Names, check_map
+from lcc_rl.data.text import TEXT_TAKES, file_size
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory

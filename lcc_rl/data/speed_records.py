@@ -14,7 +14,8 @@ import lcc_rl.assets
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import find_files
-from lcc_rl.data.tables import Column, TableFile, stem
+from lcc_rl.data.tables import Column, TableFile
+from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import HOLE, divided
 from lcc_rl.errors import DataError
 

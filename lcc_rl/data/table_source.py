@@ -13,7 +13,8 @@ from pydantic import Field
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, without_blank
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as
-from lcc_rl.data.tables import Column, TableFile, check_map, stem, whole_numbers
+from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
+from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
     FRAME,
     HOLE,

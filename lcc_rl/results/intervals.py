@@ -79,8 +79,9 @@ def saving(
             distance, ratios of totals, in which energy and distance are resampled together.
 
     Returns:
-        The share with its interval; without one if there is one window and one seed of each. If a
-        side has one seed, the interval does not cover what another seed would change.
+        The share with its interval; without one if there is one window and one seed of each, or if
+        resampled baselines are of both signs: then no share of them means anything. If a side has
+        one seed, the interval does not cover what another seed would change.
     """
     sides = [np.asarray(side, dtype=np.float64) for side in (values, baseline)]
     driven = [np.asarray(side, dtype=np.float64) for side in ways or map(np.ones_like, sides)]
@@ -91,7 +92,10 @@ def saving(
         _means(x, stream, drives) / _means(way, stream, drives)
         for x, way, stream in zip(sides, driven, (1, 1 if paired else 2), strict=True)
     )
-    return Estimate(value, *bounds(share_saved(*means)))
+    ours, theirs = means
+    if theirs.min() < 0.0 < theirs.max():
+        return Estimate(value)
+    return Estimate(value, *bounds(share_saved(ours, theirs)))
 
 
 def _means(

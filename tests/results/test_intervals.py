@@ -114,6 +114,11 @@ def test_less_drawn_is_saved_also_where_the_baseline_gains() -> None:
     assert share_saved(90.0, 100.0) == pytest.approx(0.1)
     assert share_saved(-110.0, -100.0) == pytest.approx(0.1)  # recuperates more
     assert saving([[-110.0]], [[-100.0]]).value == pytest.approx(0.1)
+    # A share of something that may be more or less than nothing has no interval.
+    mixed, gained = np.array([[-3.0], [1.0], [-2.0]]), np.array([[-3.0], [-1.0], [-2.0]])
+    assert np.isnan(saving(mixed - 1.0, mixed).low)
+    found = saving(gained - 1.0, gained)
+    assert found.low < found.value < found.high
 
 
 def fronts(saved: float = 0.05, noise: float = 0.0) -> pd.DataFrame:

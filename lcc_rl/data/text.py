@@ -1,0 +1,191 @@
+"""Text files: opened, unpacked, their columns told apart, and parsed into columns of text."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from io import BufferedReader, RawIOBase
+from pathlib import Path
+from typing import IO, Any
+
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from lcc_rl.errors import DataError
+from lcc_rl.io.memory import available, require_memory
+
+BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
+TEXT_TAKES = 3  # bytes of memory that reading a byte of text takes
+
+
+@contextmanager
+def reading(name: str | Path) -> Iterator[IO[bytes]]:
+    """Open a plain or gzipped file, distinguished by its first bytes.
+
+    Raises:
+        DataError: if it cannot be read or is damaged.
+    """
+    if Path(name).exists() and not Path(name).is_file():  # a pipe would be waited for
+        raise DataError(f"{name}: cannot be read: a folder, pipe or device; expected a file")
+    try:
+        with open(name, "rb") as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            yield BufferedReader(_Unpacked(file, name)) if packed else file
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
+    except OSError as error:
+        raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
+
+
+class _Unpacked(RawIOBase):
+    """The content of a gzipped file, which says nowhere how long it is.
+
+    Raises:
+        ConfigError: once more was unpacked than could be parsed in the memory that was free.
+    """
+
+    def __init__(self, file: IO[bytes], name: str | Path) -> None:
+        self.file, self.name = gzip.GzipFile(fileobj=file), name
+        self.size, self.free = 0, available()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        self.size += (count := self.file.readinto(buffer))
+        require_memory({f"reading {self.name}": TEXT_TAKES * self.size}, free=self.free)
+        return count
+
+
+def file_size(name: str | Path) -> int:
+    """Return the bytes of a file; 0 for none."""
+    # A pipe would be waited for; who reads it raises the error.
+    return Path(name).stat().st_size if Path(name).is_file() else 0
+
+
+def is_text(content: bytes) -> bool:
+    """Return whether bytes are UTF-8 text."""
+    try:
+        return b"\0" not in content and (content.isascii() or bool(content.decode("utf-8")))
+    except UnicodeDecodeError:
+        return False
+
+
+def single_spaces(lines: bytes) -> bytes:
+    """Return lines with one space between columns and none around the row."""
+    lines = re.sub(rb" {2,}", b" ", lines.replace(b"\t", b" "))
+    lines = lines.replace(b" \r", b"\r").replace(b" \n", b"\n").replace(b"\n ", b"\n")
+    return lines.strip(b" ")
+
+
+def cells_of(line: bytes, separator: str) -> list[str]:
+    """Return the cells of a line; none if it cannot be divided, as with a stray line end in it."""
+    with suppress(csv.Error):
+        return next(csv.reader([line.decode().rstrip("\r\n")], delimiter=separator), [])
+    return []
+
+
+def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
+    """Lines before the header of a native OpenACC file, by their first cell, and what follows."""
+    lines: list[bytes] = []
+    rest = content
+    for _ in range(PREAMBLE):
+        line, found, after = rest.partition(b"\n")
+        if line.startswith(b"Time,") and b",Speed1," in line:
+            cells = (text.decode().strip("\r, ").partition(",") for text in lines)
+            return {name: value for name, _, value in cells}, rest
+        if not found:
+            break
+        lines.append(line)
+        rest = after
+    return {}, content
+
+
+def separator_of(content: bytes) -> str:
+    """The separator that divides the header and the row after it alike, into most cells."""
+    first, second = [*content.split(b"\n", 2)[:2], b""][:2]
+    best, most = ",", 1
+    for separator in SEPARATORS:
+        lines = first, second
+        if separator == " ":
+            if most > 1:  # names may hold spaces
+                break
+            lines = single_spaces(first), single_spaces(second)
+        counts = [len(cells_of(line, separator)) for line in lines]
+        if counts[0] > most and (counts[0] == counts[1] or not second.strip()):
+            best, most = separator, counts[0]
+    return best
+
+
+def stem(file: str | Path) -> str:
+    """Return the name of a file without folder and endings, ``a`` of ``x/a.csv.gz``."""
+    return Path(Path(file).name.removesuffix(".gz")).stem
+
+
+def parse_text(
+    rows: bytes, width: int, separator: str, places: Sequence[str], source: str, first: int = 0
+) -> pa.Table:
+    """Parse rows of text into columns of text, each named by its place, from 0.
+
+    Args:
+        rows: the lines, without header.
+        width: columns of every row.
+        separator: between columns.
+        places: those wanted.
+        source: the file, for messages.
+        first: number of the first line in the file; 0 to count data rows.
+
+    Raises:
+        DataError: if a row has more or fewer columns, or a quote is not closed.
+    """
+    odd: list[pa_csv.InvalidRow] = []
+
+    def note(row: pa_csv.InvalidRow) -> str:
+        odd.append(row)
+        return "error"
+
+    try:
+        table = pa_csv.read_csv(
+            pa.BufferReader(rows),
+            pa_csv.ReadOptions(
+                use_threads=False,
+                column_names=[str(place) for place in range(width)],
+                block_size=min(len(rows) + 1, 1 << 30),
+            ),
+            pa_csv.ParseOptions(delimiter=separator, invalid_row_handler=note),
+            pa_csv.ConvertOptions(
+                include_columns=list(places),
+                column_types=dict.fromkeys(places, pa.string()),
+                null_values=BLANK,
+                strings_can_be_null=True,
+            ),
+        )
+    except pa.ArrowException as error:
+        if odd:
+            raise _odd_row(odd[0], rows, width, source, first) from error
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{source}: not a readable table: {reason}") from error
+    # An unclosed quote merges lines without an error.
+    count = rows.count(b"\n") + (not rows.endswith(b"\n"))
+    if table.num_rows != count and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):
+        place = f", from line {first} on" if first else ""
+        raise DataError(f"{source}: a quote is not closed, or a line end is stray{place}")
+    return table
+
+
+def _odd_row(row: pa_csv.InvalidRow, rows: bytes, width: int, source: str, first: int) -> DataError:
+    """Return the error for a row of another number of columns."""
+    text, held = row.text.encode(), row.actual_columns
+    lines = [line.rstrip(b"\r") for line in rows.rstrip(b"\r\n").split(b"\n")]
+    number = lines.index(text) if text in lines else 0
+    place = f"line {number + first}" if first else f"data row {number + 1}"
+    last = number == len(lines) - 1 and held < width
+    place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
+    return DataError(f"{source}: {place} has {held} columns; expected {width}{cut}")
