@@ -32,7 +32,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.runs.interrupts import SIGNALS
 
 # The baselines of an evaluation by default, in their order.
-UNTRAINED = ("direct", "idm", "human", "idm tuned", "acc tuned")
+UNTRAINED = ("direct", "idm", "human", "idm_acc", "acc")
 
 # Data that take a fraction of a second to generate; enough for every entry point.
 DATA = ("data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]")

@@ -1,7 +1,7 @@
 """Animate sample episodes of an evaluation: lcc-rl animate outputs/evaluate/<run>.
 
 lcc-rl animate RUN                           # the last strategy, RUN/figures
-lcc-rl animate RUN --strategy "idm tuned" --episode 1 --out idm.gif
+lcc-rl animate RUN --strategy idm_acc --episode 1 --out idm.gif
 lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
 lcc-rl animate RUN --strategy human --strategy "alcc: a network" --out r.svg
 """

@@ -46,7 +46,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results import headline, scores, string_tables
 from lcc_rl.results.headline import show
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
@@ -163,7 +163,8 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
     Policies have the name that was given, or the place of their file.
 
     Raises:
-        ConfigError: if two have one name, or a controller is unknown or has nobody to drive.
+        ConfigError: if two have one name, or one has that of somebody else, or a controller is
+            unknown or has nobody to drive.
     """
     named = cfg.compare
     if not isinstance(named, Mapping):
@@ -174,6 +175,12 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
                 f"compare names two {label}: give each a name, 'compare={{first: …, second: …}}'",
             )
         named = dict(zip(labels, named, strict=True))
+    for label, who in named.items():
+        plain = label.removesuffix(FILTERED)
+        require(
+            in_words(plain) == plain or plain == str(who).removesuffix(FILTERED),
+            f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
+        )
     task = task_of(cfg)
     policies = {label: str(who) for label, who in named.items() if is_policy(who)}
     rivals = {label: who for label, who in named.items() if label not in policies}

@@ -22,6 +22,7 @@ from lcc_rl.evaluation.responses import responses
 from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.policy_maps import policy_maps
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.motion import RESPONSES, Motion, motion_of, sample_episodes, visited
 from lcc_rl.results.runs import STEPS, load_config, reading
@@ -60,7 +61,8 @@ def run(folder: str | Path, trust: Sequence[str] = ()) -> list[Path]:
         grid = grid_of(_motions(steps, [strategy.name for strategy in learned], scenario, folder))
     platoon = cfg.scenario.pieces.get("communication") is not None
     tables = []
-    for strategy in (*reversed(learned), baseline(cfg, "cacc tuned" if platoon else "idm tuned")):
+    rule = "idm_acc_filtered" if cfg.scenario.filters.get(AUTOMATED) else "idm_acc"
+    for strategy in (*reversed(learned), baseline(cfg, "cacc tuned" if platoon else rule)):
         try:
             tables.append(responses(strategy, inputs.population, *grid))
         except LccError as error:

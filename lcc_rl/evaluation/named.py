@@ -26,11 +26,10 @@ from lcc_rl.settings import values
 
 PLACE = f"controller@{AUTO}"
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
-TUNED = {"idm tuned": "idm_acc", "acc tuned": "acc"}
+TUNED = ("idm_acc", "acc")
 # Settings that make the controller of each baseline.
 BASELINES = {
     "idm": ("variant=idm",),
-    **{name: ("variant=idm", f"{PLACE}={node}") for name, node in TUNED.items()},
     **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
     # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
     "mpc_far": ("variant=idm", f"{AUTO}.longest_gap=-4.0", f"{PLACE}=mpc"),
@@ -110,11 +109,10 @@ def controller_of(who: Any, behind: bool = False) -> Any:
     """
     if isinstance(who, str):
         plain = who.removesuffix(FILTERED)
-        named = behind or plain not in TUNED.values()
-        who = who if named and _words(who, behind) else plain
-        words = _words(who, behind)
-        if words:
+        own = (behind or plain not in TUNED) and _words(who)
+        if words := own or _words(plain):
             return _loaded(words, id(GlobalHydra.instance().hydra))
+        who = plain
     node, where = _node(who), f"compare={who}"
     require(isinstance(node, Mapping) and TARGET in node, f"{where}: expected {TARGET}: module.X")
     build(node, where, Controller)
@@ -134,11 +132,10 @@ def label_of(who: Any) -> str:
     return who if who in known else str(who).rpartition(".")[2]
 
 
-def _words(who: str, behind: bool) -> tuple[str, ...]:
+def _words(who: str) -> tuple[str, ...]:
     """Return the settings that make a controller which has a name; none if it has none."""
     if who in BASELINES:
-        *first, last = BASELINES[who]
-        return (*first, last + FILTERED * (behind and who in TUNED))
+        return BASELINES[who]
     if who in choices("controller"):
         return ("variant=idm", f"{PLACE}={who}")
     return (f"variant={who}",) if who in choices("variant") else ()

@@ -26,7 +26,6 @@ from lcc_rl.evaluation.named import (
     DIRECT,
     PEOPLE,
     RECORDED,
-    TUNED,
     controller_of,
     label_of,
 )
@@ -102,8 +101,9 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
 
     Args:
         cfg: the configuration under study.
-        name: its name in tables; it drives behind the safety filter if that ends in ``_filtered``.
-        who: what :func:`lcc_rl.evaluation.named.controller_of` takes; by default the name.
+        name: its name in tables.
+        who: what :func:`lcc_rl.evaluation.named.controller_of` takes; by default the name. It
+            drives behind the safety filter if this or the name ends in ``_filtered``.
 
     Raises:
         ConfigError: if the controller is unknown, or needs the safety filter and there is none.
@@ -116,11 +116,12 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         cfg = by_people(driven_by(cfg, controller_of(name)))
         cfg.scenario.start[AUTOMATED] = {TARGET: RECORDED_START}
         return Strategy(name, cfg)
-    kept, named = cfg.scenario.filters.get(AUTOMATED) or {}, name.endswith(FILTERED)
+    kept = cfg.scenario.filters.get(AUTOMATED) or {}
+    named = any(str(word).endswith(FILTERED) for word in (name, who))
     require(bool(kept) or not named, f"{name} drives behind the safety filter: add +filter=cbf")
     held = bool(kept) and kept.get("time_gap", True) is not None
     controller = controller_of(who or name, held)
-    if named or (kept and name in TUNED):
+    if named:
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _target(cfg) == controller[TARGET]:
         return Strategy(name, cfg)
@@ -133,11 +134,9 @@ def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[St
     if not any(found):
         return []
     names = {one.name for one in strategies}
-    own = cfg.scenario.filters.get(AUTOMATED) is not None
-    wanted = [] if own and names.intersection(TUNED) else [RULE_FILTERED]
     cfg = deepcopy(cfg)
     cfg.scenario.filters[AUTOMATED] = next(filter(None, found))
-    return [baseline(cfg, name) for name in [ALONE, *wanted] if name not in names]
+    return [baseline(cfg, name) for name in (ALONE, RULE_FILTERED) if name not in names]
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:

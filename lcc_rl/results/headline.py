@@ -21,14 +21,15 @@ from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side
 from lcc_rl.results.units import burns_one_fuel, per_distance
 from lcc_rl.runs.output import PLAIN
 
-AGAINST = (HUMAN, "idm", "idm tuned", "rule", "reference")  # the first that there is
-RULES = ("rule", "idm tuned")  # whom the verdict compares a network with, likewise
+# Whom tables compare with, and whom the verdict compares a network with: the first that there is.
+AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
+RULES = ("rule", "idm_acc_filtered", "idm_acc")
 FEW, SHORT, WIDEST = 5, 150.0, 10_000  # windows; seconds of them; characters
 CAPTION = (
     "Energy per vehicle and km, without what motion stores; {}shares of the time: "
     "TTC < 4 s; time gap > 2.5 s above 1 m/s; all measures: table=all or --all."
 )
-BEHIND = "those tuned and trained drive behind the safety filter; "
+BEHIND = "networks, and those called filtered, drive behind the safety filter; "
 COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
 
 

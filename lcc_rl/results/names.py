@@ -24,8 +24,6 @@ WHO = SEVERAL | {
     "acc": "tuned ACC",
     "mpc": "MPC",
     "mpc_far": "MPC, longer gaps",
-    "acc tuned": "ACC, tuned on I-80",
-    "idm tuned": "IDM, tuned on I-80",
     "follower_stopper": "FollowerStopper",
     "pi_saturation": "PI with saturation",
     "fvdm": "FVDM",

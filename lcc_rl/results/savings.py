@@ -12,13 +12,12 @@ from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
-BASELINES = ("idm", "human", "idm tuned", "rule", "reference")
+BASELINES = ("idm", "human", "idm_acc_filtered", "idm_acc", "rule", "reference")
 RULE = "rule"  # the IDM tuned on the same data, by the gradient
 # Whom networks are compared with. All but the rule learn nothing.
 UNTRAINED = (
-    *("direct", "idm", "human", "recorded", "constant_filtered", "idm tuned", "acc tuned"),
-    "idm_acc_filtered",
-    RULE,
+    *("direct", "idm", "human", "recorded", "constant_filtered", RULE),
+    *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
 NOTHING = Estimate(np.nan)
 WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles

@@ -81,8 +81,9 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
     full = ConstantAcceleration(acceleration=3.0)
     both = {"full": full, "full_filtered": full}
     words = [*SMALL, "+filter=cbf"]
-    found = energies(lcc_rl.compare(both, overrides=words, folder=tmp_path / "a").rows)
-    assert found["full"] != found["full_filtered"]
+    named = {"mine": "constant_filtered"}  # full throttle
+    found = energies(lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a").rows)
+    assert found["full"] != found["full_filtered"] == found["mine"]
     with pytest.raises(LccError, match=r"add \+filter=cbf"):
         lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
 
@@ -163,6 +164,9 @@ def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
     for who in (lambda gap: gap, partial(steady, gain=0.1)):
         with pytest.raises(LccError, match="at the top of a module"):
             lcc_rl.compare([who], overrides=SMALL, folder=tmp_path)
+    for name in ("rule", "alcc", "idm_acc", "acc_filtered"):
+        with pytest.raises(LccError, match=f"names {PATH} {name}, which stands for '.+': choose"):
+            lcc_rl.compare({name: PATH}, overrides=SMALL, folder=tmp_path)
     with pytest.raises(LccError, match="two Steady: give each a name"):
         evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)
 

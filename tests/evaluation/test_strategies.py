@@ -25,14 +25,16 @@ from lcc_rl.pieces import IDMACC, LinearACC
 
 
 @pytest.mark.parametrize("name", TUNED)
-def test_a_tuned_baseline_keeps_the_filter_and_has_constants_for_it(name) -> None:
-    free, filtered = (
-        baseline(compose("alcc", *words), name).cfg.scenario for words in ((), ("+filter=cbf",))
-    )
+def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(name) -> None:
+    cfg = compose("alcc", "+filter=cbf")
+    free, filtered = (baseline(cfg, one).cfg.scenario for one in (name, f"{name}_filtered"))
     assert free.filters.get(AUTOMATED) is None
     assert filtered.filters[AUTOMATED]["time_gap"] == 2.45
     one, two = (scenario.controllers[AUTOMATED] for scenario in (free, filtered))
     assert one["time_gap"] != two["time_gap"]
+    named = baseline(cfg, "behind the filter", f"{name}_filtered").cfg.scenario
+    assert named.filters[AUTOMATED]
+    assert named.controllers[AUTOMATED] == two
     # A human driver has no filter.
     human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
     assert human.filters.get(AUTOMATED) is None

@@ -281,7 +281,7 @@ def grid() -> pd.DataFrame:
         {"strategy": name, "speed_mps": speed, "gap_m": gap, "relative_speed_mps": relative}
         | {"acceleration_mps2": 0.2 * (gap - 10.0) + 0.1 * relative}
         | {"winner": (gap > 12) * 1.0 if name == "alcc" else np.nan}
-        for name in ("alcc", "idm tuned")
+        for name in ("alcc", "idm_acc")
         for speed in (2.0, 6.0)
     ]
     return pd.concat(map(pd.DataFrame, found), ignore_index=True)
@@ -290,7 +290,7 @@ def grid() -> pd.DataFrame:
 def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
     figure = accelerations(grid(), pd.DataFrame(columns=steps().columns), {"scenario": {}})
     titles = [axis.get_title(loc="left") for axis in figure.axes[:4]]
-    names = ("network, for all", "IDM, tuned on I-80")
+    names = ("network, for all", "tuned IDM")
     assert titles == [f"{name}, at {speed} m/s" for name in names for speed in (2, 6)]
     image = pixels(figure, tmp_path / "map.png")
     for axis in figure.axes[:4]:
@@ -306,7 +306,7 @@ def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
     assert all(count(image, hue) > 1000 for hue in PARENTS.values())
 
 
-@pytest.mark.parametrize("name", ["idm tuned", "pretrained/alcc", "cacc tuned"])
+@pytest.mark.parametrize("name", ["idm_acc", "pretrained/alcc", "cacc tuned"])
 def test_responses_have_the_right_signs_at_the_corners(name) -> None:
     cfg = load("evaluate", [f"variant={'hcfs' if name.startswith('cacc') else 'alcc'}"])
     learned = name.startswith("pretrained")
@@ -328,7 +328,7 @@ def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     assert {"overview", "improvement_alcc_vs_idm"} <= stems["png"]
     assert stems["png"] == stems["svg"]
     assert [path.name for path in maps.run(tmp_path)] == ["policy_map.png"]
-    assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm tuned"}
+    assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm_acc"}
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -342,7 +342,7 @@ def test_networks_and_own_controllers_have_figures_and_those_of_the_package_none
         re.match(r"(?:episode|human_energy|improvement)_(\w+?)(?:_vs_\w+)?$", x)[1] for x in drawn
     }
     assert whose == {"alcc", "mine"}
-    assert {"episode_mine", "human_energy_mine", "improvement_mine_vs_idm_tuned"} <= drawn
+    assert {"episode_mine", "human_energy_mine", "improvement_mine_vs_idm_acc"} <= drawn
 
 
 def test_drivers_that_are_alike_make_a_histogram() -> None:

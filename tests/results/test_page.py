@@ -128,7 +128,7 @@ def test_names_are_words_in_tables_and_figures() -> None:
     words = {
         "alcc": "network, for all",
         "alcc analytic": "network, for all (analytic)",
-        "idm tuned": "IDM, tuned on I-80",
+        "idm_acc": "tuned IDM",
         "my_pid_filtered": "my_pid, filtered",
         "idm 1.1": "idm 1.1",
     }

@@ -33,7 +33,7 @@ SHARES = [
     for name in ("unsafe_ttc_pct", tables.LONG)
     for which in ("mean", "worst_seed")
 ]
-TUNED = ("idm tuned", "acc tuned")
+TUNED = ("idm_acc", "acc")
 ITSELF = "this study"
 BOTH = {"alcc", "reference"}
 
