@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
+from rich.console import Group
 from rich.table import Table
 
 from lcc_rl.agents.factory import learns
@@ -353,14 +354,14 @@ class Found(NamedTuple):
     of: str
     table: pd.DataFrame
     shorten: Callable[[pd.DataFrame], pd.DataFrame]
-    draw_all: Callable[[pd.DataFrame, str], Table]
+    draw_all: Callable[[pd.DataFrame, str], Group]
 
     @property
     def short(self) -> pd.DataFrame:
         """The table that commands print."""
         return self.shorten(self.table)
 
-    def drawn(self, title: str, full: bool = False) -> Table:
+    def drawn(self, title: str, full: bool = False) -> Table | Group:
         """Return the table for the terminal, with ``full`` all of it."""
         if full:
             return self.draw_all(self.table, title)

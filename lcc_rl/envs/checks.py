@@ -13,12 +13,10 @@ from torch import Tensor
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, Step, entries, tick
 from lcc_rl.errors import ConfigError, LccError
-from lcc_rl.pieces import CBFFilter, Collision
+from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, StepTransform, as_key
 
 BATCH = 2
-# Pieces that replace what others wrote.
-REPLACING = (CBFFilter, Collision)
 
 
 def check_pieces(
@@ -147,7 +145,7 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
         ConfigError: naming the entry and the piece.
     """
     writers = Counter(
-        key for piece in pieces if not isinstance(piece, REPLACING) for key in piece.targets
+        key for piece in pieces if not isinstance(piece, Collision) for key in piece.targets
     )
     for key, count in writers.items():
         if count > 1:

@@ -101,6 +101,7 @@ def world_of(
         nominal,
         _by_role(scenario, "actuators", Actuation),
         _by_role(scenario, "sensors", Sensors),
+        [role for role, node in scenario.filters.items() if node is not None],
     )
 
 

@@ -15,6 +15,7 @@ from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, writ
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import MASK, STREAM, hash_bits
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
+from lcc_rl.pieces.string import COMMAND, WANTED
 
 # Reads and writes a TensorDict; None where a rule drives.
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -67,7 +68,7 @@ class Player:
         needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
         self.step = Step(needed, self.horizon)
         # What the policy and every controller wish is checked, too, whatever a filter makes of it.
-        wishes = [key for piece in needed for key in piece.targets if key[0] == "command"]
+        wishes = [key for piece in needed for key in piece.targets if key[0] in (WANTED, COMMAND)]
         driven = [] if policy is None else [ACTION]
         self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
         self.compiled = compiled

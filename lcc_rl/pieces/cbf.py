@@ -24,6 +24,7 @@ from lcc_rl.functional.sensing import brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import StepTransform
 from lcc_rl.pieces.sensors import ACCELERATION, AHEAD_ACCELERATION, SENSORS, Sensors, frames_of
+from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
@@ -71,7 +72,8 @@ class CBFFilter(StepTransform):
     with; and full braking is reached with the lag
     (:func:`lcc_rl.functional.braking.safe_command`). Comfort is that of the state expected.
 
-    Reads and replaces ``("command", role)``, ``[*batch, n, 1]`` [m/s²]. Differentiable.
+    Reads ``("wanted", role)``, which the controller of a filtered role writes, and writes
+    ``("command", role)``, both ``[*batch, n, 1]`` [m/s²]. Differentiable.
     """
 
     max_acceleration: Positive = 3.0  # in both directions [m/s²]
@@ -113,10 +115,10 @@ class CBFFilter(StepTransform):
         self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
         seen = world.sensed(self.role, STATE)
-        seen = [f"next.command.{self.role}", *seen, *self.memories]
+        seen = [f"next.{WANTED}.{self.role}", *seen, *self.memories]
         self.from_step = world.steps(self.from_s, "from_s")
         seen += ["episode.step"] * (self.from_step > 0)
-        self.see(world, seen, [("command", self.role)], self.role)
+        self.see(world, seen, [(COMMAND, self.role)], self.role)
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> Promised:

@@ -27,6 +27,7 @@ from lcc_rl.config.nodes import find_target
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces.base import StepTransform
+from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.pieces.views import ACTION, AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Number, Positive
@@ -58,6 +59,8 @@ class Population(Protocol):
 
 class Controller(StepTransform):
     """Base of all controllers: writes ``("command", role)``, ``[*batch, n, 1]`` [m/s²].
+
+    Where the role has a safety filter, it writes ``("wanted", role)``, which this reads.
 
     The role that it drives is its name in an environment.
     """
@@ -98,7 +101,8 @@ class Controller(StepTransform):
         self.role, self.string, self.time_step = self.name, world.string, world.time_step
         self.names = tuple(reads)
         known = world.sensed(self.role, reads)
-        self.see(world, known, [("command", self.role), *writes], self.role, **more)
+        wish = WANTED if self.role in world.filtered else COMMAND
+        self.see(world, known, [(wish, self.role), *writes], self.role, **more)
 
     def compute(self, *entries: Tensor) -> Any:
         """Return the commands, and what else is written."""

@@ -55,6 +55,7 @@ ENTRIES: dict[Key, tuple[str, str]] = {
     (ROLE, "commanded_speed"): ("m/s", "speed that PI with saturation commanded last"),
     (ROLE, "unsolved"): ("–", "1 where the plan of MPC had no solution, and it brakes"),
     ("command", ROLE): ("m/s²", "acceleration that the role's controller commands"),
+    ("wanted", ROLE): ("m/s²", "acceleration commanded before the safety filter"),
     ("obeyed", ROLE): ("m/s²", "acceleration that engine and brakes make of the command"),
     (ROLE, "actuation"): ("m/s²", "that of the last step, and commands that do not act yet"),
     (ROLE, "sensed_gap"): ("m", "gap as measured"),

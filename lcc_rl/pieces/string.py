@@ -22,7 +22,7 @@ from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, Positive, Speed
 
 RING_GAP = stream_id("string.ring_gap")
-COMMAND, OBEYED = "command", "obeyed"
+WANTED, COMMAND, OBEYED = "wanted", "command", "obeyed"
 LEADER_SPEED = (LEADER, "speed")
 
 

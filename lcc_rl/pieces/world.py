@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -35,6 +35,7 @@ class World:
         nominal: leaders and starts as in an evaluation, without the deviations of training.
         actuators: settings of the :class:`lcc_rl.pieces.Actuation` of roles that have one.
         sensors: settings of the :class:`lcc_rl.pieces.Sensors` of roles that have some.
+        filtered: roles whose commands a safety filter changes.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -46,6 +47,7 @@ class World:
     nominal: bool = False
     actuators: Mapping[str, Any] = field(default_factory=dict)
     sensors: Mapping[str, Any] = field(default_factory=dict)
+    filtered: Collection[str] = ()
 
     def deviations(self, factors: tuple[float, float]) -> tuple[float, float]:
         """Return the range of a factor from which episodes draw: 1 in an evaluation."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import pandas as pd
-from rich.console import Console
+from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -227,17 +227,18 @@ def saved(share: float, low: float, high: float) -> str:
     return f"{share:+.1f}{within}".replace("-", "−")
 
 
-def in_full(found: pd.DataFrame, title: str) -> Table:
+def in_full(found: pd.DataFrame, title: str) -> Group:
     """Return a whole summary as a table for the terminal, a column per strategy."""
     caption = (
-        "energies: mean per episode; path energy: without what the motion stores; intervals: over "
+        "energies: mean per episode; path energy: without what the motion stores; saved: of path "
+        "energy per km, or as drawn; intervals: over "
         "held-out windows (drives, if five or more) and training seeds; pairs: of a window and a "
         "driver"
     )
     return strategies_side_by_side(found, ROWS, title, caption)
 
 
-def show(table: Table | Text) -> None:
+def show(table: Table | Group | Text) -> None:
     """Print a table or a text, as wide as the terminal or, without one, as its content."""
     console = Console()
     if not console.is_terminal:

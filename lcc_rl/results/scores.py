@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 
 import pandas as pd
-from rich.table import Table
+from rich.console import Group
 
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
@@ -196,7 +196,7 @@ def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     return found
 
 
-def in_full(table: pd.DataFrame, title: str, task: Task) -> Table:
+def in_full(table: pd.DataFrame, title: str, task: Task) -> Group:
     """Return all that scores hold as a table for the terminal, a column per strategy."""
     limits = sorted(task.limits, key=lambda column: column.startswith(SHARE))
     rows = (

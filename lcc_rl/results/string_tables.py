@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from rich.table import Table
+from rich.console import Group
 
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import intervals
@@ -106,6 +106,6 @@ def headline(table: pd.DataFrame) -> pd.DataFrame:
     return found
 
 
-def in_full(table: pd.DataFrame, title: str) -> Table:
+def in_full(table: pd.DataFrame, title: str) -> Group:
     """Return all that a case's table holds, a column per strategy."""
     return strategies_side_by_side(table, ROWS, title, CAPTION)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pandas as pd
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
@@ -18,6 +19,7 @@ from lcc_rl.runs.output import PLAIN
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 PER_KM = "path_energy_kj_per_km"  # and vehicle; who falls back gains nothing by it
 FASTER = "share_leader_faster"
+BESIDE = 4  # strategies beside each other, within 80 characters
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
 CAR_COLUMNS = (
@@ -92,7 +94,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
 def _rows_against(baseline: str) -> tuple[tuple[str, str, str], ...]:
     name = f"saving_vs_{baseline}"
     return (
-        (f"path energy per km saved against {in_words(baseline)}", f"km_{name}", "{:+.1%}"),
+        (f"saved against {in_words(baseline)}", f"km_{name}", "{:+.1%}"),
         ("  95 % interval, low", f"km_{name}_low", "{:+.1%}"),
         ("    high", f"km_{name}_high", "{:+.1%}"),
         ("  as drawn, per episode", name, "{:+.1%}"),
@@ -162,8 +164,8 @@ def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
 
 def strategies_side_by_side(
     table: pd.DataFrame, rows: Iterable[tuple[str, str, str]], title: str, caption: str
-) -> Table:
-    """Return a table for the terminal with a column per strategy.
+) -> Group:
+    """Return tables for the terminal with a column per strategy, as many as fit 80 characters.
 
     Args:
         table: one row per strategy, named in the column ``strategy``.
@@ -172,14 +174,21 @@ def strategies_side_by_side(
         title: above the table.
         caption: below it.
     """
-    drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
+    rows = [row for row in rows if table[row[1]].notna().any()]
+    starts = range(0, len(table), BESIDE)
+    drawn = [_beside(table.iloc[start : start + BESIDE], rows) for start in starts]
+    drawn[0].title, drawn[-1].caption = escape(title), escape(caption)
+    return Group(*drawn)
+
+
+def _beside(table: pd.DataFrame, rows: Sequence[tuple[str, str, str]]) -> Table:
+    drawn = Table(**PLAIN)
     drawn.add_column("")
     for strategy in table["strategy"]:
         name = escape(in_words(str(strategy)))
         drawn.add_column(name, justify="right", max_width=len("automated"), overflow="fold")
     for label, key, form in rows:
-        if table[key].notna().any():
-            known = np.isfinite(table[key].astype(float))
-            cells = (form.format(x) if k else "–" for x, k in zip(table[key], known, strict=True))
-            drawn.add_row(escape(label), *(cell.replace("-", "−") for cell in cells))
+        known = np.isfinite(table[key].astype(float))
+        cells = (form.format(x) if k else "–" for x, k in zip(table[key], known, strict=True))
+        drawn.add_row(escape(label), *(cell.replace("-", "−") for cell in cells))
     return drawn

@@ -76,6 +76,7 @@ FILTER = ("+filter=cbf",)
     ("overrides", "words"),
     [
         (CONTROL, "strategy NanControl: command.automated is nan at step 4"),
+        ((*CONTROL, *FILTER), "strategy NanControl: wanted.automated is nan at step 4"),
         (DRIVER, "strategy direct: command.human is nan at step 4"),
         (POWER, "strategy direct: vehicles.power is -?inf at step 1"),
     ],
