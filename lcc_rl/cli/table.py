@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = Arguments(prog="lcc-rl table", description=__doc__)
     what = "folder of an evaluation, a training or a job; or a parquet file"
     parser.add_argument("run", type=Path, help=what)
-    parser.add_argument("--format", choices=FORMATS, default="text")
+    form = "text is that of the run; of --columns and parquet files it is markdown"
+    parser.add_argument("--format", choices=FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
     parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")

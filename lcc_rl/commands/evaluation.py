@@ -48,7 +48,7 @@ from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results import headline, scores, string_tables
 from lcc_rl.results.headline import show
 from lcc_rl.results.names import FILTERED, in_words
-from lcc_rl.results.policies import PRETRAINED, load_policy
+from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import Task
@@ -153,6 +153,11 @@ def task_of(cfg: StudyConfig) -> Task | None:
     return task
 
 
+def _task_name(cfg: StudyConfig) -> str | None:
+    task = task_of(cfg)
+    return None if task is None else task.name
+
+
 def only_named(cfg: EvaluateConfig) -> bool:
     """Whether only those are compared that are named: nobody's policy is its own variant's."""
     return bool(cfg.compare) and cfg.policy is None and learns(cfg)
@@ -182,18 +187,13 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
             in_words(plain) == plain or plain == str(who).removesuffix(FILTERED),
             f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
         )
-    task = task_of(cfg)
-    policies = {label: str(who) for label, who in named.items() if is_policy(who)}
+    task = _task_name(cfg)
+    policies = {label: of_task(str(who), task) for label, who in named.items() if is_policy(who)}
     rivals = {label: who for label, who in named.items() if label not in policies}
     for label, who in rivals.items():
         if who != DIRECT:
             controller_of(who)
         require(applies(cfg, label), f"compare={label}: it has no vehicle to drive in this string")
-    if task is not None:  # its own pretrained policy
-        policies = {
-            label: f"{PRETRAINED}/{task.name}" if who == PRETRAINED else who
-            for label, who in policies.items()
-        }
     return rivals, policies
 
 
@@ -209,7 +209,7 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     trust, policy = tuple(cfg.trust), None
     rivals, paths = compared(cfg)
     if cfg.policy is not None and learns(cfg):
-        policy = load_policy(cfg.policy, cfg.variant, trust)
+        policy = load_policy(of_task(cfg.policy, _task_name(cfg)), cfg.variant, trust)
     check_installed(cfg, list(rivals.values()))
     policies = {name: load_policy(path, cfg.variant, trust) for name, path in paths.items()}
     if own and learns(cfg) and cfg.policy is None:
@@ -400,7 +400,7 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     for one in found(rows, cfg):
         title = one.of
         if one.of in counts:
-            of = [x for x in (cfg.task and str(cfg.task["name"]), one.of) if x]
+            of = [x for x in (_task_name(cfg), one.of) if x]
             held = f"{counts[one.of]} held-out window{'s' * (counts[one.of] > 1)}"
             size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])

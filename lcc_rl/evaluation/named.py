@@ -126,9 +126,10 @@ def label_of(who: Any) -> str:
     """
     if isinstance(who, Mapping):
         who = str(who.get("law") or who.get(TARGET))
-    known, file = {*rules(), *choices("variant")}, Path(who)
+    known, plain = {*rules(), *choices("variant")}, who.removesuffix(FILTERED)
+    file = Path(plain)
     if file.suffix in (*YAML, ONNX):
-        return file.name if file.stem in known else file.stem
+        return (file.name if file.stem in known else file.stem) + who[len(plain) :]
     return who if who in known else str(who).rpartition(".")[2]
 
 

@@ -32,13 +32,12 @@ from lcc_rl.evaluation.named import (
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.names import FILTERED
+from lcc_rl.results.names import FILTERED, UNASKED
 
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
-ALONE, RULE_FILTERED = "constant_filtered", "idm_acc_filtered"
 RECORDED_START = "lcc_rl.pieces.RecordedStart"
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
@@ -136,7 +135,7 @@ def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[St
     names = {one.name for one in strategies}
     cfg = deepcopy(cfg)
     cfg.scenario.filters[AUTOMATED] = next(filter(None, found))
-    return [baseline(cfg, name) for name in (ALONE, RULE_FILTERED) if name not in names]
+    return [baseline(cfg, name) for name in UNASKED if name not in names]
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:

@@ -35,7 +35,8 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import column_cells, signed
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
-from lcc_rl.results.names import in_words
+from lcc_rl.results.motion import telling
+from lcc_rl.results.names import UNASKED, in_words
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, RULE, by_driver
 
@@ -72,10 +73,14 @@ def write_figures(
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
     formats = cfg.get("figure_formats", ())
-    return [
-        save(figure, folder / "figures" / f"{in_file(stem)}.png", formats=formats)
-        for stem, figure in found
-    ]
+    drawn: dict[str, Path] = {}  # files, by names in which no disk tells letters apart
+    for stem, figure in found:
+        file = in_file(stem)
+        while file.casefold() in drawn:
+            file += "_"
+        path = folder / "figures" / f"{file}.png"
+        drawn[file.casefold()] = save(figure, path, formats=formats)
+    return list(drawn.values())
 
 
 def study_figures(
@@ -99,13 +104,13 @@ def study_figures(
     cars = [name for name in names if name != "direct"]
     seeds = episodes.groupby("strategy")["training_seed"].count()
     own = [name for name in cars if name != RULE and (seeds[name] or not is_shipped(name))]
-    # Human drivers, networks, then the user's own controllers, then the others.
-    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x not in own))
+    # Human drivers, networks, the user's own controllers, the others; last what comes unasked.
+    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x not in own, x in UNASKED))
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and len(tables) == 1 and own:
-        yield "overview", overview(episodes, steps, own[-1], tables[0])
+    if len(steps) and len(tables) == 1 and cars:
+        yield "overview", overview(episodes, steps, (own or cars)[-1], tables[0])
     for name in own:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
@@ -177,14 +182,11 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
-    """Return the sample episode of a strategy whose leader's, or first, speed varies most."""
-    rows = steps[steps["strategy"] == strategy]
+    """Return the telling episode of a strategy, its columns named for one car and one human."""
+    rows = telling(steps)
+    rows = rows[rows["strategy"] == strategy]
     if "training_seed" in rows and rows["training_seed"].notna().any():
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]
-    first_speed = next(name for name in rows.columns if name.endswith("_speed"))
-    spread = rows.groupby(["profile", "driver_id"])[first_speed].transform("std")
-    first = rows.iloc[int(spread.to_numpy().argmax())]
-    rows = rows[(rows["profile"] == first["profile"]) & (rows["driver_id"] == first["driver_id"])]
     # Of several vehicles the first automated one, and the human after those ahead of it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
     behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)
@@ -220,7 +222,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     left, right = figure.subplots(1, 2)
     bins = np.histogram_bin_edges(energy.to_numpy(), 30)
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
-        mean = f"{label}, mean {energy[name].mean():.1f} kJ"
+        mean = f"{label}, mean of drivers {energy[name].mean():.1f}"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
     style(left, f"path energy of {whose}\n[kJ per {means.per}]", "drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import COLUMN, PAGE, new_figure, paper, unbox
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.motion import Motion, motion_of, sample_episodes, telling
 from lcc_rl.results.names import in_words
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
@@ -42,12 +42,10 @@ def space_time(
     Returns:
         The figure; None for strings with fewer than :data:`FEWEST` vehicles.
     """
-    first = steps.iloc[0]
-    same = (steps["profile"] == first["profile"]) & (steps["driver_id"] == first["driver_id"])
-    found = {}
+    found, episode = {}, telling(steps)
     for name in names:
         try:
-            rows = next(iter(sample_episodes(steps[same], name).values()))
+            rows = next(iter(sample_episodes(episode, name).values()))
             found[name] = motion_of(rows, cfg["scenario"]).at(slice(None, None, every))
         except ResultsError:  # the strategy does not drive this episode
             continue
@@ -56,11 +54,13 @@ def space_time(
     whole = [name for name, m in found.items() if len(m.roles) == most >= FEWEST][:WIDEST]
     if not whole:
         return None
-    top = max(float(found[name].speed.max()) for name in whole)
+    speeds = np.concatenate([found[name].speed.ravel() for name in whole])
+    low, top = float(speeds.min()), float(speeds.max())
+    scale = (low if low > 0.3 * top else 0.0, top)  # nobody nearly stands: colours tell more
     figure = new_figure(COLUMN if len(whole) == 1 else PAGE, 2.6)
     axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
     for axis, name in zip(axes, whole, strict=True):
-        lines = _panel(axis, found[name], top)
+        lines = _panel(axis, found[name], scale)
         axis.set_title(in_words(name))
         unbox(axis)
         axis.set_xlabel("time [s]")
@@ -69,7 +69,7 @@ def space_time(
     return figure
 
 
-def _panel(axis: Axes, motion: Motion, top: float) -> LineCollection:
+def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollection:
     """Draw the lines of all vehicles; return them for the scale of colours."""
     around = motion.circumference or np.inf
     shown = motion.position if np.isinf(around) else motion.position % around
@@ -83,7 +83,7 @@ def _panel(axis: Axes, motion: Motion, top: float) -> LineCollection:
             axis.add_collection(frame)
         lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=0.8, zorder=above)
         lines.set_array(motion.speed[:-1, vehicle][whole])
-        lines.set_clim(0.0, top)
+        lines.set_clim(*scale)
         axis.add_collection(lines)
     axis.autoscale_view()
     return lines

@@ -94,6 +94,17 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
     return found
 
 
+def telling(steps: pd.DataFrame) -> pd.DataFrame:
+    """Return the sample episode, of all strategies, in which the leader's speed varies most.
+
+    Without a leader the first vehicle's counts; of an evaluation with a row per episode.
+    """
+    speed = next(name for name in steps.columns if name.endswith("_speed"))
+    keys = ["profile", "driver_id"]
+    chosen: Any = steps.groupby(keys)[speed].std().fillna(0.0).idxmax()
+    return steps[(steps[keys] == list(chosen)).all(axis=1)]
+
+
 def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Motion:
     """Return the motion of one sample episode.
 

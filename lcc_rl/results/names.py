@@ -5,6 +5,8 @@ from __future__ import annotations
 import pandas as pd
 
 HUMAN, NETWORK = "human", "alcc"
+ALONE = "constant_filtered"
+UNASKED = (ALONE, "idm_acc_filtered")  # beside networks behind a filter
 # Who learns, or has several gains: further words of a name, if any, say which.
 SEVERAL = {
     "reference": "network, for itself",
@@ -19,7 +21,7 @@ WHO = SEVERAL | {
     "idm": "one driver (IDM)",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
-    "constant_filtered": "safety filter alone",
+    ALONE: "safety filter alone",
     "idm_acc": "tuned IDM",
     "acc": "tuned ACC",
     "mpc": "MPC",

@@ -19,6 +19,7 @@ from lcc_rl.results.trust import trusted
 from lcc_rl.settings import Settings, parse
 
 PRETRAINED = "pretrained"
+SHIPPED = Path(str(files("lcc_rl.assets"))) / PRETRAINED
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
 S = TypeVar("S", bound=Settings)
@@ -69,16 +70,22 @@ def save_policy(weights: Mapping[str, Any], cfg: StudyConfig, path: Path) -> Non
     write_torch({"weights": own, "config": as_text(cfg)}, path)
 
 
+def of_task(path: str, task: str | None) -> str:
+    """Return the policy that ships for a task where ``"pretrained"`` is asked and there is one."""
+    if path == PRETRAINED and task is not None and (SHIPPED / f"{task}.pt").is_file():
+        return f"{PRETRAINED}/{task}"
+    return path
+
+
 def pretrained_path(variant: str) -> Path:
     """Return the policy that ships with the package for a variant.
 
     Raises:
         ConfigError: if none does.
     """
-    shipped = Path(str(files("lcc_rl.assets"))) / "pretrained"
-    path = shipped / f"{BUILDS_ON.get(variant, variant)}.pt"
+    path = SHIPPED / f"{BUILDS_ON.get(variant, variant)}.pt"
     if not path.is_file():
-        names = sorted(file.stem for file in shipped.glob("*.pt"))
+        names = sorted(file.stem for file in SHIPPED.glob("*.pt"))
         raise ConfigError(
             f"no pretrained policy ships for {variant}, only for {', '.join(names)}; train one "
             "(lcc-rl train) and give its folder"

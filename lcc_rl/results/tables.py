@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.io.files import Rows
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.savings import BASELINES, DRIVE, NOTHING, WAYS, Windows
 from lcc_rl.results.totals import Totals, frames
 from lcc_rl.runs.output import PLAIN
@@ -129,10 +129,11 @@ ROWS = (
 
 
 def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
-    """Return a warning for every human baseline whose desired speed the leaders mostly exceed.
+    """Return a warning for every driver whose desired speed the leaders mostly exceed.
 
     Such a driver drops back, whoever drives ahead: energies then compare distances, not ways of
-    driving.
+    driving. Behind a safety filter a desired speed means other things; networks have none of
+    their own, and the share of the drivers behind them.
 
     Args:
         episodes: rows of an evaluation.
@@ -154,6 +155,10 @@ def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
         return []
     total = pd.concat(parts).groupby(level=0).sum()
     shares = total["sum"] / total["count"]
+    people = [shares[name] for name in ("human", "direct") if name in shares]
+    for name in shares.index if people else ():
+        if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
+            remedies.setdefault(name, "its desired_speed")
     return [
         f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
         f"time (more than {MOSTLY:.0%}): savings against it mean little. Raise v0: {remedy}"

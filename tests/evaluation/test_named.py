@@ -67,6 +67,7 @@ def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, mo
         ("idm_acc.yaml", "idm_acc.yaml"),  # not the tuned IDM, which idm_acc means
         ("alcc.onnx", "alcc.onnx"),
         ("follow.onnx", "follow"),
+        ("mine/follow.onnx_filtered", "follow_filtered"),
         ("lcc_rl.pieces.IDM", "IDM"),
         ({TARGET: PATH, "gain": 0.3}, "Steady"),
         ({TARGET: "lcc_rl.pieces.Law", "law": f"{__name__}.steady"}, "steady"),
