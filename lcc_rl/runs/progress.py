@@ -58,7 +58,7 @@ class Phases:
         title: str,
         console: Console,
         tell: Callable[[Sequence[str]], None],
-        every: float = 20.0,
+        every: float = 10.0,
     ) -> None:
         self.title, self.tell, self.every = title, tell, every
         self.live = console.is_terminal
