@@ -15,6 +15,7 @@ from lcc_rl.config import identity, load
 from lcc_rl.config.nodes import TARGET, build, settings_at, with_defaults
 from lcc_rl.config.schemas import as_plain, as_text, parse_config
 from lcc_rl.envs import build_env
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import SafetyReward
 from lcc_rl.settings import defaults
 
@@ -78,6 +79,24 @@ def test_every_choice_of_a_group_builds(group) -> None:
         if option not in OF_FILES:
             node = getattr(load("train", [f"{group}={option}"]), group)
             assert node is None or build(node, group) is not None
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["experiment=limits", "+experiment=smoke"], r"use 'experiment=\[limits,smoke\]'$"),
+        (["+experiment=smoke"], r"use 'experiment=\[smoke\]'$"),
+        (
+            ["experiment=limits", "+filter=cbf"],
+            "filter is chosen already by experiment=limits; filter=…, without",
+        ),
+        (["agent=td3", "+agent=sac"], r"agent is chosen already; agent=…, without \+, replaces"),
+    ],
+)
+def test_a_choice_that_is_there_cannot_be_added(words, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load("train", words)
+    assert load("train", ["experiment=[limits,smoke]"]).training.episodes == 24
 
 
 def test_the_papers_recipes_are_the_defaults() -> None:

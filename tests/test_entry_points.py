@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -13,6 +14,7 @@ from commands import QUICK, TINY, UNTRAINED, jobs_in_threads, run_command, tiny
 import lcc_rl
 from lcc_rl import api
 from lcc_rl.commands import evaluation, training
+from lcc_rl.commands.pipeline import calibrate_once
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.policies import load_policy
 
@@ -106,6 +108,25 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     again = read_parquet(job / "evaluation" / "episodes.parquet")
     pd.testing.assert_frame_equal(rows, again, check_exact=True)
     assert not list(tmp_path.rglob("x.csv"))
+
+
+def test_both_ways_of_a_calibration_are_reported_and_drivers_count_once(tmp_path, caplog) -> None:
+    both = [QUICK, "calibration=both", QUICK.replace("local", "global")]
+    with caplog.at_level("INFO", logger="lcc_rl"):
+        path = calibrate_once(tiny("pipeline", *both), tmp_path)
+    count = len(read_parquet(path)) // 2
+    words = rf"calibrated {count} drivers: mean RMSPE local \d+\.\d\d %, global \d+\.\d\d %"
+    assert re.fullmatch(words, caplog.messages[-1])
+
+
+@pytest.mark.parametrize(
+    ("words", "title"),
+    [([], "2 held-out windows × "), (["split.evaluation_share=1"], " 2 windows × ")],
+)
+def test_windows_are_held_out_only_from_a_training(tmp_path, capsys, words, title) -> None:
+    cfg = tiny("evaluate", "variant=idm", "evaluation.baselines=[]", *words, agent=False)
+    evaluation.run(cfg, tmp_path / "run")
+    assert title in capsys.readouterr().out
 
 
 # -- as functions ----------------------------------------------------------------------------------

@@ -13,13 +13,12 @@ from time import perf_counter
 import pandas as pd
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from lcc_rl.config import config_hash
 from lcc_rl.config.nodes import CALLED, build
 from lcc_rl.config.schemas import CalibrateConfig
-from lcc_rl.drivers.calibrator import OUT, Calibration
+from lcc_rl.drivers.calibrator import OUT, Calibration, counted
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import load_episodes
@@ -30,6 +29,7 @@ from lcc_rl.results.cells import MISSING
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.precision import prepare_torch
+from lcc_rl.runs.progress import Phases
 from lcc_rl.runs.states import claim
 
 ERRORS = (
@@ -76,16 +76,8 @@ def _run(
     dataset = load_episodes(cfg.data)
     tell(dataset.report)
     start = perf_counter()
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("calibration")
-
-        def show(generation: int, total: int, text: str) -> None:
-            bar.update(task, completed=generation, total=total, description=text)
-
-        result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=show)
+    with Phases("calibration", console, tell) as progress:
+        result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=progress)
     if dataset.vehicles:
         result = _named(result, dataset.vehicles)
     seconds = perf_counter() - start
@@ -129,7 +121,7 @@ def _summary(drivers: pd.DataFrame) -> Table:
     modes = list(drivers["mode"].unique())
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
-    table.add_row("drivers", *(str(len(part)) for part in parts.values()))
+    table.add_row("fitted", *map(counted, parts.values()))
     errors = [(column, column, label) for column, label in ERRORS]
     errors += [(column + OUT, column, f"{label}, held out") for column, label in ERRORS]
     for column, kind, label in errors:

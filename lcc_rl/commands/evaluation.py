@@ -401,8 +401,8 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = one.of
         if one.of in counts:
             of = [x for x in (_task_name(cfg), one.of) if x]
-            held = f"{counts[one.of]} held-out window{'s' * (counts[one.of] > 1)}"
-            size = f"{held} × {drivers}, {cfg.scenario.horizon} steps"
+            windows = headline.counted(counts[one.of], "held-out " * bool(len(inputs.training)))
+            size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
         show(one.drawn(title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step

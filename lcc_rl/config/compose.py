@@ -261,6 +261,9 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
             f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
         )
+    found = re.search(r"(\S+) appears more than once|Multiple values for (\S+)\.", str(error))
+    if found is not None:
+        return _twice(found.group(1) or found.group(2), overrides)
     found = re.search(
         r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
@@ -270,6 +273,18 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     words = [*overrides, *text.partition("See https://")[0].split()]
     return ConfigError(" ".join(words))
+
+
+def _twice(group: str, overrides: Sequence[str]) -> ConfigError:
+    """Return the error for a choice that is added where there is one already."""
+    chosen = [word.partition("=")[2] for word in overrides if key_of(word) == "experiment"]
+    if any(word.startswith("+experiment=") for word in overrides):
+        both = ",".join(name.strip("[]") for name in chosen)
+        return ConfigError(f"+experiment=…: there is one already; use 'experiment=[{both}]'")
+    source = f" by experiment={','.join(chosen)}" if chosen else ""
+    return ConfigError(
+        f"+{group}=…: {group} is chosen already{source}; {group}=…, without +, replaces it"
+    )
 
 
 def _unknown_option(name: str) -> ConfigError:

@@ -7,7 +7,7 @@ candidates, in a fixed order, and the report counts how many.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -16,6 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.data.plausible import Place, pair_place
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import LARGEST, ConfigError, DataError
 from lcc_rl.settings import NonNegative, Number, Settings
@@ -25,6 +26,7 @@ COLUMNS = (
     *("vehicle", "frame", "segment", "time_s", "position_m", "lane", "length_m", "vehicle_class"),
     *("speed_mps", "preceding", "space_headway_m"),
 )
+PAIR = {"vehicle": "follower_id", "preceding": "leader_id"}
 Mask = NDArray[np.bool_]
 
 
@@ -56,19 +58,23 @@ class ExtractionReport:
     """Counts of what the extraction kept and removed.
 
     Args:
+        place: describes a sample to the user.
         candidates: stretches of one vehicle behind another.
         removed: candidates removed by each criterion, in the order of application.
         kept: episodes left.
         rows: samples in the episodes.
         left_out: samples left out, by reason.
+        first: where the first of these is, by reason.
         notes: further remarks, one a line.
     """
 
+    place: Place
     candidates: int = 0
     removed: dict[str, int] = field(default_factory=dict)
     kept: int = 0
     rows: int = 0
     left_out: dict[str, int] = field(default_factory=dict)
+    first: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
@@ -76,24 +82,37 @@ class ExtractionReport:
 
     def lines(self) -> list[str]:
         """Return the report as plain lines."""
-        minutes, left_out = self.rows * FRAME / 60, self.left_out.items()
+        minutes = self.rows * FRAME / 60
+        left_out = [
+            f"left out {count:,} sample{'s' * (count > 1)}: {why}, the first: {self.first[why]}"
+            for why, count in self.left_out.items()
+        ]
         return [
             f"{self.candidates:,} candidates: stretches of one vehicle behind another",
-            *(f"left out {count:,} samples that {why}" for why, count in left_out if count),
+            *left_out,
             *(f"removed {count:,}: {name}" for name, count in self.removed.items()),
             *self.notes,
             f"kept {self.kept:,} episodes: {self.rows:,} samples, {minutes:,.1f} min",
         ]
 
+    def leave_out(self, rows: NDArray[np.intp], why: str, column: str) -> None:
+        """Count samples that are left out, and describe the first."""
+        if len(rows):
+            self.left_out[why] = len(rows)
+            self.first[why] = self.place(int(rows[0]), column)
+
 
 def extract(
-    trajectories: Trajectories, criteria: Criteria
+    trajectories: Trajectories,
+    criteria: Criteria,
+    place: Callable[[pd.DataFrame], Place] = pair_place,
 ) -> tuple[pd.DataFrame, ExtractionReport]:
     """Extract episodes of car following.
 
     Args:
         trajectories: samples in the shape of :class:`lcc_rl.data.trajectories.Trajectories`.
         criteria: what counts as an episode.
+        place: makes of an episode table what describes its samples to the user.
 
     Returns:
         The episode table (:data:`lcc_rl.data.episodes.SCHEMA`), numbered from 0 in the order of
@@ -106,10 +125,14 @@ def extract(
     """
     samples = {str(name): trajectories.samples[name].to_numpy() for name in COLUMNS}
     recording = trajectories.samples["recording"].cat
-    report = ExtractionReport()
+
+    def at(row: int, column: str) -> str:
+        return place(trajectories.samples.iloc[[row]].rename(columns=PAIR))(0, column)
+
+    report = ExtractionReport(at)
     follower, leader = _pairs(samples, recording.codes.to_numpy(), criteria, report)
     gap = samples["space_headway_m"][follower] - samples["length_m"][leader]
-    near = _near(gap, criteria, report)
+    near = _near(gap, follower, criteria, report)
     follower, leader, gap = follower[near], leader[near], gap[near]
     # A candidate begins after a row left out, or a change of segment, leader or lane.
     cut = np.append(True, np.diff(follower) != 1)
@@ -125,9 +148,8 @@ def extract(
         keep &= passes
         if not keep.any():
             longest = f"the longest candidate lasts {FRAME * (lengths.max() - 1):.3g} s"
-            raise DataError(
-                f"no episode is left after the criterion {name!r}; {longest}:\n{report}"
-            )
+            words = f"no episode is left after the criterion {name!r}"
+            raise DataError("; ".join([words, longest, *report.lines()]))
     entry = np.flatnonzero(np.repeat(keep, lengths))
     report.kept, report.rows = int(keep.sum()), len(entry)
     number = np.repeat(np.arange(report.kept, dtype=np.int32), lengths[keep])
@@ -169,12 +191,12 @@ def _pairs(
     preceding, lane = samples["preceding"], samples["lane"]
     ahead = find_leaders(recording, samples["vehicle"], samples["frame"], preceding)
     follows, seen = preceding > 0, ahead >= 0
-    unseen = int((follows & ~seen).sum())
-    report.left_out["name a preceding vehicle that is not seen in that frame"] = unseen
+    unseen = "the preceding vehicle is not seen in that frame"
+    report.leave_out(np.flatnonzero(follows & ~seen), unseen, "preceding")
     if criteria.lane_changes == "split":
         same = lane[ahead] == lane
-        other = int((seen & ~same).sum())
-        report.left_out["name a preceding vehicle on another lane"] = other
+        other = "the preceding vehicle is on another lane"
+        report.leave_out(np.flatnonzero(seen & ~same), other, "lane")
         seen &= same
     follower = np.flatnonzero(seen)
     if len(follower) == 0:
@@ -187,20 +209,21 @@ def _pairs(
     return follower, ahead[follower]
 
 
-def _near(gap: NDArray, criteria: Criteria, report: ExtractionReport) -> Mask:
+def _near(
+    gap: NDArray, follower: NDArray[np.intp], criteria: Criteria, report: ExtractionReport
+) -> Mask:
     """Samples whose gap is neither too short nor too long; candidates are cut at the others."""
     low, high = criteria.min_gap_m, criteria.max_gap_m
     keep = np.ones(len(gap), dtype=bool)
-    for name, limit, wrong in (
-        ("min_gap_m", low, low is not None and gap < low),
-        ("max_gap_m", high, high is not None and gap > high),
-    ):
-        count = int(np.sum(wrong))
-        if count:
-            report.left_out[f"have a gap beyond {name}={limit:g}"] = count
-            keep &= ~wrong
+    for name, limit, sign in (("min_gap_m", low, -1.0), ("max_gap_m", high, 1.0)):
+        if limit is None:
+            continue
+        wrong = sign * gap > sign * limit
+        report.leave_out(follower[wrong], f"gap beyond {name}={limit:g}", "gap_m")
+        keep &= ~wrong
     if not keep.any():
-        raise DataError(f"no sample is left within min_gap_m and max_gap_m:\n{report}")
+        words = "no sample is left within min_gap_m and max_gap_m"
+        raise DataError("; ".join([words, *report.lines()]))
     return keep
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from math import log
 from typing import Annotated
 
 import numpy as np
@@ -10,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.tables import TableFile
+from lcc_rl.data.tables import SI, UNITS, TableFile
 from lcc_rl.data.trajectories import divided, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
@@ -20,6 +21,7 @@ SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
 LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
+NEAR = 1.15  # factor by which gap_rate may be off 1 in the right units: noise of speeds lowers it
 STANDING = 0.5  # both cars stand below it [m/s]
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
@@ -62,6 +64,7 @@ class Plausible(Settings):
         place: Place,
         setting: str = "data.plausible",
         remedy: str = "",
+        units: Mapping[str, str] | None = None,
     ) -> tuple[pd.DataFrame, list[str]]:
         """Cut records where a sample is implausible; parts of less than 10 s go as well.
 
@@ -72,6 +75,7 @@ class Plausible(Settings):
             place: describes a row to the user, by its number and the column at fault.
             setting: where the configuration has these thresholds.
             remedy: what else a user may do about accelerations.
+            units: see :func:`fitting`.
 
         Returns:
             What is left, numbered by :func:`lcc_rl.data.trajectories.divided`, its speeds at least
@@ -101,7 +105,7 @@ class Plausible(Settings):
             )
             lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
-        return kept, [*lines, *more_lines, *self._check_units(kept, source, setting)]
+        return kept, [*lines, *more_lines, *self._check_units(kept, source, setting, units or {})]
 
     def _outside(
         self,
@@ -130,7 +134,9 @@ class Plausible(Settings):
             wrong |= new
         return wrong, lines, advice
 
-    def _check_units(self, kept: pd.DataFrame, source: str, setting: str) -> list[str]:
+    def _check_units(
+        self, kept: pd.DataFrame, source: str, setting: str, units: Mapping[str, str]
+    ) -> list[str]:
         hard = hard_share(kept)
         if hard is not None and hard > self.max_hard:
             raise DataError(
@@ -140,10 +146,13 @@ class Plausible(Settings):
             )
         rate = gap_rate(kept)
         if rate is not None and not 1 / self.max_mismatch <= rate <= self.max_mismatch:
+            advice = fitting(rate, units) or (
+                "are speeds in km/h, mph or ft/s, gaps in feet, times not in s, or leader and "
+                "follower exchanged?"
+            )
             raise DataError(
                 f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower "
-                f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; are speeds in km/h, mph "
-                "or ft/s, gaps in feet, times not in s, or leader and follower exchanged?"
+                f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; {advice}"
             )
         stand = standing_gap(kept)
         if stand is not None and stand > self.max_standing_gap:
@@ -303,6 +312,30 @@ def gap_rate(episodes: pd.DataFrame) -> float | None:
     seen = _centred(np.diff(gap[marks])[same], group)
     enough = len(said) >= LEAST_WINDOWS and np.sqrt(np.mean(said**2)) >= LEAST_CHANGE
     return float(said @ seen / (said @ said)) if enough else None
+
+
+def fitting(rate: float, units: Mapping[str, str]) -> str:
+    """Return in words which other units bring :func:`gap_rate` near 1; empty where none does.
+
+    A unit that the user declared is doubted before SI, the default; then the nearest comes first.
+
+    Args:
+        rate: as measured.
+        units: units that the gap and the speeds were read in, by their keys in ``data.units``.
+    """
+    found = []
+    for quantity, end, sense in (("length", "gap", 1), ("speed", "speed", -1)):
+        keys = [key for key in units if key.endswith(end)]
+        if len({units[key] for key in keys}) != 1:
+            continue
+        declared = units[keys[0]]
+        for size, unit in {size: unit for unit, size in reversed(UNITS[quantity].items())}.items():
+            there = rate * (size / UNITS[quantity][declared]) ** sense
+            if 1 / NEAR < there < NEAR:
+                option = " ".join(f"data.units.{key}={unit}" for key in keys)
+                words = f"with {option} it would be {there:.2f} m"
+                found.append((declared == SI[quantity], abs(log(there)), words))
+    return ", ".join(words for *_, words in sorted(found))
 
 
 def _centred(values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -99,7 +99,8 @@ class EpisodesSource(Settings):
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
         named = {**{key: OWN[key] for key in self.units}, **self.columns}
         source += read_as(FIELDS, named, self.units)
-        return _plausible(self.plausible, episodes, source, lines)
+        units = units_of(FIELDS, OWN, self.units)
+        return _plausible(self.plausible, episodes, source, lines, units=units)
 
 
 def episodes_of(
@@ -122,14 +123,14 @@ def episodes_of(
     """
     report, source = trajectories.report, trajectories.report.source
     try:
-        episodes, extraction = extract(trajectories, criteria or Criteria())
+        episodes, extraction = extract(trajectories, criteria or Criteria(), place)
     except DataError as error:
         raise DataError(f"{source}: {error}") from error
     lines = [*report.lines(), *extraction.lines()]
     if not trajectories.samples["position_m"].to_numpy().any():
         derive_positions(episodes)
         lines.append(DERIVED)
-    loaded = _plausible(plausible, episodes, source, lines, remedy, place)
+    loaded = _plausible(plausible, episodes, source, lines, remedy, place, report.units)
     return replace(loaded, vehicles=report.names)
 
 
@@ -141,11 +142,17 @@ def read_as(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -
         names: what the file calls them, by key.
         units: their units by key; SI for those that are not named.
     """
-    found = [x for x in columns if x.quantity in SI and names.get(x.key)]
+    found = units_of(columns, names, units)
     if not found:
         return ""
-    option = ", ".join(f"{x.key}: {units.get(x.key, SI[x.quantity])}" for x in found)
-    return f", with data.units={{{option}}} for {', '.join(repr(names[x.key]) for x in found)}"
+    option = ", ".join(f"{key}: {unit}" for key, unit in found.items())
+    return f", with data.units={{{option}}} for {', '.join(repr(names[key]) for key in found)}"
+
+
+def units_of(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -> dict[str, str]:
+    """Return the units of measured columns that have a name, by key; see :func:`read_as`."""
+    found = [x for x in columns if x.quantity in SI and names.get(x.key)]
+    return {x.key: units.get(x.key, SI[x.quantity]) for x in found}
 
 
 def _plausible(
@@ -155,8 +162,10 @@ def _plausible(
     lines: list[str],
     remedy: str = "",
     place: Callable[[pd.DataFrame], Place] = pair_place,
+    units: Mapping[str, str] | None = None,
 ) -> LoadedEpisodes:
-    kept, said = (limits or Plausible()).select(episodes, source, place(episodes), remedy=remedy)
+    thresholds = limits or Plausible()
+    kept, said = thresholds.select(episodes, source, place(episodes), remedy=remedy, units=units)
     return LoadedEpisodes(kept, [*lines, *said, medians(kept)])
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, without_blank
-from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as
+from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
@@ -93,13 +93,14 @@ class TableSource(Settings):
             DataError: naming the file, row and column, if a file is missing, damaged or holds what
                 it must not, no episode is left, or more are implausible than ``plausible`` allows.
         """
-        report = ReadReport(find_files(self.path), read_as(FIELDS, self.columns, self.units))
+        how = FIELDS, self.columns, self.units
+        report = ReadReport(find_files(self.path), read_as(*how), units_of(*how))
         rows, recordings = self._rows(report)
         trajectories = to_trajectories(rows, recordings, report)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
-        place = place_in(rows, recordings, report.names, self.columns)
+        place = place_in(rows, recordings, report, self.columns)
         return episodes_of(trajectories, self.criteria, self.plausible, remedy, place)
 
     def _rows(self, report: ReadReport) -> tuple[pd.DataFrame, list[str]]:
@@ -131,7 +132,7 @@ class TableSource(Settings):
 def place_in(
     rows: pd.DataFrame,
     recordings: Sequence[str],
-    vehicles: Mapping[int, str],
+    report: ReadReport,
     columns: Mapping[str, str | None],
 ) -> Callable[[pd.DataFrame], Place]:
     """Return what describes samples of episodes by the nearest rows of the table they are from.
@@ -139,20 +140,26 @@ def place_in(
     Args:
         rows: see :func:`to_trajectories`.
         recordings: their names.
-        vehicles: their names, by number; without one, the number is the name.
+        report: the files, and the names of numbered vehicles.
         columns: what the table calls its columns, by key.
     """
+
+    files = dict(zip(labels(report.files), report.files, strict=True))
 
     def of(episodes: pd.DataFrame, sample: int, column: str) -> str:
         entry = episodes.iloc[sample]
         number = entry["leader_id" if column.startswith("leader") else "follower_id"]
-        name, recording = vehicles.get(number, number), entry["recording"]
+        name, recording = report.names.get(number, number), entry["recording"]
         own = rows[(rows.recording == recordings.index(recording)) & (rows.vehicle == number)]
         row = own.row[(own.time - entry["time_s"]).abs().idxmin()]
-        key = next(key for key in ("speed", "length", "gap", "time") if key in column)
+        keys = ("speed", "length", "gap", "time", "lane", "preceding")
+        key = next(key for key in keys if key in column)
+        if key == "preceding":
+            key = "leader"
         if key == "gap" and not columns.get(key):
             key = "position"
-        place = f"recording {recording}, data row {row + 1}, vehicle {name}"
+        file = files.get(recording, listed(report.files))
+        place = f"{file}: recording {recording}, data row {row + 1}, vehicle {name}"
         return f"{place}, column {(columns.get(key) or key)!r}"
 
     return lambda episodes: partial(of, episodes)

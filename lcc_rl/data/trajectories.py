@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from lcc_rl.errors import DataError
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
 HOLE = 1.5  # of the usual step; a longer one is a missing sample
-LONGEST = 10.0  # s; samples so far apart tell of no following
+SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
 
 
 @dataclass
@@ -24,6 +24,7 @@ class ReadReport:
     Args:
         files: the files, in the order they were read.
         read_as: their columns and the units these were read in, where a user names them.
+        units: these units, by the keys of ``data.units``.
         rows_read: rows in the files; equals ``rows_kept`` plus every ``dropped``.
         rows_kept: rows in the result.
         dropped: rows dropped, by reason.
@@ -41,6 +42,7 @@ class ReadReport:
 
     files: list[str] = field(default_factory=list)
     read_as: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
     rows_read: int = 0
     rows_kept: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
@@ -120,13 +122,14 @@ def step_of(steps: NDArray[np.float64], source: str) -> float:
         source: the file or files, for messages.
 
     Raises:
-        DataError: if it is too long for seconds.
+        DataError: if it is too short or too long for seconds.
     """
     step = float(np.median(steps))
-    if step >= LONGEST:
+    if not SHORTEST <= step < LONGEST:
+        unit = "s" if step < SHORTEST else "ms"
         raise DataError(
-            f"{source}: samples of a vehicle are {step:g} s apart; expected less than "
-            f"{LONGEST:g} s; is the time in another unit (data.units={{time: ms}})?"
+            f"{source}: samples of a vehicle are {step:g} s apart; expected {SHORTEST:g} to "
+            f"{LONGEST:g} s; is the time in {unit} (data.units.time={unit})?"
         )
     return step
 

@@ -136,7 +136,7 @@ class Calibrator(Settings):
         parts, twins, report = [], [], list(observed.report)
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
-            reaction, measured, more = compare(observed, drivers, self.reaction)
+            reaction, measured, more = compare(observed, drivers, self.reaction, progress)
             twins.append(measured.assign(mode=mode))
             if self.reaction:
                 own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
@@ -254,11 +254,18 @@ class _Fit:
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
 
+def counted(drivers: pd.DataFrame) -> str:
+    """Return how many records a calibration in one mode fitted, and of how many drivers."""
+    people = len(drivers[["recording", "follower_id"]].drop_duplicates())
+    whose = f"{people} driver{'s' * (people > 1)}"
+    return whose if people == len(drivers) else f"{len(drivers)} records of {whose}"
+
+
 def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, Any]) -> list[str]:
     """Lines on the quality of the fit and on what it could not identify."""
     error = 100.0 * drivers["rmspe"]
     lines = [
-        f"RMSPE of {len(drivers)} drivers: mean {error.mean():.2f} %, "
+        f"RMSPE of {counted(drivers)}: mean {error.mean():.2f} %, "
         f"median {error.median():.2f} %, worst {error.max():.1f} %"
     ]
     for end, part in (("", "fitted"), (OUT, "held out")):

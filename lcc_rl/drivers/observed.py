@@ -134,7 +134,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
     Args:
         episodes: one row per sample: episode, time_s, follower_speed_mps, leader_speed_mps,
             gap_m and, where known, recording, follower_id, leader_id (or event and period for
-            episode and recording).
+            episode and recording). Without follower_id, each episode is one driver's.
         selection: which episodes to use.
 
     Returns:
@@ -181,6 +181,8 @@ def _canonical(episodes: pd.DataFrame) -> pd.DataFrame:
     for name in NUMERIC:
         if not pd.api.types.is_numeric_dtype(frame[name]):
             raise DataError(f"episode table: column {name!r} is not numeric")
+    if "follower_id" not in frame.columns:
+        frame = frame.assign(follower_id=frame["episode"])
     for name in IDENTITY:
         if name not in frame.columns:
             frame = frame.assign(**{name: "" if name == "recording" else -1})

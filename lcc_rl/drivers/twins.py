@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lcc_rl.drivers.genetic import Progress
 from lcc_rl.drivers.observed import Observed
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.energy import PaperMotor
@@ -299,8 +300,15 @@ class Tried:
     growth: float
 
 
-def tried(observed: Observed, drivers: pd.DataFrame) -> dict[Reaction, Tried]:
-    """Drive twins with all of :data:`DELAYS` × :data:`NOISES`."""
+def tried(
+    observed: Observed, drivers: pd.DataFrame, progress: Progress | None = None
+) -> dict[Reaction, Tried]:
+    """Drive twins with all of :data:`DELAYS` × :data:`NOISES`.
+
+    Args:
+        observed, drivers: see :func:`drive`.
+        progress: called as ``progress(tried, total, text)``.
+    """
     found: dict[Reaction, Tried] = {}
     together = max(1, AT_ONCE // (REPEATS * observed.count))
     for delay in DELAYS:
@@ -310,6 +318,8 @@ def tried(observed: Observed, drivers: pd.DataFrame) -> dict[Reaction, Tried]:
             twins = drive(observed, drivers, reactions)
             grown = growth(observed, drivers, reactions)
             found |= dict(zip(reactions, map(Tried, twins, grown), strict=True))
+            if progress is not None:
+                progress(len(found), len(DELAYS) * len(NOISES), "reactions tried")
     return found
 
 
@@ -344,7 +354,7 @@ def judged(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.DataFra
 
 
 def compare(
-    observed: Observed, drivers: pd.DataFrame, react: bool
+    observed: Observed, drivers: pd.DataFrame, react: bool, progress: Progress | None = None
 ) -> tuple[Reaction, pd.DataFrame, list[str]]:
     """Compare calibrated drivers with the recorded ones.
 
@@ -352,6 +362,7 @@ def compare(
         observed: the records.
         drivers: see :func:`drive`.
         react: also choose a reaction that all drivers share.
+        progress: see :func:`tried`.
 
     Returns:
         The reaction; what was measured (:func:`measure`, with the columns episode and driver) of
@@ -363,7 +374,7 @@ def compare(
         found = {RECORDED: records, TWINS: drive(observed, drivers, [Reaction()], 1)[0]}
         line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
         return Reaction(), _together(found, observed), [line]
-    tries = tried(observed, drivers)
+    tries = tried(observed, drivers, progress)
     reaction = choose(tries, records, np.ones(len(records), bool))
     found = {RECORDED: records, TWINS: tries[Reaction()].twins, REACTING: judged(tries, records)}
     errors = {

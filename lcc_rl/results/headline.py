@@ -139,9 +139,9 @@ def verdict(found: pd.DataFrame) -> str:
     )
 
 
-def counted(windows: int) -> str:
-    """Return a number of windows in words."""
-    return f"{windows} window{'s' * (windows != 1)}"
+def counted(windows: int, which: str = "") -> str:
+    """Return a number of windows in words, ``which`` such as ``"held-out "``."""
+    return f"{windows} {which}window{'s' * (windows != 1)}"
 
 
 def sample_of(episodes: pd.DataFrame) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from multiprocessing import parent_process
 from pathlib import Path
@@ -27,7 +27,7 @@ def clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
-def bar(console: Console, shown: bool) -> Progress:
+def bar(console: Console, shown: bool, transient: bool = False) -> Progress:
     """Return a progress bar for tasks with a ``note``, disabled unless ``shown``."""
     return Progress(
         TextColumn("{task.description}"),
@@ -36,7 +36,56 @@ def bar(console: Console, shown: bool) -> Progress:
         TimeElapsedColumn(),
         console=console,
         disable=not shown,
+        transient=transient,
     )
+
+
+class Phases:
+    """Reports the progress of a job in phases, each of which counts anew.
+
+    On a terminal a live bar, which disappears at the end; otherwise a line at most every ``every``
+    seconds.
+
+    Args:
+        title: name of the job.
+        console: console of the bar.
+        tell: takes the lines.
+        every: seconds between lines without a terminal.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        console: Console,
+        tell: Callable[[Sequence[str]], None],
+        every: float = 10.0,
+    ) -> None:
+        self.title, self.tell, self.every = title, tell, every
+        self.live = console.is_terminal
+        self.bar = bar(console, self.live, transient=True)
+        self.task = self.bar.add_task(title, total=None, note="")
+        self.begun = self.last = self.last_line = time.monotonic()
+        self.done = 0
+
+    def __enter__(self) -> Phases:
+        self.bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.stop()
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        """Report that ``done`` of ``total`` units of a phase are finished."""
+        now = time.monotonic()
+        if done <= self.done:
+            self.begun = self.last
+        self.done, self.last = done, now
+        eta = clock((now - self.begun) / max(done, 1) * (total - done))
+        note = f"{text}: {done}/{total}  ETA {eta}"
+        self.bar.update(self.task, completed=done, total=total, note=note)
+        if not self.live and now - self.last_line >= self.every:
+            self.last_line = now
+            self.tell([f"{self.title}: {note}"])
 
 
 class ProgressReporter:

@@ -123,7 +123,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     # Values that are implausible, and units.
     ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),
     ("source", csv_text(pair(range(200), v_Vel=400)), "holds 121.92 m/s .*max_speed=70"),
-    ("table", csv(TABLE.assign(t=1e3 * TABLE["t"])), "are 100 s apart; .*another unit"),
+    ("table", csv(TABLE.assign(t=1e3 * TABLE["t"])), "are 100 s apart; .*is the time in ms"),
     ("episodes", csv(pairs().eval("time_s = 1000 * time_s")), "are 100 s apart; .*data.units"),
     ("table", csv(TABLE.assign(v=3.6 * TABLE["v"])), "by their positions the vehicles drive"),
     ("table", csv(TABLE.assign(x=-TABLE["x"])), "must grow in the direction of travel"),

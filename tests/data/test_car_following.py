@@ -94,7 +94,9 @@ def test_a_lane_change_splits_or_rejects(tmp_path: Path) -> None:
     episodes, report = extracted(tmp_path, lane_change())
     assert episodes.groupby("episode").size().tolist() == [12, 15]
     assert report.candidates == 2
-    assert "left out 3 samples that name a preceding vehicle on another lane" in report.lines()
+    first = "recording 2005-04-13T22:58:55Z, vehicle 7 (follower), 1.2 s, column 'lane'"
+    line = f"left out 3 samples: the preceding vehicle is on another lane, the first: {first}"
+    assert line in report.lines()
     reject = Criteria(min_duration_s=1.0, lane_changes="reject")
     with pytest.raises(DataError, match=r"no episode is left after .*'lane_changes: reject'"):
         extracted(tmp_path, lane_change(), reject)
@@ -136,10 +138,10 @@ def test_each_criterion_removes_its_candidates_in_order(tmp_path: Path) -> None:
         "max_duration_s: 5": 1,
         "passenger_cars_only": 1,
     }
-    assert report.left_out["have a gap beyond min_gap_m=1"] == 30
-    assert report.left_out["have a gap beyond max_gap_m=100"] == 30
+    assert report.left_out["gap beyond min_gap_m=1"] == 30
+    assert report.left_out["gap beyond max_gap_m=100"] == 30
     assert episodes["follower_id"].unique().tolist() == [11]
-    assert "left out 30 samples that have a gap beyond min_gap_m=1" in str(report)
+    assert "left out 30 samples: gap beyond min_gap_m=1, the first: recording" in str(report)
 
 
 def test_a_gap_beyond_the_limits_cuts(tmp_path: Path) -> None:
@@ -148,7 +150,7 @@ def test_a_gap_beyond_the_limits_cuts(tmp_path: Path) -> None:
         row[16] = "1000"
     episodes, report = extracted(tmp_path, rows, Criteria(min_duration_s=1.0))
     assert episodes.groupby("episode").size().tolist() == [20, 37]
-    assert report.left_out["have a gap beyond max_gap_m=120"] == 3
+    assert report.left_out["gap beyond max_gap_m=120"] == 3
 
 
 @pytest.mark.parametrize(

@@ -111,9 +111,9 @@ def test_names_keep_their_commas_and_number_the_vehicles(tmp_path) -> None:
     ("units", "change", "words"),
     [
         ({"gap": "ft"}, {"v": 80.0}, "row 801, vehicle BMW, column 'v' holds 80 m/s"),
-        ({"gap": "ft"}, {}, "speed: m/s, gap: ft} for 't', 'v', 'gap': gaps change by 0"),
+        ({"gap": "ft"}, {}, "speed: m/s, gap: ft} for 't', 'v', 'gap': .*units.speed=km/h it w"),
         ({"speed": "km/h"}, {}, "speed: km/h, gap: m} for 't', 'v', 'gap': .*change by 3"),
-        ({"time": "ms"}, {}, "{time: ms, speed: m/s, gap: m} for .*longest .* lasts 0 s"),
+        ({"time": "ms"}, {}, "{time: ms, speed: m/s, gap: m} for .* is the time in s"),
         ({}, {"t": 0.0}, r"and data row 1 differ, but are of one vehicle \(Audi, A8\)"),
         ({}, {"t": 1e3}, "{time: s, speed: m/s, gap: m} for .* are 100 s apart"),
     ],
@@ -177,9 +177,51 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     assert "dropped 2 rows: exact duplicate (vehicle, time)" in loaded.report
     assert "dropped 1 rows: blank time, speed or position" in loaded.report
     assert loaded.episodes["follower_id"].unique().tolist() == [3]
-    assert any(
-        "400 samples that name a preceding vehicle that is not seen" in x for x in loaded.report
-    )
+    unseen = "left out 400 samples: the preceding vehicle is not seen in that frame, the first: "
+    assert any(x.startswith(unseen) for x in loaded.report)
+
+
+def test_the_first_sample_left_out_is_named_by_file_row_and_column(tmp_path) -> None:
+    frame = long_table()
+    frame.loc[700, "gap"] = -1.0
+    frame.loc[1100, "ahead"] = 77
+    path = written(tmp_path, frame)
+    report = TableSource(path=path, columns=BY_GAP).load().report
+    where = f"the first: {path}: recording my, data row"
+    assert [line for line in report if line.startswith("left out 1 sample:")] == [
+        f"left out 1 sample: the preceding vehicle is not seen in that frame, {where} 1101, "
+        "vehicle 3, column 'ahead'",
+        f"left out 1 sample: gap beyond min_gap_m=0, {where} 701, vehicle 2, column 'gap'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("units", "first"),
+    [
+        ({"gap": "ft"}, "with data.units.gap=m it would be 1.00 m, with data.units.speed=ft"),
+        ({"speed": "km/h"}, "with data.units.speed=m/s it would be 1.00 m, with data.units.gap=ft"),
+        ({"speed": "kn"}, "with data.units.speed=m/s it would be 1.00 m$"),
+    ],
+)
+def test_a_unit_declared_for_si_is_named(tmp_path, units, first) -> None:
+    frame = named()
+    frame["v"] *= 3.0 / 3.6  # m/s, fast enough to tell
+    frame["gap"] *= 3.0 * FOOT
+    path = written(tmp_path, frame)
+    with pytest.raises(DataError, match=rf"say 1 m, .*max_mismatch=1\.5; {first}"):
+        TableSource(path=path, columns=BY_GAP, units=units).load()
+    with pytest.raises(
+        DataError, match=r"0\.0001 s apart; .* is the time in s \(data\.units\.time="
+    ):
+        TableSource(path=path, columns=BY_GAP, units={"time": "ms"}).load()
+
+
+def test_the_report_of_an_extraction_without_episode_is_divided_by_semicolons(tmp_path) -> None:
+    path = written(tmp_path, long_table(rows=100))
+    with pytest.raises(
+        DataError, match=r"lasts 9\.9 s; 2 candidates: .* another; removed 2: min_d"
+    ):
+        TableSource(path=path, columns=BY_GAP).load()
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.pieces import CalibratedDrivers
 from lcc_rl.pieces.world import World
+from lcc_rl.runs.progress import Phases
 
 
 @pytest.fixture
@@ -130,3 +131,30 @@ def test_drivers_keep_the_names_of_the_data(cfg, tmp_path):
 def test_spreads_are_those_of_a_sample():
     assert calibration._spread(pd.Series([0.0, 2.0])) == "1.00 ± 1.41"  # n − 1
     assert calibration._spread(pd.Series([2.0, 2.0])) == "2.00 (all)"
+
+
+def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
+    path = source / "episodes.parquet"
+    table = pd.read_parquet(path).reset_index(drop=True)
+    table["gap_m"] = table["gap_m"].where(table.index != 438)  # a blank cell in the middle of one
+    table.to_parquet(path)
+    out, lines = io.StringIO(), []
+    cfg.calibration["modes"] = ["local"]
+    tell = lines.extend
+    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), tell)
+    assert len(drivers) == 4
+    assert any(line.startswith("local: RMSPE of 4 records of 3 drivers: ") for line in lines)
+    assert "4 records of 3 drivers" in out.getvalue()
+
+
+def test_phases_report_lines_with_the_time_left_where_there_is_no_terminal():
+    lines, quiet = [], Console(file=io.StringIO())
+    with Phases("calibration", quiet, lines.extend, every=0.0) as progress:
+        for phase in ("generations", "reactions tried"):
+            for done in (1, 2):
+                progress(done, 2, phase)
+    assert lines[-1] == "calibration: reactions tried: 2/2  ETA 0:00"
+    assert len(lines) == 4
+    with Phases("calibration", quiet, lines.extend) as progress:
+        progress(1, 2, "generations")
+    assert len(lines) == 4

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from lcc_rl.commands.pipeline import _pass_on
+from lcc_rl.drivers import twins
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
 from lcc_rl.drivers.parameters import COLUMNS
@@ -153,3 +154,11 @@ def test_twins_of_one_delay_meet_the_same_noise() -> None:
     assert (quiet.pop("rmspe") < 1e-9).all()
     pd.testing.assert_frame_equal(quiet, recorded(observed), rtol=1e-9)
     assert (loud["lost_1.1s_j"] > quiet["lost_1.1s_j"]).all()
+
+
+def test_the_search_for_a_reaction_reports_its_progress(monkeypatch) -> None:
+    monkeypatch.setattr(twins, "DELAYS", (0.0, 0.1))
+    episodes, known = followed(0.0, 0.0, drivers=2)
+    seen = []
+    tried(observe(episodes), known, lambda *state: seen.append(state))
+    assert seen == [(13, 26, "reactions tried"), (26, 26, "reactions tried")]

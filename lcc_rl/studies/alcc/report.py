@@ -116,8 +116,8 @@ def _headline(page: Page, means: Means) -> None:
         weighted network for itself (own_energy) is that one, whose own energy counts as often as
         alcc's reward has terms of energy: what it saves is due to that weight, not to regard for
         others. One driver (idm) is one human in the car's place, simulated drivers (human) are
-        those of the population in that place, without noise of their own; without an automated
-        car (direct), the human driver is directly behind the leader.
+        those of the population in that place, with the noise of all human drivers; without an
+        automated car (direct), the human driver is directly behind the leader.
 
         All meet the same {means.size()} with the same noise. Energies are means per episode,
         over all seeds; savings are positive where energy is saved. Path energy is what the speeds
