@@ -343,6 +343,6 @@ def check_distinct(strategies: Sequence[Strategy]) -> None:
     for name, seed in (key for key, count in counts.items() if count > 1):
         which = name if seed is None else f"{name} with training seed {seed}"
         raise ConfigError(
-            f"policy and compare name two policies of variant {which}: give each a name of its "
+            f"policy and compare name two policies called {which}: give each a name of its "
             "own, 'compare={first: …, second: …}'"
         )

@@ -179,6 +179,17 @@ def test_all_scores_of_a_ring_name_the_damped_episodes_and_their_mean_time(capsy
     assert rows == [["0%", "67%"], ["–", "35"]]
 
 
+def test_a_table_in_a_pipe_is_as_wide_as_its_content_or_as_columns(monkeypatch, capsys) -> None:
+    rows = [driven(name, 1.0, 1.0) for name in ("human", *(f"own{n}" for n in range(9)))]
+    table = in_full(scores(pd.concat(rows), TASK, MOTOR), "", TASK)
+    widths = {}
+    for columns in ("", "80"):
+        monkeypatch.setenv("COLUMNS", columns) if columns else monkeypatch.delenv("COLUMNS", False)
+        show(table)
+        widths[columns] = max(map(len, capsys.readouterr().out.splitlines()))
+    assert widths["80"] == 80 < widths[""]
+
+
 @pytest.mark.parametrize(
     ("change", "kept"),
     [
