@@ -128,10 +128,8 @@ def sweep(command: Callable[[], Any]) -> None:
     try:
         command()
     except (KeyboardInterrupt, Exception) as error:
-        if was_interrupted(error) and not isinstance(input_error(error), Interrupted):
-            folder = SweepCallback.end()
-            if folder is None:
-                raise KeyboardInterrupt from error
+        folder = SweepCallback.end()
+        if folder is not None and was_interrupted(error):
             raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
         raise
     finally:

@@ -27,8 +27,9 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
     """
     path = f"policy={cfg.policy}"
     wanted = (own.task or {}).get("name")
-    if wanted is not None and wanted != (cfg.task or {}).get("name"):
+    if wanted is not None and cfg.task is None:
         raise ConfigError(f"{path} was trained for a task: add task={wanted}")
+    check_scenario(path, own, cfg)
     hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
         raise ConfigError(f"{path} was trained as variant {own.variant}, not {cfg.variant}")
@@ -46,14 +47,14 @@ def _observed(cfg: StudyConfig) -> dict[str, Any]:
 
 
 def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
-    """Check that a policy to compare with was trained in the scenario under study.
+    """Check that a policy was trained in the scenario under study.
 
     Raises:
         ConfigError: naming both.
     """
     if own.scenario.name != cfg.scenario.name:
         raise ConfigError(
-            f"compare: {path} was trained as variant {own.variant}, in the scenario "
+            f"{path} was trained as variant {own.variant}, in the scenario "
             f"{own.scenario.name}, not in {cfg.scenario.name}"
         )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -297,15 +297,15 @@ def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     """Return strategies whose names differ wherever their training differs by more than the seed.
 
     A variant that several kinds of agents learned gets the agent's name; one whose settings differ
-    otherwise gets the name of the file or folder that its policy comes from.
+    otherwise, or that has a seed twice, gets the name of the file or folder of its policy.
     """
     kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
     found = _where_several(strategies, kinds, kinds)
-    return _where_several(found, [_settings(one) for one in found], [_place(one) for one in found])
+    return _where_several(found, _trainings(found), [_place(one) for one in found])
 
 
 def _where_several(
-    strategies: Sequence[Strategy], marks: Sequence[str], labels: Sequence[str]
+    strategies: Sequence[Strategy], marks: Sequence[Hashable], labels: Sequence[str]
 ) -> list[Strategy]:
     different = Counter(
         name for name, _ in {(s.name, m) for s, m in zip(strategies, marks, strict=True)}
@@ -316,11 +316,15 @@ def _where_several(
     ]
 
 
-def _settings(strategy: Strategy) -> str:
-    if strategy.policy is None:
-        return ""
-    cfg = strategy.cfg
-    return json.dumps([cfg.agent, cfg.scenario.filters], sort_keys=True)
+def _trainings(strategies: Sequence[Strategy]) -> list[Hashable]:
+    """Return what sets policies of a name apart: their settings, and which of one seed they are."""
+    found: list[Hashable] = []
+    of_seed: Counter[Hashable] = Counter()
+    for one in strategies:
+        of_seed[one.name, one.seed] += 1
+        settings = json.dumps([one.cfg.agent, one.cfg.scenario.filters], sort_keys=True)
+        found.append((settings, of_seed[one.name, one.seed]) if one.policy else None)
+    return found
 
 
 def _place(strategy: Strategy) -> str:
@@ -338,6 +342,6 @@ def check_distinct(strategies: Sequence[Strategy]) -> None:
     for name, seed in (key for key, count in counts.items() if count > 1):
         which = name if seed is None else f"{name} with training seed {seed}"
         raise ConfigError(
-            f"policy and compare name two policies of variant {which}, whose rows could not be "
-            "distinguished; evaluate them one after the other"
+            f"policy and compare name two policies called {which}: give each a name of its "
+            "own, 'compare={first: …, second: …}'"
         )

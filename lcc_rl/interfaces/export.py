@@ -23,7 +23,8 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.evaluation.named import is_policy, rules
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.io.atomic import atomic_path, new_file
@@ -31,7 +32,7 @@ from lcc_rl.pieces import Action, CBFFilter, Observation
 from lcc_rl.pieces.cbf import STATE
 from lcc_rl.pieces.entries import ENTRIES
 from lcc_rl.pieces.knowledge import ObservationMemory
-from lcc_rl.results.policies import load_policy
+from lcc_rl.results.policies import PRETRAINED, load_policy
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
@@ -206,6 +207,11 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
     path = new_file(path, "name")
     if path.suffix not in FORMS:
         raise unknown_name("ending", path.suffix, FORMS)
+    require(
+        is_policy(str(policy)) or str(policy) not in rules(),
+        f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
+        f"file or {PRETRAINED}/<name>",
+    )
     content = FORMS[path.suffix](policy, trust)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)

@@ -227,8 +227,9 @@ class DriverModel(Drivers):
     :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
     """
 
-    desired_speed: Positive | None = None  # v0 of every vehicle; None: of the population [m/s]
-    time_gap: Positive | None = None  # T of every vehicle, likewise [s]
+    # v0 of every vehicle; None: of the population [m/s]. Needs time_gap, too.
+    desired_speed: Positive | None = None
+    time_gap: Positive | None = None  # T of every vehicle, likewise [s]; needs desired_speed, too
     # Those besides v0 and T, the law's constants; None: of the population.
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 

@@ -94,7 +94,7 @@ class StringMotion(StepTransform):
     start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
     circumference: Positive | None = None  # of a ring road [m]
     circumference_range: Factors = (1.0, 1.0)  # factor of it in training; evaluation takes 1
-    vehicle_length: Positive = 5.0  # of every vehicle, of use on a ring road only [m]
+    vehicle_length: Positive = 5.0  # of every vehicle, for the flow, and on a ring for the gaps [m]
     # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
     initial_speed: Speed = 0.0
 

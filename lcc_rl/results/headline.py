@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -239,9 +240,9 @@ def in_full(found: pd.DataFrame, title: str) -> Group:
 
 
 def show(table: Table | Group | Text) -> None:
-    """Print a table or a text, as wide as the terminal or, without one, as its content."""
+    """Print a table or a text, as wide as the terminal or ``COLUMNS``; else as its content."""
     console = Console()
-    if not console.is_terminal:
+    if not console.is_terminal and "COLUMNS" not in os.environ:
         wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width
         console = Console(width=max(wide, console.width))
     console.print(table)

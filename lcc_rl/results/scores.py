@@ -26,7 +26,7 @@ PER_DISTANCE = {
     "path_energy": "total_path_energy_kj",
 }
 PLAIN = ("final_speed_spread_mps", "speed_std_mps", "string_ratio")
-SCORE, DISTANCE = "score", "distance_m"
+SCORE, DISTANCE, DAMPING = "score", "distance_m", "damping_time_s"
 MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", "flow_vph", "string_ratio")
 # Columns that may have a limit, and what tables call them.
 HEADINGS = {
@@ -90,7 +90,8 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
     Returns:
         One row per strategy: seeds, windows, drives, score, the share saved against
         ``task.against`` with its interval, the share of the distance that is lost against it, means
-        of gap, speed and traffic, the value of every limit, collisions, and whether the strategy
+        of gap, speed and traffic, on a ring the share of episodes that are damped and their mean
+        damping time, the value of every limit, collisions, and whether the strategy
         keeps all limits and never collides.
 
     Raises:
@@ -118,6 +119,8 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
         row |= {"score": value, **share.columns("saving")}
         row |= {"distance_lost": 1.0 - part[DISTANCE].mean() / whole}
         row |= {column: part[column].mean() for column in MEANS if column in part}
+        if DAMPING in part:  # on a ring; the mean is over the episodes that are damped
+            row |= {"damped": part[DAMPING].notna().mean(), DAMPING: part[DAMPING].mean()}
         row |= limits | {"collisions": int(part["collided"].sum())}
         kept = all(keeps(column, limits[column], task.limits[column]) for column in limits)
         found.append(row | {"kept": kept and not row["collisions"]})
@@ -209,6 +212,8 @@ def in_full(table: pd.DataFrame, title: str, task: Task) -> Group:
         ("mean speed [m/s]", "mean_speed_mps", "{:.2f}"),
         ("spread of speeds at the end [m/s]", "final_speed_spread_mps", "{:.2f}"),
         ("flow [vehicles/h]", "flow_vph", "{:.0f}"),
+        ("episodes whose wave is damped", "damped", "{:.0%}"),
+        ("  their mean damping time [s]", DAMPING, "{:.0f}"),
         ("string ratio", "string_ratio", "{:.2f}"),
         *(
             (

@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 from lcc_rl.errors import Interrupted, LccError, ResultsError, input_error, one_line
 from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
+from lcc_rl.runs.interrupts import was_interrupted
 
 LOCK, ERROR, PROGRESS, HYDRA = ".lock", "error.txt", "progress.json", ".hydra"
 # The table that a run writes last: a training or evaluation, a calibration.
@@ -154,7 +155,12 @@ def _holds_only(folder: Path, names: set[str]) -> bool:
 
 
 def record(folder: Path, error: Exception) -> None:
-    """Write ``error.txt``: the error in one line, with a traceback unless it is an input error."""
+    """Write ``error.txt``: the error in one line, with a traceback unless it is an input error.
+
+    An error that followed from an interrupt is no failure and leaves no file.
+    """
+    if was_interrupted(error):
+        return
     text = described(error) + "\n"
     if not isinstance(input_error(error) or error, (LccError, OSError)):
         text += "\n" + "".join(traceback.format_exception(error))

@@ -28,7 +28,7 @@ from lcc_rl.config import NOT_IDENTITY, identity, key_of, parsed
 from lcc_rl.errors import Interrupted, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
-from lcc_rl.runs.interrupts import BAD_INPUT
+from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.search import register as register_search
 from lcc_rl.runs.states import Busy, busy, described, is_claimed, record, survey
@@ -234,6 +234,8 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         log.info("%s: left to it", error)
         return NO_RESULT
     except Exception as error:
+        if was_interrupted(error):  # the interrupt broke into a library, which made it this error
+            raise KeyboardInterrupt from error
         record(folder, error)
         log.error("%s failed: %s", folder.name, described(error))
         return NO_RESULT

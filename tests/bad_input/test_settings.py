@@ -14,7 +14,7 @@ from table_text import long_table
 from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
-from lcc_rl.data import tables
+from lcc_rl.data import text
 from lcc_rl.data.leaders import Mixture
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import ConfigError
@@ -152,7 +152,7 @@ def test_a_table_larger_than_memory(tmp_path, monkeypatch, more) -> None:
     columns = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
     source = TableSource(path=str(path), columns=columns)
     source.load()
-    for module in (memory, tables):
+    for module in (memory, text):
         monkeypatch.setattr(module, "available", lambda device="cpu": 29_000)
     with pytest.raises(ConfigError, match=r"reading .*big\.csv\.gz needs about"):
         source.load()

@@ -63,8 +63,18 @@ def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
     other = replace(ddpg, cfg=compose("alcc", "agent.gamma=0.5"), source="runs/b/policy.pt")
     named = named_apart([replace(ddpg, source="runs/a.pt"), other])
     assert [one.name for one in named] == ["alcc a", "alcc b"]
-    with pytest.raises(ConfigError, match="two policies of variant alcc with training seed 0"):
-        check_distinct([ddpg, ddpg])
+
+
+def test_policies_of_one_training_are_named_by_their_files_and_one_file_is_refused() -> None:
+    policy = TensorDictModule(torch.nn.Linear(1, 1), ["a"], ["b"])
+    shipped = Strategy("alcc", compose("alcc"), policy, 0, "pretrained/i24-mixed")
+    own = replace(shipped, source="runs/mine/policy.pt")
+    named = named_apart([shipped, own])
+    assert [one.name for one in named] == ["alcc i24-mixed", "alcc mine"]
+    check_distinct(named)
+    twice = named_apart([own, replace(own, source="runs/mine")])
+    with pytest.raises(ConfigError, match=r"alcc mine with training seed 0.*compare=\{first"):
+        check_distinct(twice)
 
 
 @pytest.mark.parametrize(
@@ -82,3 +92,11 @@ def test_a_policy_of_other_settings_is_refused(variant, words, expected) -> None
     check_policy(cfg, compose("alcc"))
     with pytest.raises(ConfigError, match=expected):
         check_policy(cfg, compose(variant, *words))
+
+
+def test_a_policy_of_a_task_is_refused_without_a_task_and_in_another_scenario() -> None:
+    own = compose("alcc", "task=i24-follow5")
+    with pytest.raises(ConfigError, match="add task=i24-follow5"):
+        check_policy(compose("alcc"), own)
+    with pytest.raises(ConfigError, match="in the scenario leading_cruise, not in ring"):
+        check_policy(compose("alcc", "task=ring-22"), own)

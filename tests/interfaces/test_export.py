@@ -91,7 +91,11 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("words", "expected"),
-    [(["pretrained/alcc", "x.tflite"], "ending"), (["pretrained/nobody", "x.onnx"], "nobody")],
+    [
+        (["pretrained/alcc", "x.tflite"], "ending"),
+        (["pretrained/nobody", "x.onnx"], "nobody"),
+        (["idm_acc", "x.onnx"], "idm_acc is a rule; only a trained policy"),
+    ],
 )
 def test_bad_input_is_one_clear_error(words, expected) -> None:
     with pytest.raises(ConfigError, match=expected):

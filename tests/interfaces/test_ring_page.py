@@ -65,7 +65,9 @@ const read = () => { show(); return el("span").textContent; }, names = [read()];
 el("skip").click(); names.push(read());
 const wave = readings()[3];
 document.querySelector("[value=network]").click(); advance(50); names.push(read());
-document.title = JSON.stringify([names, wave, el("note3").textContent]);
+const note = el("note3").textContent, leads = [el("lead").textContent];
+el("count").value = 18; el("count").oninput(); leads.push(el("lead").textContent);
+document.title = JSON.stringify([names, wave, note, leads.map(text => parseInt(text))]);
 </script>"""
 
 
@@ -152,11 +154,12 @@ def test_filter_and_fuel_are_the_packages_in_any_state(browser) -> None:
 
 
 def test_readings_name_their_time_and_the_skip_ends_in_a_wave(browser) -> None:
-    span, spread, compared = browser(ring_page(RING), VISIT)
+    span, spread, compared, counts = browser(ring_page(RING), VISIT)
     names = ["Mean since the start: 0 s", "Mean of the last minute", "Mean since the handover: 5 s"]
     assert span == names
     assert 2.0 < spread < 4.0  # [m/s], seed 2: 0.8 after five minutes
     assert re.fullmatch(r".+ %, before 2\.\d\d", compared)
+    assert counts == [22, 18]  # of the lead
 
 
 @pytest.mark.parametrize("policy", ["pretrained/ddpg", "idm_acc"])

@@ -10,7 +10,8 @@ import torch
 from lcc_rl.energy import CirclesFuel, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measure
-from lcc_rl.results.scores import Task, scores
+from lcc_rl.results.headline import show
+from lcc_rl.results.scores import Task, in_full, scores
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.studies.hcfs.tables import win_rates
@@ -166,6 +167,27 @@ def test_a_score_is_energy_over_distance_and_falling_behind_gains_nothing() -> N
     assert found.loc["behind", "distance_lost"] == pytest.approx(0.1)
     assert np.isnan(found.loc["human", "saving"])
     assert TASK.among(["own"]).against == "own"
+
+
+def test_all_scores_of_a_ring_name_the_damped_episodes_and_their_mean_time(capsys) -> None:
+    never = driven("human", 1.0, 1.0).assign(damping_time_s=np.nan)
+    own = driven("own", 1.0, 1.0, 1.0).assign(damping_time_s=[30.0, 40.0, np.nan])
+    found = scores(pd.concat([never, own]), TASK, MOTOR)
+    show(in_full(found, "", TASK))
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line.split()[-2:] for line in lines if "damp" in line]
+    assert rows == [["0%", "67%"], ["–", "35"]]
+
+
+def test_a_table_in_a_pipe_is_as_wide_as_its_content_or_as_columns(monkeypatch, capsys) -> None:
+    rows = [driven(name, 1.0, 1.0) for name in ("human", *(f"own{n}" for n in range(9)))]
+    table = in_full(scores(pd.concat(rows), TASK, MOTOR), "", TASK)
+    widths = {}
+    for columns in ("", "80"):
+        monkeypatch.setenv("COLUMNS", columns) if columns else monkeypatch.delenv("COLUMNS", False)
+        show(table)
+        widths[columns] = max(map(len, capsys.readouterr().out.splitlines()))
+    assert widths["80"] == 80 < widths[""]
 
 
 @pytest.mark.parametrize(

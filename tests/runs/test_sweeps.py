@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -53,6 +54,27 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
         third = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
     assert "another process" in third.stdout
     assert not table.exists()
+
+
+@pytest.mark.parametrize(
+    "where", ["agents.loop.ProgressReporter.update", "commands.training.build_agent"]
+)
+def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypatch, where) -> None:
+    """Within an iteration, and where a library answers an interrupt with an error of its own."""
+
+    def interrupted(*_: object) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("broken") from error
+
+    monkeypatch.setattr(f"lcc_rl.{where}", interrupted)
+    words = ("-m", *TINY, "variant=alcc", "seed=0,1", "sweep=mine")
+    done = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
+    line = "lcc_rl: stopped; the same command resumes it in outputs/train/mine\n"
+    assert (done.returncode, done.stderr) == (130, line)
+    assert not list(tmp_path.rglob("error.txt"))
+    assert len(list(tmp_path.rglob("train.log"))) == 1  # the second run has not begun
 
 
 def test_a_sweep_is_read_as_one_table(tmp_path) -> None:
