@@ -24,6 +24,7 @@ from lcc_rl.functional.laws import LAWS
 
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
 THOROUGH = GeneticSettings(population=128, generations=150, patience=20)
+EXPONENT = ("idm", {"exponent": 2.5})
 EACH = pytest.mark.parametrize("model", list(LAWS))
 KNOWN: dict[str, dict[str, float]] = {
     "idm": {"acceleration": 1.8, "deceleration": 2.5, "min_gap": 3.0},
@@ -80,7 +81,10 @@ def reference_measures(observed, candidates, model, constants) -> dict[str, torc
 
 
 @pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("model", "more"), [*((x, {}) for x in LAWS), ("idm", {"exponent": 2.5})])
+@pytest.mark.parametrize(
+    ("model", "more"),
+    slow_but([("gipps", {}), EXPONENT], [*((x, {}) for x in LAWS), EXPONENT]),
+)
 def test_errors_are_those_of_the_plain_simulation(model, more, compiled, uneven_lengths):
     observed, names = observe(uneven_lengths), fitted("global", model)
     constants, candidates = LAWS[model].constants(**more), random_candidates(model, 3, 6)

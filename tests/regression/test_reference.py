@@ -122,7 +122,8 @@ def compare(found: torch.Tensor, reference: np.ndarray, what: str) -> None:
         )
 
 
-@pytest.mark.parametrize("name", sorted(CASES))
+# Every second one is quick; make test-all plays all.
+@pytest.mark.parametrize("name", slow_but(sorted(CASES)[::2], sorted(CASES)))
 def test_rollouts(name) -> None:
     data = arrays(f"rollouts/{name}.npz")
     played = roll(name)
