@@ -80,22 +80,26 @@ def saving(
 
     Returns:
         The share with its interval; without one if there is one window and one seed of each, or if
-        resampled baselines are of both signs: then no share of them means anything. If a side has
-        one seed, the interval does not cover what another seed would change.
+        resampled baselines are of both signs: then no share of them means anything. The share of a
+        baseline of zero is NaN. If a side has one seed, the interval does not cover what another
+        seed would change.
     """
     sides = [np.asarray(side, dtype=np.float64) for side in (values, baseline)]
     driven = [np.asarray(side, dtype=np.float64) for side in ways or map(np.ones_like, sides)]
-    value = share_saved(*(_mean(x) / _mean(way) for x, way in zip(sides, driven, strict=True)))
+    ours, theirs = (_mean(x) / _mean(way) for x, way in zip(sides, driven, strict=True))
+    if theirs == 0.0:
+        return Estimate(np.nan)
+    value = share_saved(ours, theirs)
     if max(shape for side in sides for shape in side.shape) < 2:
         return Estimate(value)
     means = (
         _means(x, stream, drives) / _means(way, stream, drives)
         for x, way, stream in zip(sides, driven, (1, 1 if paired else 2), strict=True)
     )
-    ours, theirs = means
-    if theirs.min() < 0.0 < theirs.max():
+    own, other = means
+    if other.min() <= 0.0 <= other.max():
         return Estimate(value)
-    return Estimate(value, *bounds(share_saved(ours, theirs)))
+    return Estimate(value, *bounds(share_saved(own, other)))
 
 
 def _means(

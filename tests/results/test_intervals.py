@@ -117,6 +117,7 @@ def test_less_drawn_is_saved_also_where_the_baseline_gains() -> None:
     # A share of something that may be more or less than nothing has no interval.
     mixed, gained = np.array([[-3.0], [1.0], [-2.0]]), np.array([[-3.0], [-1.0], [-2.0]])
     assert np.isnan(saving(mixed - 1.0, mixed).low)
+    assert np.isnan(saving(mixed, np.zeros((3, 1))).value)
     found = saving(gained - 1.0, gained)
     assert found.low < found.value < found.high
 
