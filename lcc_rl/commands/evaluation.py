@@ -393,7 +393,7 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
     plan = episodes.plan_of(cfg, inputs)
-    drivers = f"{len(plan.chosen)} driver{'s' * (len(plan.chosen) > 1)}"
+    drivers = headline.several(len(plan.chosen), "driver")
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
     drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
     counts = Counter(inputs.evaluation.sources or [""] * plan.profiles)

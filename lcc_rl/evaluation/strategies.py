@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from copy import deepcopy
@@ -37,6 +38,7 @@ from lcc_rl.results.names import FILTERED, UNASKED
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
+DATED = re.compile(r"^\d{4}-\d\d-\d\d_(\d\d-\d\d-\d\d)-\d{6}_.*")
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
 RECORDED_START = "lcc_rl.pieces.RecordedStart"
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
@@ -329,7 +331,8 @@ def _trainings(strategies: Sequence[Strategy]) -> list[Hashable]:
 
 def _place(strategy: Strategy) -> str:
     path = Path(strategy.source)
-    return path.parent.name if path.name == POLICY else path.name.removesuffix(".pt")
+    name = path.parent.name if path.name == POLICY else path.name.removesuffix(".pt")
+    return DATED.sub(r"\1", name)  # of a run's folder the time of day
 
 
 def check_distinct(strategies: Sequence[Strategy]) -> None:

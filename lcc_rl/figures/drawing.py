@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -21,6 +22,7 @@ from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
 COLUMN, PAGE = 3.5, 7.2  # widths of one column of a journal, and of two [in]
+LABEL = 28  # signs of a name in one line of a figure
 # Decorates what draws: sizes of print, and letters that stay letters in vector formats.
 paper = mpl.rc_context(
     {
@@ -100,9 +102,14 @@ def legend_above(axis: Axes, columns: int = 3) -> Legend:
     )
 
 
+def lines_of(name: str) -> str:
+    """Return a strategy's name in words, in two lines at most."""
+    return fill(in_words(name), LABEL, max_lines=2, placeholder="…")
+
+
 def rows_of(axis: Axes, names: Sequence[str]) -> None:
     """Label the rows of a chart, the first at the top; without a name no label is drawn."""
-    axis.set_yticks(range(len(names)), [in_words(name) for name in names])
+    axis.set_yticks(range(len(names)), [lines_of(name) for name in names])
     axis.set_ylim(len(names) - 0.4, -0.6)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.cells import column_cells, signed
+from lcc_rl.results.headline import several
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.motion import telling
@@ -100,7 +102,7 @@ def study_figures(
         tables: as in :func:`write_figures`.
     """
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
-    several = episodes["driver_id"].nunique() > 2
+    many = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
     seeds = episodes.groupby("strategy")["training_seed"].count()
     own = [name for name in cars if name != RULE and (seeds[name] or not is_shipped(name))]
@@ -118,7 +120,7 @@ def study_figures(
             yield f"human_energy {name}", human_energy(means, name)
         # Who collides, and so drives less of an episode, saves nothing.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
-        for baseline in BASELINES if several and whole else ():
+        for baseline in BASELINES if many and whole else ():
             if baseline in names and baseline != name:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure
@@ -153,7 +155,8 @@ def overview(
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
-    left.set_title(f"one held-out episode: {in_words(strategy)}", loc="left", pad=16)
+    whose = shorten(in_words(strategy), 40, placeholder="…")
+    left.set_title(f"one episode: {whose}", loc="left", pad=16)
     legend_above(left)
     against = str(table.attrs["against"])
     what, _, unit = str(table.attrs["label"]).removesuffix("]").partition(" [")
@@ -168,8 +171,8 @@ def overview(
     right.set_xlim(low, high + 0.3 * (high - low))
     sizes = (episodes[name].nunique() for name in ("profile_id", "driver_id"))
     style(right, f"{what} saved\nagainst {in_words(against)} [%]")
-    title = "{} windows × {} drivers; lines: 95 % intervals".format(*sizes)
-    right.set_title(title, loc="right", pad=16)
+    size = " × ".join(map(several, sizes, ("window", "driver")))
+    right.set_title(f"{size}; lines: 95 % intervals", loc="right", pad=16)
     return figure
 
 

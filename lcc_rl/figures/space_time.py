@@ -13,10 +13,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import COLUMN, PAGE, new_figure, paper, unbox
+from lcc_rl.figures.drawing import COLUMN, PAGE, lines_of, new_figure, paper, unbox
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes, telling
-from lcc_rl.results.names import in_words
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
 EVERY = 5  # steps between the points of a line
@@ -61,7 +60,7 @@ def space_time(
     axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
     for axis, name in zip(axes, whole, strict=True):
         lines = _panel(axis, found[name], scale)
-        axis.set_title(in_words(name))
+        axis.set_title(lines_of(name))
         unbox(axis)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")

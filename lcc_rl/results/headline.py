@@ -140,15 +140,20 @@ def verdict(found: pd.DataFrame) -> str:
     )
 
 
+def several(count: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def counted(windows: int, which: str = "") -> str:
     """Return a number of windows in words, ``which`` such as ``"held-out "``."""
-    return f"{windows} {which}window{'s' * (windows != 1)}"
+    return several(windows, f"{which}window")
 
 
 def sample_of(episodes: pd.DataFrame) -> str:
     """Return how many windows and drivers an evaluation is of, for a title."""
     windows, drivers = (episodes[key].nunique() for key in KEYS)
-    return f"{windows} held-out windows × {drivers} drivers"
+    return f"{counted(windows, 'held-out ')} × {several(drivers, 'driver')}"
 
 
 def caption_of(table: pd.DataFrame, more: str = "") -> str:

@@ -9,6 +9,7 @@ from typing import Self
 import pandas as pd
 
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.headline import counted, several
 from lcc_rl.results.intervals import Estimate
 from lcc_rl.results.runs import EPISODES
 from lcc_rl.results.savings import WAYS, savings
@@ -83,7 +84,8 @@ class Means:
     def size(self) -> str:
         """Return the number of windows and drivers, in words."""
         windows = self.windows["profile_id"].nunique()
-        return f"{windows} held-out windows × {self.drivers['driver_id'].nunique()} drivers"
+        drivers = several(self.drivers["driver_id"].nunique(), "driver")
+        return f"{counted(windows, 'held-out ')} × {drivers}"
 
 
 def _per_km(table: pd.DataFrame) -> pd.DataFrame:
