@@ -143,13 +143,18 @@ def drawn(name: str, rows: list[Row]) -> Table:
     for heading in ("case", "batch", "median", "smallest … largest", "unit", "ratio", "to"):
         table.add_column(heading, justify="left" if heading in ("case", "unit", "to") else "right")
     for row in rows:
-        numbers = (row["value"], row["spread_low"], row["spread_high"])
-        value, low, high = (f"{x:,.0f}" if x >= 1000 else f"{x:.3g}" for x in numbers)
+        value, spread = numbers_of(row)
         batch, other = row["batch"] or "", row["alternative"]
         ratio = f"{row['ratio']:.3g}" if other else ""
-        spread = f"{low} … {high}"
         table.add_row(row["case"], str(batch), value, spread, row["unit"], ratio, other or "")
     return table
+
+
+def numbers_of(row: Any) -> tuple[str, str]:
+    """Return the median of a row, and the smallest and largest of its repeats."""
+    numbers = (row["value"], row["spread_low"], row["spread_high"])
+    value, low, high = (f"{x:,.0f}" if x >= 1000 else f"{x:.3g}" for x in numbers)
+    return value, f"{low} … {high}"
 
 
 def page(rows: pd.DataFrame) -> str:
@@ -159,12 +164,13 @@ def page(rows: pd.DataFrame) -> str:
     lines = [
         f"{'; '.join(where)}; load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."
     ]
-    lines += ["", "| case | batch | median | unit | ratio | to |", "|---|---|---|---|---|---|"]
+    lines += ["", "| case | batch | median | smallest … largest | unit | ratio | to |"]
+    lines += ["|---" * 7 + "|"]
     for _, row in rows.iterrows():
         batch = "" if pd.isna(row["batch"]) else f"{row['batch']:,}"
-        number = f"{row['value']:,.0f}" if row["value"] >= 1000 else f"{row['value']:.3g}"
         compared = pd.notna(row["alternative"])
         ratio, other = (f"{row['ratio']:.2f}", row["alternative"]) if compared else ("", "")
-        cells = (f"{row['benchmark']}: {row['case']}", batch, number, row["unit"], ratio, other)
+        case = f"{row['benchmark']}: {row['case']}"
+        cells = (case, batch, *numbers_of(row), row["unit"], ratio, other)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
