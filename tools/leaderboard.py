@@ -1,5 +1,6 @@
-"""Write the tables of tasks: python tools/leaderboard.py outputs/evaluate/<run>… (docs/tasks.md),
-and that of the files of lcc-rl score that are kept in outputs/reference/scores (leaderboard.md).
+"""Write the tables of docs/tasks.md and docs/leaderboard.md: python tools/leaderboard.py <run>…
+
+That of the leaderboard is of the files of lcc-rl score in outputs/reference/scores.
 
 Each run is an evaluation with task=…. Its scores, and the time that each strategy takes for a
 decision, measured here for one vehicle, are kept below --reference. Without runs the tables are
@@ -187,6 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_parquet(table, options.reference / f"{options.name or name}.parquet")
     write_tables(options.reference, options.page)
     write_board(SCORES, BOARD)
+    print(f"written: {options.page}, {BOARD}")
     return 0
 
 

@@ -119,7 +119,7 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         return Strategy(name, cfg)
     kept = cfg.scenario.filters.get(AUTOMATED) or {}
     named = any(str(word).endswith(FILTERED) for word in (name, who))
-    require(bool(kept) or not named, f"{name} drives behind the safety filter: add +filter=cbf")
+    require(bool(kept) or not named, f"{name} drives behind the safety filter, and there is none (+filter=cbf adds one)")
     held = bool(kept) and kept.get("time_gap", True) is not None
     controller = controller_of(who or name, held)
     if named:

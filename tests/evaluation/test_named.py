@@ -85,7 +85,7 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
     named = {"mine": "constant_filtered"}  # full throttle
     found = energies(lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a").rows)
     assert found["full"] != found["full_filtered"] == found["mine"]
-    with pytest.raises(LccError, match=r"add \+filter=cbf"):
+    with pytest.raises(LccError, match=r"\+filter=cbf adds one"):
         lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
 
 
