@@ -99,7 +99,9 @@ def saving(
     own, other = means
     if other.min() <= 0.0 <= other.max():
         return Estimate(value)
-    return Estimate(value, *bounds(share_saved(own, other)))
+    low, high = bounds(share_saved(own, other))
+    # Of two windows one is drawn, and the share of both may lie outside those of either.
+    return Estimate(value, min(low, value), max(high, value))
 
 
 def _means(

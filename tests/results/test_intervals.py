@@ -118,6 +118,10 @@ def test_less_drawn_is_saved_also_where_the_baseline_gains() -> None:
     mixed, gained = np.array([[-3.0], [1.0], [-2.0]]), np.array([[-3.0], [-1.0], [-2.0]])
     assert np.isnan(saving(mixed - 1.0, mixed).low)
     assert np.isnan(saving(mixed, np.zeros((3, 1))).value)
+    # Nothing is saved in either window, but less is driven where it costs more.
+    two = saving([[2.0], [9.0]], [[18.0], [1.0]], ways=([[1.0], [9.0]], [[9.0], [1.0]]))
+    assert (two.low, two.high) == (0.0, two.value)
+    assert two.value == pytest.approx(1 - 1.1 / 1.9)
     found = saving(gained - 1.0, gained)
     assert found.low < found.value < found.high
 
