@@ -119,7 +119,8 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         return Strategy(name, cfg)
     kept = cfg.scenario.filters.get(AUTOMATED) or {}
     named = any(str(word).endswith(FILTERED) for word in (name, who))
-    require(bool(kept) or not named, f"{name} drives behind the safety filter, and there is none (+filter=cbf adds one)")
+    words = f"{name} drives behind the safety filter, and there is none (+filter=cbf adds one)"
+    require(bool(kept) or not named, words)
     held = bool(kept) and kept.get("time_gap", True) is not None
     controller = controller_of(who or name, held)
     if named:
