@@ -101,7 +101,7 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
         return kind(**{key: value for key, value in given.items() if value != "???"})
     except ConfigError as error:
         if isinstance(error.__cause__, ValidationError):
-            raise refused(error.__cause__, kind, where) from error
+            raise refused(error.__cause__, kind, where) from None
         raise
 
 

@@ -98,7 +98,7 @@ def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
             return compose(entry, overrides=as_meant(overrides))
         return _composed(entry, tuple(as_meant(overrides)))
     except (*HYDRA_ERRORS, ValueError, TypeError) as error:  # Hydra raises some as plain ones
-        raise explained(error, overrides) from error
+        raise explained(error, overrides) from None
 
 
 @lru_cache(maxsize=512)  # an evaluation asks for its baselines several times
@@ -180,9 +180,9 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         raise ConfigError(
             f"{error.full_key} takes its value from {missing and missing.group()}, which is not "
             "there: do variant, task, scenario and reward fit each other?"
-        ) from error
+        ) from None
     except OmegaConfBaseException as error:  # a reference in a circle
-        raise ConfigError(" ".join(str(error).split())) from error
+        raise ConfigError(" ".join(str(error).split())) from None
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
@@ -193,7 +193,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         group = found.group(1) if found else ""
         if not group or not choices(group):
             raise
-        raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from error
+        raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from None
     check_used(content, overrides, sweep)
     return tree
 

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.envs.clock import reset_options
+from lcc_rl.envs.clock import is_whole, reset_options
 from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.envs.step import TERMINATED, TRUNCATED, Step, closure, entries, pieces_of
@@ -95,7 +95,7 @@ class ArrayEpisodes:
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> Array:
-        """Begin new episodes in some places.
+        """Begin new episodes in some places; what is refused changes nothing.
 
         Args:
             places: numbers of the places.
@@ -109,10 +109,11 @@ class ArrayEpisodes:
         Raises:
             ConfigError: naming the option that does not exist, or its range.
         """
-        for place in places if seeds is not None else ():
-            if (seed := seeds[place]) is not None:  # type: ignore[index]
-                self.generators[place].manual_seed(seed)
-        drawn = [torch.randint(2**31, (1, 1), generator=self.generators[i]) for i in places]
+        generators = [self.generators[place].clone_state() for place in places]
+        for place, generator in zip(places, generators, strict=True):
+            if seeds is not None and (seed := seeds[place]) is not None:
+                generator.manual_seed(seed)
+        drawn = [torch.randint(2**31, (1, 1), generator=each) for each in generators]
         if options:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
@@ -120,18 +121,21 @@ class ArrayEpisodes:
             state, seen = self._packed(moment)[places].numpy(), moment[OBSERVATION,][places].numpy()
         else:
             state, seen = self.begin(torch.cat(drawn).numpy())
+        for place, generator in zip(places, generators, strict=True):
+            self.generators[place] = generator
         self.state, self.observation = self.state.copy(), self.observation.copy()
         self.state[places], self.observation[places] = state, seen
         return self.observation
 
     def _given(self, seeds: Tensor, options: Mapping[str, Any]) -> TensorDict:
         """Return seeds and reset options as the TorchRL environment takes them."""
-        given, specs = TensorDict({SEED: seeds}, [self.count]), reset_options(self.env)
+        given = TensorDict({SEED: seeds}, [self.count])
+        specs = {".".join(key): spec for key, spec in reset_options(self.env).items()}
         for name, value in options.items():
-            if (spec := specs.get(as_key(name))) is None:
-                raise unknown_name("reset option", name, [".".join(key) for key in specs])
-            array, size = np.asarray(value), spec.shape.numel()
-            if array.dtype.kind not in "iu" or array.size not in (1, size):
+            if (spec := specs.get(name)) is None:
+                raise unknown_name("reset option", str(name), specs)
+            array, size = np.asarray(value, np.object_), spec.shape.numel()
+            if array.size not in (1, size) or not all(map(is_whole, array.flat)):
                 raise ConfigError(f"reset: {name} must be 1 or {size} whole numbers, got {value!r}")
             whole = torch.as_tensor(array.astype(np.int64)).flatten()
             given.set(as_key(name), whole.expand(size).reshape(spec.shape).clone())

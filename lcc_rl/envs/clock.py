@@ -33,6 +33,25 @@ def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
     return batch
 
 
+def is_whole(value: Any) -> bool:
+    """Whether a value is a whole number of 64 bits; truth values are none."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    return whole and -(2**63) <= value < 2**63
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Return a seed as an int; None stays None.
+
+    Raises:
+        ConfigError: naming the seed and its range.
+    """
+    if seed is None:
+        return None
+    if not (is_whole(seed) and 0 <= seed <= LAST_SEED):
+        raise ConfigError(f"seed must be a whole number from 0 to {LAST_SEED}, got {seed!r}")
+    return int(seed)
+
+
 class Clock(EnvBase):
     """Counts steps, truncates at the horizon and gives every episode a seed of its own.
 
@@ -92,10 +111,7 @@ class Clock(EnvBase):
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-        if seed is not None and not (whole and 0 <= seed <= LAST_SEED):
-            raise ConfigError(f"seed must be a whole number from 0 to {LAST_SEED}, got {seed!r}")
-        self.generator.manual_seed(0 if seed is None else seed)
+        self.generator.manual_seed(checked_seed(seed) or 0)
 
     def draw_seeds(self) -> torch.Tensor:
         """Draw a seed for a new episode in every place of the batch, ``[*batch, 1]``, int64."""

@@ -6,7 +6,7 @@ module registers them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -17,9 +17,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from lcc_rl.envs.arrays import ArrayEpisodes
+from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.factory import make_env
 from lcc_rl.envs.rowwise import Array
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 
 VARIANTS = ("alcc", "reference", "own_energy")
 TERMS, MASK = "reward_terms", "reset_mask"
@@ -37,6 +38,50 @@ def register() -> None:
                 vector_entry_point=f"{__name__}:CarFollowingVector",
                 kwargs={"variant": variant},
             )
+
+
+def _episodes(
+    variant: str, count: int, overrides: Sequence[str], held_out: bool, render_mode: Any
+) -> ArrayEpisodes:
+    """Build episodes side by side; arguments as of the environments.
+
+    Raises:
+        ConfigError: naming the setting at fault.
+    """
+    require(
+        render_mode is None,
+        f"render_mode must be None, got {render_mode!r}: nothing is drawn here; "
+        "lcc-rl animate draws the episodes of a run",
+    )
+    return ArrayEpisodes(make_env(variant, count, overrides, held_out=held_out, single=True))
+
+
+def _seeds(seed: Any, count: int) -> list[int | None]:
+    """Return the seed of each place, from a number, None or a list of these.
+
+    Raises:
+        ConfigError: naming a seed and its range, or the number of places.
+    """
+    given = np.asarray(seed, np.object_)
+    if given.ndim == 0:
+        first = checked_seed(given.item())
+        return [None if first is None else checked_seed(first + i) for i in range(count)]
+    if given.shape != (count,):
+        raise ConfigError(
+            f"seed must be a number or a list of {count}, got one of {list(given.shape)}"
+        )
+    return [checked_seed(each) for each in given]
+
+
+def _options(options: Any) -> dict[str, Any]:
+    """Return reset options as a dictionary of the caller's own.
+
+    Raises:
+        ConfigError: if they are none.
+    """
+    if not isinstance(options, Mapping | None):
+        raise ConfigError(f"options must be a dictionary of reset options, got {options!r}")
+    return dict(options or {})
 
 
 def _spaces(episodes: ArrayEpisodes) -> tuple[Box, Box]:
@@ -59,7 +104,8 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         render_mode: None; there is no rendering.
 
     Raises:
-        ConfigError: if an override is unknown or there is not just one automated vehicle.
+        ConfigError: if an override is unknown, there is not just one automated vehicle, or a
+            rendering is asked for.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
@@ -71,8 +117,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         held_out: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        env = make_env(variant, 1, overrides, held_out=held_out, single=True)
-        self.episodes, self.render_mode = ArrayEpisodes(env), render_mode
+        self.episodes = _episodes(variant, 1, overrides, held_out, render_mode)
         self.observation_space, self.action_space = _spaces(self.episodes)
         self.running = False
 
@@ -84,9 +129,13 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         Args:
             seed: of the series; None: the next episode of the series.
             options: see :meth:`lcc_rl.envs.arrays.ArrayEpisodes.reset`.
+
+        Raises:
+            ConfigError: naming the seed or the option and its range; nothing changes then.
         """
+        seed = checked_seed(seed)
+        observation = self.episodes.reset(FIRST, [seed], _options(options))[0]
         super().reset(seed=seed)
-        observation = self.episodes.reset(FIRST, [seed], options)[0]
         self.running = True
         return observation, {}
 
@@ -110,6 +159,10 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
     Args:
         num_envs: episodes side by side.
         variant, overrides, held_out, render_mode: see :class:`CarFollowing`.
+        max_episode_steps: None; ``scenario.horizon`` is the number of steps.
+
+    Raises:
+        ConfigError: as of :class:`CarFollowing`, or if ``max_episode_steps`` is given.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -121,13 +174,18 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         overrides: Sequence[str] = (),
         held_out: bool = False,
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
-        env = make_env(variant, num_envs, overrides, held_out=held_out, single=True)
-        self.episodes = ArrayEpisodes(env)
+        require(
+            max_episode_steps is None,
+            f"max_episode_steps={max_episode_steps} is no setting of the vector: "
+            f'use overrides=["scenario.horizon={max_episode_steps}"]',
+        )
+        self.episodes = _episodes(variant, num_envs, overrides, held_out, render_mode)
         self.single_observation_space, self.single_action_space = _spaces(self.episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.num_envs, self.render_mode = num_envs, render_mode
+        self.num_envs = num_envs
         self.running = np.zeros(num_envs, np.bool_)
 
     def reset(
@@ -145,18 +203,18 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
                 says where episodes begin, by default everywhere.
 
         Raises:
-            ConfigError: if seeds or mask do not fit the number of places.
+            ConfigError: if seeds or mask do not fit the number of places, and as of
+                :meth:`CarFollowing.reset`; nothing changes then.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
-        options, count = dict(options or {}), self.num_envs
-        mask = np.asarray(options.pop(MASK, np.ones(count, np.bool_)))
-        if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
-            raise ConfigError(f"{MASK} must be {count} truth values, one true, got {mask}")
-        seeds = [seed + i for i in range(count)] if isinstance(seed, int) else seed
-        if seeds is not None and len(seeds) != count:
-            raise ConfigError(f"seed must be a number or a list of {count}, got {seed}")
-        observation = self.episodes.reset(np.flatnonzero(mask), seeds, options)
-        self.running |= mask
+        options, count = _options(options), self.num_envs
+        mask = np.asarray(options.pop(MASK, [True] * count), np.object_)
+        truths = all(isinstance(each, bool | np.bool_) for each in mask.flat)
+        if mask.shape != (count,) or not truths or not mask.any():
+            raise ConfigError(f"{MASK} must be {count} truth values, one true, got {mask.tolist()}")
+        seeds, places = _seeds(seed, count), np.flatnonzero(mask)
+        observation = self.episodes.reset(places, seeds, options)
+        super().reset(seed=seeds[0])
+        self.running[places] = True
         return observation, {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:

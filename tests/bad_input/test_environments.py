@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections import deque
 
 import pytest
@@ -91,6 +92,16 @@ def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
     for seed in (2**32, 2**33, -1):
         with pytest.raises(ConfigError, match="seed must be a whole number from 0 to 4294967295"):
             env.set_seed(seed)
+
+
+@pytest.mark.parametrize(
+    "typed", ["wrong.option=1", "seed", "agent=dddpg", "scenario.horizon=0", "scenario.road=${a}"]
+)
+def test_a_wrong_setting_is_one_traceback(typed) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_env(overrides=[typed])
+    text = "".join(traceback.format_exception(caught.value))
+    assert text.count("Traceback") == 1
 
 
 @pytest.mark.parametrize("device", ["banana", *([] if torch.cuda.is_available() else ["cuda"])])

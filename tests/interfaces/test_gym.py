@@ -23,6 +23,18 @@ import lcc_rl.interfaces.gym  # noqa: E402
 DATA = ["data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
 SHORT = [*DATA, "scenario.horizon=20"]
 STILL = np.zeros((3, 1), np.float32)
+SEEDS, WHOLE = np.array([3, 4, 5]), "seed must be a whole number from 0 to 4294967295, got"
+EVERYWHERE = (-1, 3.0, True, np.True_, "3", 2**32, 2**64)
+BAD_SEEDS = (
+    (*EVERYWHERE, [3]),
+    (*EVERYWHERE, 2**32 - 2, [-1, 3, 4], [3, 4, 2**64], [3.0, 4, 5], SEEDS / 1.0, SEEDS > 3),
+)
+BAD_OPTIONS = (
+    ({5: 5}, "option '5'; valid"),
+    ("x", "options must be"),
+    ([1], "options must be"),
+    *(({"leader.profile": given}, "whole number") for given in ([[1], []], 2**63, True, "1")),
+)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +143,18 @@ def test_an_action_of_double_precision_changes_no_type(env, many) -> None:
         (lambda one, many: one.reset(options={"leader.profile": 0.5}), "1 whole number"),
         (lambda one, many: many.reset(options={"leader.start": [1, 2]}), "1 or 3 whole numbers"),
         (lambda one, many: one.reset(options={"leader.profile": 10**6}), "must lie in 0…"),
+        (lambda one, many: many.reset(options={"reset_mask": np.zeros((64, 2))}), "3 truth values"),
+        (lambda one, many: many.reset(options={"reset_mask": [[True], [], []]}), "3 truth values"),
+        *(
+            (lambda one, many, seed=seed, place=place: (one, many)[place].reset(seed=seed), WHOLE)
+            for place, seeds in enumerate(BAD_SEEDS)
+            for seed in seeds
+        ),
+        *(
+            (lambda one, many, given=given, place=place: (one, many)[place].reset(options=given), x)
+            for place in (0, 1)
+            for given, x in BAD_OPTIONS
+        ),
         (lambda one, many: many.step(np.zeros((2, 1))), r"must be \[3, 1\], got \[2, 1\]"),
         (lambda one, many: many.step(STILL + np.nan), "automated.action is nan at step 1"),
     ],
@@ -141,6 +165,46 @@ def test_what_cannot_take_effect_is_refused_in_one_line(env, many, call, message
     with pytest.raises(LccError, match=message) as error:
         call(env, many)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"options": {"leader.profil": 1}},
+        {"options": {"leader.profile": 10**6}},
+        {"options": {"reset_mask": [True]}},
+        {"options": "x"},
+        {"seed": -1},
+    ],
+)
+def test_a_refused_reset_changes_nothing(env, many, given) -> None:
+    for each, seed in ((env, 9), (many, [9, 9, 9])):
+        each.reset(seed=5)
+        expected, _ = each.reset()
+        each.reset(seed=5)
+        with pytest.raises(LccError):
+            each.reset(**{"seed": seed, **given})
+        np.testing.assert_array_equal(each.reset()[0], expected)
+
+
+def test_seeds_may_be_whole_numbers_of_numpy(env, many) -> None:
+    for each, seed, same in ((env, 3, SEEDS[0]), (many, 3, SEEDS[0]), (many, [3, 4, 5], SEEDS)):
+        expected, _ = each.reset(seed=seed)
+        np.testing.assert_array_equal(each.reset(seed=same)[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "message"),
+    [
+        (gymnasium.make, {"render_mode": "human"}, "render_mode must be None, got 'human'"),
+        (gymnasium.make_vec, {"render_mode": "human"}, "render_mode must be None, got 'human'"),
+        (gymnasium.make_vec, {"max_episode_steps": 10}, "scenario.horizon=10"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*render_mode")
+def test_what_cannot_be_made_is_refused_in_one_line(make, given, message) -> None:
+    with pytest.raises(LccError, match=message):
+        make("lcc_rl/alcc-v0", overrides=SHORT, **given)
 
 
 def test_an_episode_that_has_ended_takes_no_further_step(env) -> None:
