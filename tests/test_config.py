@@ -96,7 +96,10 @@ def test_every_choice_of_a_group_builds(group) -> None:
 def test_a_choice_that_is_there_cannot_be_added(words, said) -> None:
     with pytest.raises(ConfigError, match=said):
         load("train", words)
-    assert load("train", ["experiment=[limits,smoke]"]).training.episodes == 24
+    small = load("train", ["experiment=[limits,smoke]"])
+    assert small.training.episodes == 24
+    assert small.training.segment == small.scenario.horizon == 60  # no warning of nobody's setting
+    assert load("train", ["experiment=smoke"]).training.segment == 20
 
 
 def test_the_papers_recipes_are_the_defaults() -> None:

@@ -14,7 +14,7 @@ from commands import QUICK, TINY, UNTRAINED, jobs_in_threads, run_command, tiny
 import lcc_rl
 from lcc_rl import api
 from lcc_rl.commands import evaluation, training
-from lcc_rl.commands.pipeline import calibrate_once
+from lcc_rl.commands.pipeline import calibrate_once, read_once
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.policies import load_policy
 
@@ -113,7 +113,9 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
 def test_both_ways_of_a_calibration_are_reported_and_drivers_count_once(tmp_path, caplog) -> None:
     both = [QUICK, "calibration=both", QUICK.replace("local", "global")]
     with caplog.at_level("INFO", logger="lcc_rl"):
-        path = calibrate_once(tiny("pipeline", *both), tmp_path)
+        cfg = tiny("pipeline", *both)
+        read_once(cfg, tmp_path)
+        path = calibrate_once(cfg, tmp_path)
     count = len(read_parquet(path)) // 2
     words = rf"calibrated {count} drivers: mean RMSPE local \d+\.\d\d %, global \d+\.\d\d %"
     assert re.fullmatch(words, caplog.messages[-1])

@@ -52,9 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 print(run.printed(full=options.all))
                 return
             table = worded(run.table) if options.all else run.headline
+    note = table.attrs.get("caption", "")
     if names or options.format != "csv":
         table = for_print(table, names)
     print(FORMATS[options.format](table))
+    if note and options.format != "csv":
+        print(f"% {note}" if options.format == "latex" else f"\n{note}")
 
 
 def read_run(folder: Path, trust: Sequence[str]) -> Run:

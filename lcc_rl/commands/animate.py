@@ -22,6 +22,7 @@ from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
 from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.runs.states import no_run
 from lcc_rl.settings import NonNegative, Whole
 
 KEPT = "evaluation.sample_episodes=4"
@@ -107,7 +108,7 @@ def with_steps(folder: Path) -> Path:
         if (place / STEPS).is_file():
             return place
     if not (folder / CONFIG).is_file():
-        raise ConfigError(f"{folder}: not a run folder: it has no {CONFIG}")
+        raise no_run(folder)
     raise ResultsError(f"{folder}: holds no {STEPS}: not evaluated yet?")
 
 

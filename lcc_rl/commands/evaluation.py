@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import (
@@ -349,12 +350,14 @@ class Found(NamedTuple):
         table: a row per strategy.
         shorten: returns what a reader asks first.
         draw_all: draws the whole table under a title.
+        verdict: a sentence below it; empty for none.
     """
 
     of: str
     table: pd.DataFrame
     shorten: Callable[[pd.DataFrame], pd.DataFrame]
     draw_all: Callable[[pd.DataFrame, str], Group]
+    verdict: str = ""
 
     @property
     def short(self) -> pd.DataFrame:
@@ -364,8 +367,10 @@ class Found(NamedTuple):
     def drawn(self, title: str, full: bool = False) -> Table | Group:
         """Return the table for the terminal, with ``full`` all of it."""
         if full:
-            return self.draw_all(self.table, title)
-        return headline.as_rich(self.short, title, headline.caption_of(self.short))
+            drawn: Table | Group = self.draw_all(self.table, title)
+        else:
+            drawn = headline.as_rich(self.short, title, headline.caption_of(self.short))
+        return Group(drawn, Text(self.verdict)) if self.verdict else drawn
 
 
 def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
@@ -387,7 +392,9 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
             yield Found(source, scores.scores(part, task, energy), short, full)
         else:
             short = partial(headline.headline, energy=energy, filtered=filtered)
-            yield Found(source, summary(rows, source), short, headline.in_full)
+            table = summary(rows, source)
+            said = headline.verdict(table, of_few=False)
+            yield Found(source, table, short, headline.in_full, said)
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:

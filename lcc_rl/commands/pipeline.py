@@ -136,6 +136,7 @@ def _run(
     command: str,
 ) -> Rows:
     tell(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
+    read_once(cfg, folder)
     drivers = calibrate_once(cfg, folder)
     for part in (*trainings.values(), final):
         part.data = with_defaults(_episodes(cfg, folder))
@@ -176,16 +177,21 @@ def _episodes(cfg: PipelineConfig, folder: Path) -> dict[str, Any]:
     return node
 
 
+def read_once(cfg: PipelineConfig, folder: Path) -> None:
+    """Read the trajectories, check that they can be split, and keep them; skip what is there."""
+    if (folder / TRAJECTORIES).exists():
+        return
+    loaded = build_source(cfg.data).load()
+    _pass_on(loaded.report)
+    counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
+    tell(f"data: {(counts or loaded.report)[-1]}")
+    load_inputs(cfg, loaded.episodes).to_learn_from()
+    write_episodes(loaded.episodes, folder / TRAJECTORIES)
+
+
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
-    """Read the trajectories once, keep them, and calibrate; skip what is already there."""
-    table, drivers = folder / TRAJECTORIES, folder / "calibration" / "drivers.parquet"
-    if not table.exists():
-        loaded = build_source(cfg.data).load()
-        _pass_on(loaded.report)
-        counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
-        tell(f"data: {(counts or loaded.report)[-1]}")
-        load_inputs(cfg, loaded.episodes).to_learn_from()  # whether they can be split
-        write_episodes(loaded.episodes, table)
+    """Calibrate drivers to the trajectories in the folder, unless that is done."""
+    drivers = folder / "calibration" / "drivers.parquet"
     if not drivers.exists():
         shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
         own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})

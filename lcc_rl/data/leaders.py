@@ -31,6 +31,7 @@ from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, checked, parse
 
+LISTED = 8  # names in a line
 WHOLE = "full length"  # a case that is a whole record, before the record's name
 Nodes = Mapping[str, Mapping[str, Any] | None]
 
@@ -230,7 +231,33 @@ class TrajectoryLeaders(Settings):
         profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
         windows = varying(held_out.windows(horizon), self.least_variation)
-        return Leaders(training, windows, report=tuple(loaded.report))
+        report = (*loaded.report, *apart(training, held_out, loaded.vehicles))
+        return Leaders(training, windows, report=report)
+
+
+def apart(
+    training: Profiles, held_out: Profiles, vehicles: Mapping[int, str] | None = None
+) -> list[str]:
+    """Return a line on the recordings or vehicles that are held out; none where nothing is.
+
+    Args:
+        training, held_out: the two sides.
+        vehicles: names of the numbered vehicles, where the file names them.
+    """
+
+    def leader(name: str) -> str:
+        recording, _, number = name.rsplit("@", 1)[0].rpartition("/")
+        return f"{recording}/{(vehicles or {}).get(int(number), number)}"
+
+    for what, own, others in (
+        ("recordings", held_out.recordings, training.recordings),
+        ("vehicles", [*map(leader, held_out.names)], [*map(leader, training.names)]),
+    ):
+        if others and not set(own) & set(others):
+            names = list(dict.fromkeys(own))
+            more = f" … ({len(names)})" if len(names) > LISTED else ""
+            return [f"held out: {what} {', '.join(names[:LISTED])}{more}"]
+    return []
 
 
 class DriveLeaders(Settings):

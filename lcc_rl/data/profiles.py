@@ -315,7 +315,7 @@ class Split(Settings):
             use = "split.by=vehicle" if other else "split=single (train and evaluate on one)"
             raise DataError(
                 f"cannot split {len(profiles)} profiles by {self.by}: only {distinct} found; "
-                f"give more data, or use {use} or split.evaluation_share=1 (evaluate on all)"
+                f"give more data, or use {use}; evaluations also take split.evaluation_share=1"
             )
         held = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
         # Evenly spread over the sorted groups, the last always among them: deterministic and

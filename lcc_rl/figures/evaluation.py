@@ -111,7 +111,7 @@ def study_figures(
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and len(tables) == 1 and cars:
+    if len(steps) and cars and len(tables) == 1 and "saved_pct" in tables[0]:
         yield "overview", overview(episodes, steps, (own or cars)[-1], tables[0])
     for name in own:
         if len(steps) and (steps["strategy"] == name).any():

@@ -31,7 +31,8 @@ CAPTION = (
     "TTC < 4 s; time gap > 2.5 s above 1 m/s; all measures: table=all or --all."
 )
 BEHIND = "networks, and those called filtered, drive behind the safety filter; "
-COMPARED = "saved: against {}, with the 95 % interval over {}; distance against theirs; "
+COMPARED = "saved: against {}{}; distance against theirs; "
+INTERVAL = ", with the 95 % interval over {}"
 
 
 class Shown(NamedTuple):
@@ -87,14 +88,14 @@ def headline(
 
     Returns:
         A row per strategy with a controlled car, those that draw most first: path energy per
-        vehicle and km [kJ/km], the share saved [%] against :func:`baseline_of` with its interval,
-        the distance [%] against it, the shares of the time [%] with an unsafe time-to-collision
-        and a long time gap, and collisions. Its ``attrs`` hold the baseline (``against``), the
-        column that is compared (``score``) and its name with unit (``label``), the columns that
-        are ``shown`` and the ``caption``.
+        vehicle and km [kJ/km], of several strategies the share saved [%] against
+        :func:`baseline_of` with its interval and the distance [%] against it, the shares of the
+        time [%] with an unsafe time-to-collision and a long time gap, and collisions. Its
+        ``attrs`` hold the baseline (``against``), the column that is compared (``score``) and its
+        name with unit (``label``), the columns that are ``shown`` and the ``caption``.
     """
     cars = found[found[PATH].notna()].sort_values(PER_KM, ascending=False, kind="stable")
-    against = baseline_of(cars["strategy"])
+    against = baseline_of(cars["strategy"]) if len(cars) > 1 else None
     table = pd.DataFrame({"strategy": cars["strategy"]})
     table["who"] = [in_words(str(name)) for name in cars["strategy"]]
     table["energy_kj_per_km"] = cars[PER_KM]
@@ -109,21 +110,35 @@ def headline(
     table["long_time_gap_pct"] = (100.0 * cars["share_time_gap_long_moving"]).round(2)
     table["collisions"] = cars["collisions"]
     table = table.reset_index(drop=True)
-    saved = COMPARED.format(in_words(against), resampled(cars)) if against else ""
-    saved += BEHIND if filtered else ""
-    table.attrs |= {"against": against, "caption": CAPTION.format(saved), "shown": COLUMNS}
+    note = _comparison(table, cars, against) + (BEHIND if filtered else "")
+    table.attrs |= {"against": against, "caption": CAPTION.format(note), "shown": COLUMNS}
     table.attrs |= {"score": "energy_kj_per_km", "label": "path energy per km [kJ/km]"}
     return table
 
 
-def verdict(found: pd.DataFrame) -> str:
-    """Return in a sentence what came out for the network, from a summary; empty without one."""
-    rows = found.set_index("strategy").to_dict("index")
+def _comparison(table: pd.DataFrame, cars: pd.DataFrame, against: str | None) -> str:
+    """Return whom a headline compares with, and over what its intervals are, if it has any."""
+    if against is None:
+        return ""
+    known = table["saved_pct_low"].notna().any()
+    return COMPARED.format(in_words(against), INTERVAL.format(resampled(cars)) if known else "")
+
+
+def verdict(found: pd.DataFrame, of_few: bool = True) -> str:
+    """Return in a sentence what came out for the network, from a summary; empty without one.
+
+    Args:
+        found: of :func:`lcc_rl.results.tables.summary`.
+        of_few: whether windows that are too few for a finding have a sentence, too.
+    """
+    rows = found[found[PER_KM].notna()].set_index("strategy").to_dict("index")
     other = next((name for name in (*RULES, HUMAN) if name in rows), None)
     if NETWORK not in rows or other is None:
         return ""
     windows = rows[NETWORK]["windows"]
     if windows < FEW:
+        if not of_few:
+            return ""
         both = (f"{rows[name][PER_KM]:,.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
         return f"Per vehicle and km: {', '.join(both)}; {counted(windows)} allow no finding."
     key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_plain, as_text
-from lcc_rl.errors import ConfigError, LccError, ResultsError
+from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
+from lcc_rl.runs.states import no_run
 
 log = logging.getLogger("lcc_rl")
 
@@ -64,7 +65,7 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     """
     path = Path(folder) / CONFIG
     if not path.is_file():
-        raise ConfigError(f"{folder}: not a run folder: it has no {CONFIG}")
+        raise no_run(Path(folder))
     cfg, places = trusted(read_settings(path), str(path), trust)
     for place in places:
         log.warning("%s: %s names a place to write and is left out", path, place)

@@ -158,7 +158,9 @@ def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
     people = [shares[name] for name in ("human", "direct") if name in shares]
     for name in shares.index if people else ():
         if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
-            remedies.setdefault(name, "its desired_speed")
+            kind = "lcc_rl.pieces.LinearACC" if name == "acc" else "<its class>"
+            option = f"'compare={{faster: {{_target_: {kind}, desired_speed: 45}}}}'"
+            remedies.setdefault(name, option)
     return [
         f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
         f"time (more than {MOSTLY:.0%}): savings against it mean little. Raise v0: {remedy}"

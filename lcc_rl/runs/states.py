@@ -16,7 +16,14 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lcc_rl.errors import Interrupted, LccError, ResultsError, input_error, one_line
+from lcc_rl.errors import (
+    ConfigError,
+    Interrupted,
+    LccError,
+    ResultsError,
+    input_error,
+    one_line,
+)
 from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted
@@ -26,6 +33,7 @@ LOCK, ERROR, PROGRESS, HYDRA = ".lock", "error.txt", "progress.json", ".hydra"
 RESULTS = ("episodes.parquet", "drivers.parquet")
 CONFIG = "config.yaml"
 MARKS = {CONFIG, ERROR, LOCK, *RESULTS}
+NAMED = 3  # runs or tables that a message names
 STATES = ("finished", "running", "stopped", "failed")
 
 
@@ -229,6 +237,23 @@ def run_folders(root: Path) -> list[Path]:
             found.append(Path(place))
     parents = {parent for folder in found for parent in folder.parents}
     return sorted(folder for folder in found if folder not in parents)
+
+
+def no_run(folder: Path) -> ConfigError:
+    """Build the error for a folder that is no run, which names the runs and tables in it."""
+    runs = (
+        [run for run in run_folders(folder) if (run / CONFIG).is_file()] if folder.is_dir() else []
+    )
+    tables = sorted(folder.glob("tables/*.parquet"))
+    text = f"{folder}: not a run folder: it has no {CONFIG}"
+    for what, found in (("run", runs), ("table", tables)):
+        if found:
+            names = ", ".join(str(path.relative_to(folder)) for path in found[:NAMED])
+            more = f" … ({len(found)})" if len(found) > NAMED else ""
+            text += f"; it holds the {what}{'s' * (len(found) > 1)} {names}{more}"
+    if runs:
+        text += f"; lcc_rl.results.load({str(folder)!r}) reads all runs"
+    return ConfigError(text)
 
 
 def survey(root: Path) -> list[RunState]:

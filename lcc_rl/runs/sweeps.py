@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from shutil import which
+from typing import Any, ClassVar, NoReturn
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import configure_log
@@ -119,18 +120,17 @@ class SweepCallback(Callback):
         except OmegaConfBaseException:  # resume=nowhere: Hydra says so itself when it gets there
             return
         if is_claimed(folder):
-            print(f"lcc_rl: error: {busy(folder)}", file=sys.stderr)
-            # Hydra turns any other exception of a callback into a warning.
-            sys.exit(BAD_INPUT)
+            refuse(busy(folder))
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the plan and log the folder; exit with one line where it has too many runs."""
+        """Write the plan and log the folder; exit with one line where it cannot be run."""
+        if needs_slurm(config) and which("srun") is None:
+            refuse("there is no SLURM here (no srun); use hydra/launcher=lcc_submitit_local")
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
         plan = make_plan(config)
         if plan.runs > MOST_RUNS:
-            print(f"lcc_rl: error: a sweep has at most {MOST_RUNS} runs", file=sys.stderr)
-            sys.exit(BAD_INPUT)  # as above
+            refuse(f"a sweep has at most {MOST_RUNS} runs")
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)))
@@ -161,6 +161,17 @@ class SweepCallback(Callback):
             configure_log(cls.lines)
         folder, cls.folder, cls.table = cls.folder, None, None
         return folder
+
+
+def refuse(reason: object) -> NoReturn:
+    """Exit with one line; Hydra turns any other exception of a callback into a warning."""
+    print(f"lcc_rl: error: {reason}", file=sys.stderr)
+    sys.exit(BAD_INPUT)
+
+
+def needs_slurm(config: DictConfig) -> bool:
+    """Whether a sweep's launcher is that of SLURM."""
+    return str(config.hydra.launcher.get("_target_")).endswith(".SlurmLauncher")
 
 
 def mute() -> None:

@@ -45,6 +45,13 @@ def test_every_baseline_with_a_desired_speed_is_warned_of() -> None:
     assert said == ["direct", "human", "mine"]
 
 
+def test_the_remedy_for_a_controller_is_an_option() -> None:
+    rows = pd.DataFrame({"strategy": ["human", "acc", "mine"], FASTER: [0.1, 0.9, 0.8]})
+    acc, mine = (line.split("Raise v0: ")[1] for line in leader_too_fast(rows))
+    assert acc == "'compare={faster: {_target_: lcc_rl.pieces.LinearACC, desired_speed: 45}}'"
+    assert mine == "'compare={faster: {_target_: <its class>, desired_speed: 45}}'"
+
+
 def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:
     assert stretch("udds", 0.1, scale=2.0).speeds.max() > 50.0
     with pytest.raises(ConfigError, match=r"udds at scale=100 drives up to .* m/s, leader.plaus"):

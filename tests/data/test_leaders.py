@@ -18,6 +18,7 @@ from lcc_rl.data.leaders import (
     DriveLeaders,
     Mixture,
     RecordLeaders,
+    apart,
     from_trajectories,
     hashed,
     stretch,
@@ -285,3 +286,24 @@ def test_real_pairs_give_a_leader_each(shared_data) -> None:
     profiles = leader_profiles(loaded.episodes, 0.1)
     assert len(profiles) == 264
     assert len(set(profiles.recordings)) == 3
+
+
+@pytest.mark.parametrize(
+    ("by", "said"),
+    [("recording", "held out: recordings rec1"), ("vehicle", "held out: vehicles rec1/3")],
+)
+def test_the_report_names_what_is_held_out(by, said) -> None:
+    training, held_out = Split(by=by, evaluation_share=0.25)(wavy_profiles())
+    assert apart(training, held_out) == [said]
+    assert apart(held_out, held_out) == []  # one profile for both
+
+
+def test_one_recording_cannot_be_divided_and_the_remedies_say_where_they_hold() -> None:
+    words = r"use split.by=vehicle; evaluations also take split.evaluation_share=1$"
+    with pytest.raises(DataError, match=words):
+        Split()(wavy_profiles().select([0, 2]))
+
+
+def test_held_out_vehicles_have_the_names_of_their_file() -> None:
+    training, held_out = Split(by="vehicle", evaluation_share=0.25)(wavy_profiles())
+    assert apart(training, held_out, {3: "red van"}) == ["held out: vehicles rec1/red van"]

@@ -58,6 +58,9 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     score = run.headline.set_index("strategy").loc[against, "score"]
     assert any(f"{in_words(against)} & {score:{form}}" in latex for form in (".1f", ",.0f"))
     assert r"saved [\%]" in latex
+    assert latex.splitlines()[-1].startswith("% ")  # the note, as a comment
+    table_again([str(tmp_path), "--format", "markdown"])
+    assert not capsys.readouterr().out.splitlines()[-1].startswith("|")
     table_again([str(tmp_path), "--format", "latex", "--columns", "who,saved_pct"])
     heads = capsys.readouterr().out.splitlines()[2]
     assert heads.split(" & ") == ["driven by", r"saved [\%] \\"]

@@ -13,6 +13,8 @@ from PIL import Image
 from rich.console import Console
 from study_frames import episodes
 
+from lcc_rl.api import Run
+from lcc_rl.config import load
 from lcc_rl.figures.drawing import new_figure
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
@@ -151,3 +153,26 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     few = verdict(summary(frame[frame["profile_id"] < 4]))
     assert few.endswith("; 4 windows allow no finding.")
     assert "%" not in few
+    assert verdict(summary(frame[frame["profile_id"] < 4]), of_few=False) == ""
+
+
+def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> None:
+    cfg = load("evaluate", ["variant=alcc"])
+    frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})
+    run = Run(tmp_path, frame, cfg)
+    assert " less than with IDM, tuned on these data" in " ".join(run.printed().split())
+    few = Run(tmp_path, frame[frame["profile_id"] < 4], cfg)
+    assert "allow no finding" not in few.printed()
+
+
+def test_one_strategy_is_compared_with_nobody_and_one_window_has_no_interval() -> None:
+    frame = episodes(profiles=12)
+    alone = headline(summary(frame[frame["strategy"] == "idm"]))
+    assert alone.attrs["against"] is None
+    assert not {"saved_pct", "distance_pct"} & set(alone)
+    assert "saved" not in alone.attrs["caption"]
+    assert "with the 95 % interval" in headline(summary(frame)).attrs["caption"]
+    seed = frame["training_seed"].isna() | (frame["training_seed"] == frame["training_seed"].min())
+    one = headline(summary(frame[seed & (frame["profile_id"] == 0)])).attrs["caption"]
+    assert "saved: against" in one
+    assert "interval" not in one

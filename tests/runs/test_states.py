@@ -14,9 +14,19 @@ from rich.console import Console
 
 from lcc_rl.cli.status import main
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
+from lcc_rl.results.runs import load_config
 from lcc_rl.runs.overview import draw
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.runs.states import Busy, RunState, claim, inspect_run, is_claimed, survey, working
+from lcc_rl.runs.states import (
+    Busy,
+    RunState,
+    claim,
+    inspect_run,
+    is_claimed,
+    no_run,
+    survey,
+    working,
+)
 
 
 def status(folder: Path) -> list[str]:
@@ -109,6 +119,22 @@ def test_clean_removes_failed_runs_without_work(tmp_path, capsys) -> None:
     main([str(tmp_path), "--clean"])
     assert f"removed {tmp_path / 'failed'}\n" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"failed_late", "stopped"}
+
+
+def test_a_folder_that_is_no_run_is_refused_with_the_runs_and_tables_in_it(tmp_path) -> None:
+    assert str(no_run(tmp_path)) == f"{tmp_path}: not a run folder: it has no config.yaml"
+    for name in ("seed=0", "seed=1", "seed=2", "seed=3", "tables"):
+        (tmp_path / name).mkdir()
+        if name != "tables":
+            (tmp_path / name / "config.yaml").write_text("")
+    (tmp_path / "tables" / "main.parquet").write_text("")
+    with pytest.raises(ConfigError) as caught:
+        load_config(tmp_path)
+    assert str(caught.value) == (
+        f"{tmp_path}: not a run folder: it has no config.yaml; it holds the runs seed=0, seed=1, "
+        "seed=2 … (4); it holds the table tables/main.parquet; "
+        f"lcc_rl.results.load('{tmp_path}') reads all runs"
+    )
 
 
 def test_nothing_to_see(tmp_path) -> None:

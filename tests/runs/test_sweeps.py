@@ -21,6 +21,7 @@ from lcc_rl.commands import training
 from lcc_rl.config import load
 from lcc_rl.envs import inputs
 from lcc_rl.errors import ConfigError
+from lcc_rl.runs import sweeps
 from lcc_rl.runs.states import claim
 from lcc_rl.runs.sweeps import run_name
 
@@ -166,3 +167,19 @@ def test_random_kills_lose_nothing() -> None:
     done = subprocess.run(words, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     assert "nothing lost, all readable, rows identical" in done.stdout
+
+
+@pytest.mark.parametrize("srun", [None, "/usr/bin/srun"])
+def test_a_sweep_on_slurm_without_slurm_is_refused_in_one_line(
+    tmp_path, monkeypatch, capsys, srun
+) -> None:
+    monkeypatch.setattr(sweeps, "which", lambda name: srun)
+    monkeypatch.setattr(sweeps, "make_plan", lambda config: sweeps.Plan(sweeps.MOST_RUNS + 1))
+    launcher = {"_target_": "hydra_plugins.submitit.SlurmLauncher"}
+    parts = {"launcher": launcher, "sweep": {"dir": str(tmp_path / "sweep")}}
+    with pytest.raises(SystemExit):
+        sweeps.SweepCallback().on_multirun_start(OmegaConf.create({"hydra": parts}))
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert ("use hydra/launcher=lcc_submitit_local" in said) == (srun is None)
+    assert not list(tmp_path.iterdir())

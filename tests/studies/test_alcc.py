@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from table_text import long_table
 
 from lcc_rl.config.schemas import as_plain
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.studies.alcc import study
+
+NAMES = "data.columns={vehicle: id, time: t, speed: v, leader: ahead, gap: gap}"
 
 
 def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> None:
@@ -51,3 +54,30 @@ def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
     run = study.Study(folder, "smoke", 1).runs(folder / "train", study.MAIN)[0]
     assert Path(run.compose().data["path"]) == folder / "trajectories.parquet"
+
+
+def of_one_file(folder: Path, *overrides: str) -> study.Study:
+    """A study of a table that is one recording, calibrated quickly."""
+    long_table(cars=4).to_csv(folder / "lab.csv", index=False)
+    path = f"data.path='{folder / 'lab.csv'}'"
+    quick = [f"calibration.{x}_genetic.generations=2" for x in ("local", "global")]
+    return study.Study(
+        folder / "study", "smoke", 1, ("data=table", path, NAMES, *quick, *overrides)
+    )
+
+
+def test_a_study_of_one_file_divides_it_by_vehicle(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(study, "run_all", lambda *arguments: [])
+    own = of_one_file(tmp_path, "split.by=vehicle")
+    assert study.run(own, ["main"], "typed") == []
+    assert (own.folder / study.DRIVERS).is_file()
+    single = own.runs(tmp_path, study.ABLATIONS["one_training_profile"])[0].compose()
+    assert single.split["held_out"]["by"] == "vehicle"
+    assert single.split["profile"] == 0
+
+
+def test_a_study_whose_data_cannot_be_divided_leaves_no_file(tmp_path) -> None:
+    own = of_one_file(tmp_path)
+    with pytest.raises(DataError, match=r"only \['lab'\] found"):
+        study.run(own, ["main"], "typed")
+    assert not own.folder.exists()

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lcc_rl.commands import evaluation
-from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, known_settings
+from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, known_settings, read_once
 from lcc_rl.config import key_of, load, root_key
-from lcc_rl.config.schemas import PipelineConfig
+from lcc_rl.config.schemas import PipelineConfig, StudyConfig
 from lcc_rl.errors import unknown_name
 from lcc_rl.studies.runner import (
     EPISODES,
@@ -52,9 +52,10 @@ class Change:
     recipes: tuple[str, ...] = ()
 
 
-# One profile for training, the usual held-out recordings for evaluation.
+# One profile for training; evaluation is on what the study's own split holds out.
+SINGLE = "split=single"
 ONE_PROFILE = (
-    "split=single",
+    SINGLE,
     "split.held_out={_target_: lcc_rl.data.profiles.Split, by: recording, evaluation_share: 0.34}",
 )
 MAIN = Change(variants=(*VARIANTS, CONTROL))
@@ -118,13 +119,18 @@ class Study(BaseStudy):
             for item in self.overrides
             if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
         ]
+        settings = known_settings(shared, entry)
+        if SINGLE in own:  # the user's split is then that of ``held_out``
+            moved = [x for x in settings if key_of(x).startswith("split.")]
+            settings = [x for x in settings if x not in moved]
+            own = (*own, *(x.replace("split.", "split.held_out.", 1) for x in moved))
         return [
             f"experiment=[{','.join([*filter(None, [self.recipe]), *recipes])}]",
             f"variant={variant}",
             "data=episodes",
             data,
             *(() if "drivers" in given else ("drivers=calibrated", drivers)),
-            *known_settings(shared, entry),
+            *settings,
             *own,
         ]
 
@@ -167,13 +173,14 @@ def run(study: Study, parts: Sequence[str] = PARTS, command: str = "") -> list[O
         LccError: one clear error for wrong settings, data or files.
     """
     series = _series(study, parts)
-    for folder, change in series.items():  # before any work
-        check_accepted(study.accept, study.runs(folder, change)[0].compose())
-    calibration = _calibration(study)
+    composed = [study.runs(folder, change)[0].compose() for folder, change in series.items()]
+    for cfg in composed:  # before any work
+        check_accepted(study.accept, cfg)
+    calibration = _calibration(study, composed[0])
+    read_once(calibration, study.folder)
     if command:
         note(study.folder, "alcc", command)
-    if not ((study.folder / DRIVERS).exists() and (study.folder / TRAJECTORIES).exists()):
-        calibrate_once(calibration, study.folder)
+    calibrate_once(calibration, study.folder)
     outcomes = []
     for folder, change in series.items():
         trained = run_all(study.runs(folder, change), study.jobs, study.accept)
@@ -204,9 +211,11 @@ def _series(study: Study, parts: Sequence[str]) -> dict[Path, Change]:
     return found
 
 
-def _calibration(study: Study) -> PipelineConfig:
+def _calibration(study: Study, training: StudyConfig) -> PipelineConfig:
+    """Return the settings of the calibration, whose data are divided as those of a training."""
     own = [item for item in study.overrides if root_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
+    cfg.split, cfg.scenario = training.split, training.scenario
     return cfg
 
 
