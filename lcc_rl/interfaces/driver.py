@@ -151,13 +151,20 @@ class Driver:
         Args:
             measured: the entries :data:`MEASURED`, one row per vehicle; see :func:`entries`.
             kept: memories of the step before, or of :meth:`begin`.
+
+        Raises:
+            ConfigError: if a controller returns another shape than a row per vehicle.
         """
         reached = dict(measured)
         for piece in self.pieces:
             piece.apply({**measured, **kept}, reached)
         after = {key: reached[key] for key in self.kept}
         if self.module is None:
-            return reached[COMMAND].flatten(), after
+            command, expected = reached[COMMAND], (len(measured[STEP]), 1, 1)
+            if command.shape != expected:
+                found = f"{list(command.shape)}; expected {list(expected)}, one row per vehicle"
+                raise ConfigError(f"{self.name} returns {found}")
+            return command.flatten(), after
         columns = [value(reached, name) for name in self.module.names]
         return self.module(torch.stack(columns, -1)).flatten(), after
 

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,7 +19,7 @@ from unittest.mock import patch
 
 import torch
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.interfaces.driver import PRESENT, Driver, Measured, entries
 from lcc_rl.pieces.base import SEED, STEP, State
 
@@ -89,6 +90,10 @@ class Bridge:
 
         Returns:
             The accelerations commanded, by vehicle [m/s²].
+
+        Raises:
+            LccError: if a controller returns another shape than a row per vehicle, or what is no
+                number; SUMO would drive with its own model instead.
         """
         cars = self.sumo.vehicle
         present = cars.getIDList()
@@ -105,6 +110,10 @@ class Bridge:
         wanted, after = self.driver(entries(list(measured.values())) | before, before)
         after |= {SEED: before[SEED], STEP: before[STEP] + 1}
         commands = dict(zip(measured, wanted.tolist(), strict=True))
+        for car, acceleration in commands.items():
+            if not math.isfinite(acceleration):
+                when = f"at {self.sumo.simulation.getTime():g} s"
+                raise Diverged(f"{self.driver.name}: the command of {car} is {acceleration} {when}")
         for place, (car, acceleration) in enumerate(commands.items()):
             if execute:
                 self._set(car, cars.getSpeed(car) + acceleration * self.driver.time_step)

@@ -19,7 +19,7 @@ from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, LccError
 from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import with_weights
@@ -173,6 +173,27 @@ def test_whatever_compare_takes_drives(tmp_path) -> None:
         assert [one.command(execute=False)["own"] for one in alike] == [expected] * len(alike)
         assert twice.command(execute=False)["own"] == pytest.approx(0.2 * step)
     assert Bridge(steady, "own").command()["own"] == pytest.approx(0.01 * 15.0 - 0.2, abs=1e-4)
+
+
+def nobody_knows(gap, speed):
+    return gap * float("nan")
+
+
+def alone(gap, speed):
+    return gap.mean()
+
+
+@pytest.mark.parametrize(
+    ("who", "words"),
+    [
+        (nobody_knows, r"nobody_knows.*: the command of own is nan at 0\.1 s"),
+        (alone, r"alone.* returns \[\]; expected \[1, 1, 1\], one row per vehicle"),
+    ],
+)
+def test_what_is_no_command_is_refused_before_sumo_drives_instead(who, words, tmp_path) -> None:
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
+    with pytest.raises(LccError, match=words):
+        Bridge(who, "own").command()
 
 
 def test_sumo_is_imported_without_its_line_about_pyarrow() -> None:
