@@ -97,7 +97,7 @@ def policy_file(path: str | Path, variant: str = "") -> Path:
     """Return the file that :func:`load_policy` reads; arguments as there.
 
     Raises:
-        ConfigError: if no policy ships for the variant.
+        ConfigError: if no policy ships for the variant, or a training has not ended.
     """
     path = Path(path)
     first = path.parts[0] if path.parts else ""
@@ -105,7 +105,10 @@ def policy_file(path: str | Path, variant: str = "") -> Path:
         raise ConfigError(f"policy={path}: no such file; did you mean {PRETRAINED!r}?")
     if first == PRETRAINED and not path.exists():
         path = pretrained_path(path.name if len(path.parts) > 1 else variant)
-    return path / "policy.pt" if path.is_dir() else path
+    file = path / "policy.pt" if path.is_dir() else path
+    if not file.exists() and (path / "checkpoint.pt").is_file():
+        raise ConfigError(f"{path}: its training has not ended: lcc-rl train resume={path}")
+    return file
 
 
 def load_policy(

@@ -250,3 +250,9 @@ def test_a_law_reads_what_its_parameters_name() -> None:
     assert law.names == ("self.gap", "self.speed", "ahead.speed")
     entries = [torch.full((3, 1, 1), value) for value in (20.0, 10.0, 12.0)]
     assert torch.equal(law.command(*entries), steady(*entries))
+
+
+def test_a_training_that_has_not_ended_says_how_it_goes_on(tmp_path) -> None:
+    (tmp_path / "checkpoint.pt").touch()
+    with pytest.raises(LccError, match=f"{tmp_path}: its training has not ended: .* resume="):
+        lcc_rl.compare([tmp_path], overrides=SMALL, folder=tmp_path / "a")
