@@ -155,8 +155,7 @@ def task_of(cfg: StudyConfig) -> Task | None:
 
 
 def _task_name(cfg: StudyConfig) -> str | None:
-    task = task_of(cfg)
-    return None if task is None else task.name
+    return None if cfg.task is None else str(cfg.task["name"])
 
 
 def only_named(cfg: EvaluateConfig) -> bool:
@@ -188,6 +187,7 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
             in_words(plain) == plain or plain == str(who).removesuffix(FILTERED),
             f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
         )
+    task_of(cfg)  # its settings are checked before the data are read
     task = _task_name(cfg)
     policies = {label: of_task(str(who), task) for label, who in named.items() if is_policy(who)}
     rivals = {label: who for label, who in named.items() if label not in policies}

@@ -32,7 +32,6 @@ from lcc_rl.config.unused import check_used
 from lcc_rl.config.words import key_of
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
-from lcc_rl.runs.states import no_run
 
 CONF = "lcc_rl.conf"
 # Settings that do not change any row of a result.
@@ -51,18 +50,6 @@ NAMES = (
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
-def chosen_folder(resumed: str | None, fresh: str) -> str:
-    """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew."""
-    if resumed and not (Path(resumed) / "config.yaml").is_file():
-        raise ConfigError(f"resume={no_run(Path(resumed))}")
-    return str(resumed or fresh)
-
-
-def hydra_folder(folder: str | None) -> str | None:
-    """Return where Hydra notes its own settings: nowhere in a folder that holds a run before."""
-    return None if folder and (Path(folder) / "config.yaml").is_file() else ".hydra"
-
-
 def terms_of_energy(string: Any) -> float:
     """Return how many vehicles' energy counts for an automated one: its own and those behind."""
     plain = OmegaConf.to_container(string) if OmegaConf.is_config(string) else string
@@ -70,14 +57,7 @@ def terms_of_energy(string: Any) -> float:
     return 1.0 + roles.count(HUMAN) / max(roles.count(AUTOMATED), 1)
 
 
-def smoke_segment(bootstrap: bool, horizon: int) -> int:
-    """Return the segment of a smoke run: the horizon where no value stands for what follows."""
-    return 20 if bootstrap else horizon
-
-
-OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
-OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
-OmegaConf.register_new_resolver("lcc.segment", smoke_segment, replace=True)
+OmegaConf.register_new_resolver("lcc.either", lambda so, yes, no: yes if so else no, replace=True)
 OmegaConf.register_new_resolver("lcc.pairs", lambda a, b: len(a) * len(b), replace=True)
 OmegaConf.register_new_resolver("lcc.energies", terms_of_energy, replace=True)
 

@@ -18,6 +18,7 @@ from lcc_rl.figures.drawing import (
     paper,
     style,
 )
+from lcc_rl.results.headline import several
 from lcc_rl.results.intervals import band
 from lcc_rl.results.names import in_words
 
@@ -110,7 +111,7 @@ def draw_curves(axis: Axes, training: pd.DataFrame, column: str) -> tuple[float,
             low, high = band(smooth.mean().to_numpy(float))
         else:
             low, high = (smooth.quantile(q).iloc[:, 0].to_numpy(float) for q in (0.05, 0.95))
-        label = f"{in_words(str(variant))} ({count} seed{'s' * (count > 1)})"
+        label = f"{in_words(str(variant))} ({several(count, 'seed')})"
         axis.fill_between(line.index, low, high, color=colour(str(variant)), alpha=0.2, lw=0)
         axis.plot(line.index, line, color=colour(str(variant)), label=label)
         floor = min(floor, float(line.iloc[len(line) // 5 :].min()))

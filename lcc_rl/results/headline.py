@@ -72,7 +72,7 @@ def resampled(found: pd.DataFrame) -> str:
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
     if drives < min(LEAST_DRIVES, windows):
-        over += f" (too narrow: windows of {drives} drive{'s' * (drives > 1)} are alike)"
+        over += f" (too narrow: windows of {several(drives, 'drive')} are alike)"
     return over
 
 

@@ -1,4 +1,4 @@
-"""Sweeps: names of folders, the plan, one run, the final report."""
+"""Sweeps: names of folders, those of single runs too, the plan, one run, the final report."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from rich.console import Console
 from rich.live import Live
 
 from lcc_rl.config import NOT_IDENTITY, identity, key_of, parsed
-from lcc_rl.errors import Interrupted, LccError, ResultsError
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.search import register as register_search
-from lcc_rl.runs.states import Busy, busy, described, is_claimed, record, survey
+from lcc_rl.runs.states import CONFIG, Busy, busy, described, is_claimed, no_run, record, survey
 
 log = logging.getLogger("lcc_rl")
 
@@ -44,7 +44,9 @@ NO_RESULT = None  # returned to the sweeper; Optuna refuses NaN
 
 
 def register_resolvers() -> None:
-    """Register the OmegaConf resolvers of a sweep's folders and jobs."""
+    """Register the OmegaConf resolvers of the folders of runs and sweeps, and of a sweep's jobs."""
+    OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
+    OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
     # Cached: every job must get the folder of the whole command.
     OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
     OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
@@ -57,6 +59,18 @@ def sweep_name(given: str | None, typed: Sequence[str]) -> str:
         return str(given)
     kept = sorted(result_overrides(typed))
     return f"sweep_{hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]}"
+
+
+def chosen_folder(resumed: str | None, fresh: str) -> str:
+    """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew."""
+    if resumed and not (Path(resumed) / CONFIG).is_file():
+        raise ConfigError(f"resume={no_run(Path(resumed))}")
+    return str(resumed or fresh)
+
+
+def hydra_folder(folder: str | None) -> str | None:
+    """Return where Hydra notes its own settings: nowhere in a folder that holds a run before."""
+    return None if folder and (Path(folder) / CONFIG).is_file() else ".hydra"
 
 
 def run_name(*, _root_: DictConfig) -> str:
