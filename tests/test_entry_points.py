@@ -15,6 +15,7 @@ import lcc_rl
 from lcc_rl import api
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.pipeline import calibrate_once, read_once
+from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.policies import load_policy
 
@@ -134,11 +135,14 @@ def test_windows_are_held_out_only_from_a_training(tmp_path, capsys, words, titl
 # -- as functions ----------------------------------------------------------------------------------
 
 
-def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(trained, tmp_path) -> None:
+def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(
+    trained, tmp_path, caplog
+) -> None:
     run = lcc_rl.learn("alcc", TINY, tmp_path / "run")
     pd.testing.assert_frame_equal(run.rows, read_parquet(run.folder / "episodes.parquet"))
     pd.testing.assert_frame_equal(run.rows, read_parquet(trained / "episodes.parquet"))
     assert list(run.table["strategy"]) == ["alcc"]
+    assert "was trained with other" not in caplog.text
     assert len(run.training) == 3
     shrunk = [word for word in TINY if not word.startswith("agent.")]
     found = lcc_rl.compare([run, "idm_acc"], "alcc", shrunk, tmp_path / "found")
@@ -146,6 +150,24 @@ def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(trained, tmp
     own = found.rows[found.rows["strategy"] == "alcc"].reset_index(drop=True)
     columns = ["profile_id", "driver_id", "total_energy_kj"]
     pd.testing.assert_frame_equal(own[columns], run.rows[columns])
+
+
+@pytest.mark.parametrize(
+    ("asked", "beside"),
+    [([], ["constant_filtered", "idm_acc_filtered"]), (["evaluation.behind_filter=[]"], [])],
+)
+def test_a_filtered_policy_stands_beside_the_baselines_asked_for(
+    trained, tmp_path, caplog, asked, beside
+) -> None:
+    words = ["evaluation.baselines=[human]", "+filter=cbf", "drivers=highway", *asked]
+    # A policy may have the name of its own variant, and no other one's.
+    cfg = tiny("evaluate", f"compare={{alcc: {trained}}}", *words, agent=False)
+    rows = evaluation.run(cfg, tmp_path / "run", quiet=True)
+    assert list(rows["strategy"].unique()) == [*beside, "human", "alcc"]
+    assert f"{trained} was trained with other drivers: with drivers=… as in" in caplog.text
+    cfg.compare = {"reference": str(trained)}
+    with pytest.raises(LccError, match="reference, which stands for 'network, for itself'"):
+        evaluation.run(cfg, tmp_path / "named")
 
 
 def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> None:

@@ -31,10 +31,12 @@ from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
+from lcc_rl.evaluation.fit import other_traffic
 from lcc_rl.evaluation.named import DIRECT, RECORDED, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import (
     POLICY,
     Strategy,
+    TrainedPolicy,
     applies,
     baselines,
     beside_filtered,
@@ -181,21 +183,25 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
                 f"compare names two {label}: give each a name, 'compare={{first: …, second: …}}'",
             )
         named = dict(zip(labels, named, strict=True))
-    for label, who in named.items():
-        plain = label.removesuffix(FILTERED)
-        require(
-            in_words(plain) == plain or plain == str(who).removesuffix(FILTERED),
-            f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
-        )
     task_of(cfg)  # its settings are checked before the data are read
     task = _task_name(cfg)
     policies = {label: of_task(str(who), task) for label, who in named.items() if is_policy(who)}
     rivals = {label: who for label, who in named.items() if label not in policies}
     for label, who in rivals.items():
+        _check_label(label, who, str(who).removesuffix(FILTERED))
         if who != DIRECT:
             controller_of(who)
         require(applies(cfg, label), f"compare={label}: it has no vehicle to drive in this string")
     return rivals, policies
+
+
+def _check_label(label: str, who: Any, own: str) -> None:
+    """Refuse a row's name that tables use for somebody else; ``own`` may be said of who it is."""
+    plain = label.removesuffix(FILTERED)
+    require(
+        in_words(plain) in (plain, in_words(own)),
+        f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
+    )
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
@@ -207,12 +213,9 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
     """
     own = not only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
-    trust, policy = tuple(cfg.trust), None
     rivals, paths = compared(cfg)
-    if cfg.policy is not None and learns(cfg):
-        policy = load_policy(of_task(cfg.policy, _task_name(cfg)), cfg.variant, trust)
+    policy, policies = _read_policies(cfg, paths)
     check_installed(cfg, list(rivals.values()))
-    policies = {name: load_policy(path, cfg.variant, trust) for name, path in paths.items()}
     if own and learns(cfg) and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
@@ -226,13 +229,31 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
         strategies.append(dataclasses.replace(one, name=name) if named else one)
     if own:
         strategies += studied(cfg, policy, inputs.population)
-    if cfg.evaluation.rows == "episodes":
-        strategies = beside_filtered(cfg, strategies) + strategies
+    strategies = beside_filtered(cfg, strategies) + strategies
     for strategy in (s for s in strategies if s.policy is not None):
         cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)
     check_distinct(strategies)
     return strategies, inputs
+
+
+def _read_policies(
+    cfg: EvaluateConfig, paths: Mapping[str, str]
+) -> tuple[TrainedPolicy | None, dict[str, TrainedPolicy]]:
+    """Read the policy under study, where there is one, and those compared, by their names."""
+
+    def read(path: str) -> TrainedPolicy:
+        weights, own = load_policy(path, cfg.variant, tuple(cfg.trust))
+        if words := other_traffic(path, own, cfg):
+            log.warning(words)
+        return weights, own
+
+    studied_too = cfg.policy is not None and learns(cfg)
+    policy = read(of_task(str(cfg.policy), _task_name(cfg))) if studied_too else None
+    policies = {name: read(path) for name, path in paths.items()}
+    for name in paths if isinstance(cfg.compare, Mapping) else ():
+        _check_label(name, paths[name], policies[name][1].variant)
+    return policy, policies
 
 
 def _rules(cfg: EvaluateConfig, rivals: Mapping[str, Any], inputs: Inputs) -> list[Strategy]:

@@ -110,6 +110,7 @@ class EvaluationConfig(Settings):
 
     rows: Literal["episodes", "vehicles"]
     baselines: list[str]
+    behind_filter: list[str] = dataclasses.field(default_factory=list)
     profiles: Count | None
     drivers: Count | None
     batch_size: Count

@@ -19,9 +19,9 @@ from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
+    BEHIND,
     INDEX,
     KEYS,
-    PROMISED,
     as_frame,
     describe,
     desired_speeds,
@@ -33,6 +33,7 @@ from lcc_rl.evaluation.rows import (
     traffic,
 )
 from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.tables import FASTER
@@ -169,7 +170,8 @@ class Episodes:
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )
         self.energy = build_energy(self.cfg)
-        keys = [*KEYS, INDEX, PROMISED, CLASS]
+        filtered = bool(self.cfg.scenario.filters.get(AUTOMATED))
+        keys = [*KEYS, INDEX, CLASS, *(BEHIND if filtered else ())]
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModule
@@ -10,9 +11,11 @@ from tensordict.nn import TensorDictModule
 from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 
 FIRST = "module.0.0.weight"  # of a policy's network
+TRAFFIC = ("data", "split", "drivers")
 
 
 def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
@@ -85,6 +88,30 @@ def _check_same(path: str, own: Mapping[str, Any], asked: Mapping[str, Any]) -> 
     changes = [f"{key}={one.get(key)}, got {other.get(key)}" for key in differing(one, other)]
     if changes:
         raise ConfigError(f"{path} was trained with {'; '.join(changes)}")
+
+
+def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
+    """Return a warning where a policy was trained on other data, drivers or split; else nothing.
+
+    A task chooses its own, and a policy that ships is to be tried on others'.
+
+    Args:
+        path: where the policy comes from.
+        own: configuration of its training.
+        cfg: configuration under study.
+    """
+    if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
+        return ""
+    changed = [name for name in TRAFFIC if getattr(own, name) != getattr(cfg, name)]
+    if not changed:
+        return ""
+    places = {name: (getattr(own, name) or {}).get("path") for name in changed}
+    others = ", ".join(name + (f" (path={at})" if at else "") for name, at in places.items())
+    options = " ".join(f"{name}=…" for name in changed)
+    return (
+        f"{path} was trained with other {others}: with {options} as in the config.yaml of its "
+        "training, an evaluation is of the windows that were held out there"
+    )
 
 
 def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str) -> None:

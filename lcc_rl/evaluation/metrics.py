@@ -15,6 +15,7 @@ UNSAFE_TTC = 4.0  # [s] (A10)
 LONG_TIME_GAP = 2.5  # [s] (A13)
 CALM = 0.5  # spread of the speeds at which a wave counts as damped [m/s]
 PACE = 1.0  # below it a long time gap is a matter of metres [m/s]
+ACTS = 0.01  # change of a command by which a filter acts [m/s²]
 
 
 def energy_measures(
@@ -86,7 +87,8 @@ def safety_measures(
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
             each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first one;
-            behind a safety filter, for which steps it answers, ``promised``.
+            behind a safety filter, for which steps it answers, ``promised``, what it was told,
+            ``wanted``, and its ``command`` [m/s²].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
@@ -120,6 +122,9 @@ def safety_measures(
         "rms_jerk_mps3": average(series["jerk"] ** 2).sqrt(),
         "duration_s": alive.sum(0).squeeze(-2) * time_step,
     }
+    if "wanted" in series:
+        changed = (series["command"] - series["wanted"]).abs() > ACTS
+        found["share_filter_acts"] = average(changed)
     if "promised" in series:
         found["share_promised"] = average(series["promised"])
         found["share_ttc_unpromised"] = average(unsafe & (series["promised"] == 0.0))

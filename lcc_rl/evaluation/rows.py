@@ -30,6 +30,7 @@ from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.features import CLASS
+from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.results.savings import DRIVE, LEADER, REPEAT, SOURCE
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
@@ -52,7 +53,9 @@ SAMPLED = (
 )
 KEYS = [("leader", name) for name in ("speed", "acceleration")]
 KEYS += [("vehicles", name) for name in RECORDED]
-INDEX, PROMISED = (AUTOMATED, "index"), (AUTOMATED, "promised")
+INDEX = (AUTOMATED, "index")
+# Behind a safety filter: for which steps it answers, what it was told and what it commanded.
+BEHIND = ((AUTOMATED, "promised"), (WANTED, AUTOMATED), (COMMAND, AUTOMATED))
 # The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
 Groups = dict[str, dict[str, Tensor]]
 
@@ -66,8 +69,8 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     own = list(string.places(AUTOMATED))
     others = [place for place in range(len(string)) if place not in own]
     for (space, name), entry in record.items():
-        if (space, name) == PROMISED:
-            groups["cav"][name] = entry
+        if (space, name) in BEHIND:
+            groups["cav"][name if space == AUTOMATED else space] = entry
         elif space == "leader":
             groups["leader"][name] = entry.unsqueeze(-2)
         elif space == "vehicles" and not string.drawn:

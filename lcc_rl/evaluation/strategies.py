@@ -33,7 +33,7 @@ from lcc_rl.evaluation.named import (
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.names import FILTERED, UNASKED
+from lcc_rl.results.names import FILTERED
 
 log = logging.getLogger("lcc_rl")
 
@@ -131,14 +131,14 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
 
 
 def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
-    """Build what a filtered policy is to be seen beside: the filter alone, and a rule behind it."""
+    """Build the baselines that a filtered policy is to be seen beside, behind its filter."""
     found = [one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy]
     if not any(found):
         return []
     names = {one.name for one in strategies}
     cfg = deepcopy(cfg)
     cfg.scenario.filters[AUTOMATED] = next(filter(None, found))
-    return [baseline(cfg, name) for name in UNASKED if name not in names]
+    return [baseline(cfg, name) for name in cfg.evaluation.behind_filter if name not in names]
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:

@@ -49,6 +49,7 @@ COLOURS = {
     "alcc": "#0072b2",
     "reference": "#d55e00",
     "own_energy": "#009e73",
+    "rule": "#e69f00",
     "idm": "#6b6b6b",
     "human": "#b0a080",
     "direct": INK,

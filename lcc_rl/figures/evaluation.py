@@ -38,7 +38,7 @@ from lcc_rl.results.headline import several
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.motion import telling
-from lcc_rl.results.names import UNASKED, in_words
+from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.savings import BASELINES, RULE, by_driver
 
@@ -107,7 +107,9 @@ def study_figures(
     seeds = episodes.groupby("strategy")["training_seed"].count()
     own = [name for name in cars if name != RULE and (seeds[name] or not is_shipped(name))]
     # Human drivers, networks, the user's own controllers, the others; last what comes unasked.
-    order = sorted(names, key=lambda x: (x != "human", not seeds[x], x not in own, x in UNASKED))
+    order = sorted(
+        names, key=lambda x: (x != "human", not seeds[x], x not in own, x.endswith(FILTERED))
+    )
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import pandas as pd
 from rich.console import Console, Group
@@ -127,29 +127,41 @@ def _comparison(table: pd.DataFrame, cars: pd.DataFrame, against: str | None) ->
 def verdict(found: pd.DataFrame, of_few: bool = True) -> str:
     """Return in a sentence what came out for the network, from a summary; empty without one.
 
+    Without one that goes by its variant's name, each network has a sentence.
+
     Args:
         found: of :func:`lcc_rl.results.tables.summary`.
         of_few: whether windows that are too few for a finding have a sentence, too.
     """
-    rows = found[found[PER_KM].notna()].set_index("strategy").to_dict("index")
+    rows: dict[str, Any] = {
+        str(row["strategy"]): row for row in found[found[PER_KM].notna()].to_dict("records")
+    }
     other = next((name for name in (*RULES, HUMAN) if name in rows), None)
-    if NETWORK not in rows or other is None:
+    if other is None:
         return ""
-    windows = rows[NETWORK]["windows"]
+    learned = [name for name, row in rows.items() if row["seeds"] and name not in RULES]
+    names = [NETWORK] if NETWORK in rows else learned
+    return "\n".join(filter(None, (_sentence(rows, name, other, of_few) for name in names)))
+
+
+def _sentence(rows: Mapping[str, Any], name: str, other: str, of_few: bool) -> str:
+    """Return what came out for one network beside another strategy."""
+    windows = rows[name]["windows"]
     if windows < FEW:
         if not of_few:
             return ""
-        both = (f"{rows[name][PER_KM]:,.1f} kJ ({in_words(name)})" for name in (NETWORK, other))
+        both = (f"{rows[who][PER_KM]:,.1f} kJ ({in_words(who)})" for who in (name, other))
         return f"Per vehicle and km: {', '.join(both)}; {counted(windows)} allow no finding."
     key, long = f"km_saving_vs_{other}", "share_time_gap_long_moving"
-    saved, low, high = (100.0 * rows[NETWORK][f"{key}{end}"] for end in ("", "_low", "_high"))
+    saved, low, high = (100.0 * rows[name][f"{key}{end}"] for end in ("", "_low", "_high"))
     less = "less"
     if saved < 0.0:
         less, saved, low, high = "more", -saved, -high, -low
     within = "" if low > 0.0 else ", within the uncertainty"
-    own, theirs = (100.0 * rows[name][long] for name in (NETWORK, other))
+    own, theirs = (100.0 * rows[who][long] for who in (name, other))
+    article = "the " if in_words(name) != name else ""
     return (
-        f"With the {in_words(NETWORK)}, energy per vehicle and km is {saved:.1f} % ({low:.1f} … "
+        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % ({low:.1f} … "
         f"{high:.1f}) {less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
         f"the time against {theirs:.2f} %."
     )

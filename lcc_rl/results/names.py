@@ -6,7 +6,6 @@ import pandas as pd
 
 HUMAN, NETWORK = "human", "alcc"
 ALONE = "constant_filtered"
-UNASKED = (ALONE, "idm_acc_filtered")  # beside networks behind a filter
 # Who learns, or has several gains: further words of a name, if any, say which.
 SEVERAL = {
     "reference": "network, for itself",

@@ -107,6 +107,15 @@ def test_traffic_of_a_string() -> None:
     )
 
 
+def test_a_filter_acts_where_its_command_is_not_what_it_was_told() -> None:
+    one = torch.ones(4, 1, 1, 1)
+    series = dict.fromkeys(("ttc", "time_gap", "gap", "jerk"), one)
+    series |= {"speed": torch.full((5, 1, 1, 1), 9.0), "wanted": one}
+    series["command"] = torch.tensor([1.0, 0.5, 1.001, -3.0]).view(4, 1, 1, 1)
+    found = safety_measures(series, torch.tensor([1, 1, 1, 0]).bool().view(4, 1, 1, 1), 0.1)
+    assert found["share_filter_acts"].item() == pytest.approx(1 / 3)
+
+
 def test_every_string_has_the_places_of_its_automated_vehicles() -> None:
     record = {("vehicles", "speed"): torch.arange(8.0).view(2, 1, 4, 1)}
     groups = grouped(record, parse_string("human automated human automated"))

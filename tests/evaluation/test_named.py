@@ -83,8 +83,12 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
     both = {"full": full, "full_filtered": full}
     words = [*SMALL, "+filter=cbf"]
     named = {"mine": "constant_filtered"}  # full throttle
-    found = energies(lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a").rows)
+    rows = lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a").rows
+    found = energies(rows)
     assert found["full"] != found["full_filtered"] == found["mine"]
+    acts = rows.groupby("strategy")["share_filter_acts"].mean()  # nobody obeys full throttle
+    assert (acts[["full_filtered", "mine"]] > 0.5).all()
+    assert acts.drop(["full_filtered", "mine"]).isna().all()
     with pytest.raises(LccError, match=r"\+filter=cbf adds one"):
         lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
 

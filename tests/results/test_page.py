@@ -149,6 +149,13 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     )
     assert "less than with IDM, tuned on these data; long time gaps: 0.40 % of" in words
     assert "within the uncertainty" in verdict(found.assign(km_saving_vs_rule_low=-1.0))
+    # So has a network of any name, and each of several.
+    frame.loc[frame["strategy"] == "human", "training_seed"] = np.nan
+    both = [frame.replace({"strategy": {"alcc": name}}) for name in ("near", "far")]
+    found = summary(pd.concat(both).drop_duplicates())
+    first, second = verdict(found).splitlines()
+    assert first == words.replace("the network, for all", "near", 1)
+    assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
     few = verdict(summary(frame[frame["profile_id"] < 4]))
     assert few.endswith("; 4 windows allow no finding.")
