@@ -31,7 +31,7 @@ from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, Interrupted, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
-from lcc_rl.evaluation.fit import other_traffic
+from lcc_rl.evaluation.fit import check_policy, other_traffic
 from lcc_rl.evaluation.named import DIRECT, RECORDED, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import (
     POLICY,
@@ -250,6 +250,8 @@ def _read_policies(
 
     studied_too = cfg.policy is not None and learns(cfg)
     policy = read(of_task(str(cfg.policy), _task_name(cfg))) if studied_too else None
+    if policy is not None:
+        check_policy(cfg, policy[1])
     policies = {name: read(path) for name, path in paths.items()}
     for name in paths if isinstance(cfg.compare, Mapping) else ():
         _check_label(name, paths[name], policies[name][1].variant)

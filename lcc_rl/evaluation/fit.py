@@ -9,7 +9,7 @@ from typing import Any
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.config.schemas import AUTO, StudyConfig
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
@@ -36,8 +36,21 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
     hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
         raise ConfigError(f"{path} was trained as variant {own.variant}, not {cfg.variant}")
+    _check_entries(path, own, cfg)
     _check_same(path, _observed(own), _observed(cfg))
     check_action(path, own, cfg)
+
+
+def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
+    """Check that an observation has the entries of the training, before its settings."""
+    one, other = ({key for key, _ in flatten(x.observation.get("scales", {}))} for x in (own, cfg))
+    parts = (("with", one - other), ("without", other - one))
+    words = [f"{how} {', '.join(sorted(keys))}" for how, keys in parts if keys]
+    require(
+        not words,
+        f"{path} was trained {' and '.join(words)} in its observation: give the options of its "
+        f"training, or 'compare=[{path.removeprefix('policy=')}]', which observes as in training",
+    )
 
 
 def _observed(cfg: StudyConfig) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import TARGET, short_name
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, ResultsError, require
-from lcc_rl.evaluation.fit import check_action, check_policy, check_scenario, check_width
+from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
     DIRECT,
     PEOPLE,
@@ -207,7 +207,7 @@ def studied(
         population: the human drivers.
 
     Raises:
-        ConfigError: if the variant needs a policy that is not given, or the policy does not fit.
+        ConfigError: if the variant needs a policy that is not given.
     """
     if not learns(cfg):
         strategy = rule(cfg)
@@ -218,7 +218,6 @@ def studied(
     if policy is None:
         raise no_policy(cfg)
     weights, own_cfg = policy
-    check_policy(cfg, own_cfg)
     cfg = _of_training(cfg, own_cfg)
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     return [strategy] if cfg.deployed is None else hybrids(strategy)

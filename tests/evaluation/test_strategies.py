@@ -85,7 +85,9 @@ def test_policies_of_one_training_are_named_by_their_files_and_one_file_is_refus
     [
         ("reference", (), "was trained as variant reference"),
         ("alcc", ("observation.scales.self.gap=0.2",), "scales.self.gap=0.2, got 0.1"),
-        ("alcc", ("+knowledge=memory",), "scenario.pieces.memory"),
+        ("alcc", ("+knowledge=memory",), r"with memory\.entries in its .* 'compare=\[p\.pt\]'"),
+        ("alcc", ("~observation.scales.ahead",), r"trained without ahead\.speed in its"),
+        ("alcc", ("+knowledge=memory", "~observation.scales.memory"), "scenario.pieces.memory"),
         ("alcc", ("scenario.time_step=0.2",), "scenario.time_step=0.2, got 0.1"),
     ],
 )
