@@ -62,7 +62,7 @@ def _help() -> str:
             "",
             *lines,
             "",
-            "run, train, evaluate and calibrate take settings as key=value (experiment=smoke).",
+            "run, train, evaluate and calibrate take settings as key=value (seed=3).",
         ]
     )
 

@@ -283,7 +283,10 @@ def _unknown_option(name: str) -> ConfigError:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in ("out", "output", "folder", "dir"):
         return ConfigError(f"unknown option {name!r}: hydra.run.dir=… sets the folder")
-    return unknown_name("option", name, _top_level() | _groups())
+    known = _top_level() | _groups()
+    if root in known:
+        return ConfigError(f"this command has no option {root!r}, as others have: -h shows its own")
+    return unknown_name("option", name, known)
 
 
 def own_file(group: str, name: str) -> str:

@@ -44,6 +44,7 @@ REFUSED = {
     "train variant=alccc": "'alccc'.*'alcc'",
     "train variant=idm --experiment 3": "--experiment.*key=value",
     "calibrate --seed 3": "--seed",
+    "calibrate experiment=smoke": "this command has no option 'experiment'",
     "train data=ngsim data.path=nowhere.csv": "nowhere.csv",
     "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: cannot be read",
     "train data=ngsim data.path=[]": "no file is named",
