@@ -234,6 +234,8 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
         cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)
     check_distinct(strategies)
+    for strategy in (s for s in strategies if s.source):
+        log.info("%s: the policy of %s", in_words(strategy.name), strategy.source)
     return strategies, inputs
 
 
