@@ -126,7 +126,8 @@ def compare(
             behind the safety filter.
         variant: whose scenario and data they meet.
         overrides: further settings, ``["evaluation.drivers=12"]``.
-        folder: where the files go; by default a new one below ``outputs/evaluate``.
+        folder: where the files go, figures among them; by default a new one below
+            ``outputs/evaluate``, without figures, which take seconds.
 
     Returns:
         The run, with the rows of all strategies.
@@ -144,7 +145,10 @@ def compare(
         cfg.compare = {name: setting_of(who) for name, who in strategies.items()}
     else:
         cfg.compare = [setting_of(who) for who in strategies]
-    return Run(target, evaluation.run(cfg, target, own=False, quiet=True), cfg)
+    rows = evaluation.run(cfg, target, own=False, quiet=True)
+    if folder is not None:
+        evaluation.draw(rows, cfg, target)
+    return Run(target, rows, cfg)
 
 
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:

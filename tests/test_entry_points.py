@@ -145,8 +145,11 @@ def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(
     assert "was trained with other" not in caplog.text
     assert len(run.training) == 3
     shrunk = [word for word in TINY if not word.startswith("agent.")]
+    shrunk += ["figure_formats=[png,svg]"]
     found = lcc_rl.compare([run, "idm_acc"], "alcc", shrunk, tmp_path / "found")
     assert {"alcc", "idm_acc", "idm"} <= set(found.table["strategy"])
+    drawn = {path.name for path in (found.folder / "figures").iterdir()}
+    assert {"episode_alcc.png", "episode_alcc.svg"} <= drawn
     own = found.rows[found.rows["strategy"] == "alcc"].reset_index(drop=True)
     columns = ["profile_id", "driver_id", "total_energy_kj"]
     pd.testing.assert_frame_equal(own[columns], run.rows[columns])

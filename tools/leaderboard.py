@@ -161,7 +161,7 @@ def write_tables(reference: Path, page: Path) -> None:
 
 def write_board(scores: Path, page: Path) -> None:
     """Write the table of all files of ``lcc-rl score`` in a folder into the page."""
-    documents = [json.loads(path.read_text()) for path in sorted(scores.glob("*.json"))]
+    documents = {path.name: json.loads(path.read_text()) for path in sorted(scores.glob("*.json"))}
     _write_between(page, [as_markdown(documents)])
 
 

@@ -137,14 +137,20 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
-    if not quiet and isinstance(rows, pd.DataFrame):
-        # Here: a training, which draws nothing, need not load matplotlib.
-        from lcc_rl.figures.evaluation import write_figures
-
-        write_figures(folder, cfg.evaluation.rows, [one.short for one in found(rows, cfg)])
-    elif not quiet:
-        log.info("no figures: there are more than %d rows", FEW)
+    if not quiet:
+        draw(rows, cfg, folder)
     return rows
+
+
+def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
+    """Draw the figures of an evaluation into its folder, unless it has too many rows."""
+    if not isinstance(rows, pd.DataFrame):
+        log.info("no figures: there are more than %d rows", FEW)
+        return
+    # Here: a training, which draws nothing, need not load matplotlib.
+    from lcc_rl.figures.evaluation import write_figures
+
+    write_figures(folder, cfg.evaluation.rows, [one.short for one in found(rows, cfg)])
 
 
 def task_of(cfg: StudyConfig) -> Task | None:

@@ -39,19 +39,30 @@ from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.episodes import any_leader
-from lcc_rl.evaluation.named import DIRECT, ONNX, RECORDED, YAML, controller_of, is_policy, label_of
+from lcc_rl.evaluation.named import (
+    DIRECT,
+    ONNX,
+    RECORDED,
+    YAML,
+    controller_of,
+    is_policy,
+    is_shipped,
+    label_of,
+)
 from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, baseline, trained
-from lcc_rl.functional.pattern import HUMAN, RING
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.board import as_rich, row_of
 from lcc_rl.results.headline import show
+from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.policies import load_policy, policy_file
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.results.scores import scores
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
+from lcc_rl.runs.states import record
 
 # Where leaders come from, and human drivers who keep up with them.
 SOURCES: dict[str, tuple[str, ...]] = {
@@ -85,6 +96,11 @@ class Scored(NamedTuple):
             found = replace(trained(cfg, self.who, self.policy, population), name=self.label)
         else:
             require(applies(cfg, self.label), "it has no vehicle to drive in this string")
+            require(
+                bool(scenario.filters.get(AUTOMATED)) or not self.label.endswith(FILTERED),
+                f"the task has no safety filter: score {self.who.removesuffix(FILTERED)}, which "
+                "drives without one; with +filter=cbf the leaderboard refuses the row",
+            )
             found = baseline(cfg, self.label, self.who)
         road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
         build_env(any_leader(found.cfg), road, population, 1, nominal=True)
@@ -174,7 +190,7 @@ def hash_of(windows: Profiles) -> str:
 
 
 def about(who: Scored) -> dict[str, Any]:
-    """Return who is scored, the hash of its files, and versions."""
+    """Return the hash of the files of who is scored, and versions."""
     contents = [file.read_bytes() for file in who.files()]
     found: dict[str, str | None] = {}
     for name in ("lcc_rl", *PACKAGES):
@@ -184,15 +200,27 @@ def about(who: Scored) -> dict[str, Any]:
             found[name] = None
     digest = hashlib.sha256(b"".join(contents)).hexdigest() if contents else None
     versions = {"python": platform.python_version(), **found}
-    return {"name": who.label, "sha256": digest, "versions": versions}
+    return {"sha256": digest, "versions": versions}
 
 
 def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     """Play all tasks that fit and write the scores; return them."""
     who = scored(options.who, tuple(options.trust))
-    name = re.sub(r"\W+", "_", who.label)
-    default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{name}"
+    name = who.label if options.name is None else _own_name(options.name)
+    file = re.sub(r"\W+", "_", name)
+    default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
     folder = own_folder(options.out or default, "--out", lambda names: False)
+    try:
+        return _run(who, name, folder, options, further)
+    except Exception as error:
+        if folder.is_dir() and any(folder.iterdir()):  # a refused command leaves nothing
+            record(folder, error)
+        raise
+
+
+def _run(
+    who: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
+) -> dict[str, Any]:
     own = dict(map(_source, options.source))
     given, wanted = {**SOURCES, **own}, {*options.on, *own} if options.on else None
     found: list[dict[str, Any]] = []
@@ -201,7 +229,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
         sources: dict[str, EvaluateConfig] = {}
         with leaving_out(task, left_out):
             sources = roads(who, task, given, further)
-        chosen = [name for name in sources if name in (wanted or [name])]
+        chosen = [one for one in sources if one in (wanted or [one])]
         if sources and not chosen:
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
@@ -209,13 +237,13 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
                 found.append(play(who, source, sources[source], folder / task / source))
     why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"
     require(bool(found), f"nothing could be played: {why}")
-    document = {**about(who), "results": found, "left_out": left_out}
+    document = {"name": name, **about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
     tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
-    for name in own:
-        require(name in played, f"--source {name} could not be played: {'; '.join(left_out)}")
+    for source in own:
+        require(source in played, f"--source {source} could not be played: {'; '.join(left_out)}")
     return document
 
 
@@ -226,6 +254,17 @@ def leaving_out(what: str, left_out: list[str]) -> Iterator[None]:
         yield
     except (ConfigError, DataError, ResultsError, Diverged) as error:
         left_out.append(f"{what}: {error}")
+
+
+def _own_name(name: str) -> str:
+    """Return a name that the command line gives; nobody of the package has it."""
+    plain = name.removesuffix(FILTERED)
+    new = not is_shipped(plain) and in_words(plain) == plain
+    require(
+        new and re.fullmatch(r"\w[\w .+-]*", name) is not None,
+        f"--name {name}: expected a new name of letters, digits, spaces and _.+-",
+    )
+    return name
 
 
 def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
@@ -249,6 +288,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Score and print the table."""
     parser = Arguments(prog="lcc-rl score", description=__doc__)
     parser.add_argument("who", help="program.onnx, run folder, policy or controller")
+    parser.add_argument("--name", help="who is scored, in tables; by default that of the file")
     parser.add_argument("--task", action="append", help="only this task; repeat for several")
     parser.add_argument("--on", action="append", default=[], help="only this source")
     parser.add_argument(

@@ -11,10 +11,10 @@ from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, Step, entries, tick
+from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries, tick
 from lcc_rl.errors import ConfigError, LccError
 from lcc_rl.pieces import Collision
-from lcc_rl.pieces.base import SEED, STEP, Key, Piece, StepTransform, as_key
+from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
 
 BATCH = 2
 
@@ -63,9 +63,22 @@ def _play(
         state[as_key(key)] = torch.zeros(BATCH, *shape)
     reached = tick(state[SEED], state[STEP] + 1, horizon)
     for piece in pieces:
-        step = Step([piece], horizon).pieces[0][0]
-        _attempt(piece, lambda step=step: step.apply(state, reached))
-        _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
+        check_step(piece, state, reached)
+
+
+def check_step(piece: Piece, before: State, reached: State) -> None:
+    """Compare what a piece writes in a step of :data:`BATCH` episodes with what its specs promise.
+
+    Args:
+        piece: the piece.
+        before: entries of the state before the step.
+        reached: entries of the state after it, to which those written are added.
+
+    Raises:
+        ConfigError: naming the piece, and the number of entries, shape or type at fault.
+    """
+    _attempt(piece, lambda: piece.apply(before, reached))
+    _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
 
 
 def _kept(piece: Piece) -> dict[str, list[Any]]:

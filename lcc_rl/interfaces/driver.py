@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs.checks import BATCH, check_step
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
@@ -83,8 +84,8 @@ class Driver:
         kept: keys of the entries that are remembered from step to step.
 
     Raises:
-        LccError: if the policy or rule is unknown, was trained with another step, or reads an
-            entry that is not measured.
+        LccError: if the policy or rule is unknown, was trained with another step, reads an entry
+            that is not measured, or returns another shape than a row per vehicle.
     """
 
     def __init__(self, name: Any, time_step: float, trust: Sequence[str] = ()) -> None:
@@ -124,6 +125,14 @@ class Driver:
                 raise ConfigError(
                     f"{self.name} reads {'.'.join(key)}, which is not measured here, only {known}"
                 )
+        none = torch.zeros(BATCH, 1).long()
+        trial = entries([Measured(*[1.0] * len(Measured._fields))] * BATCH) | {
+            SEED: none,
+            STEP: none,
+        }
+        before = {**trial, **self.begin(trial)}
+        for piece in self.pieces:
+            check_step(piece, before, trial)
 
     def reads(self) -> list[Key]:
         """Return the keys of all entries that the driver reads."""
@@ -151,20 +160,13 @@ class Driver:
         Args:
             measured: the entries :data:`MEASURED`, one row per vehicle; see :func:`entries`.
             kept: memories of the step before, or of :meth:`begin`.
-
-        Raises:
-            ConfigError: if a controller returns another shape than a row per vehicle.
         """
         reached = dict(measured)
         for piece in self.pieces:
             piece.apply({**measured, **kept}, reached)
         after = {key: reached[key] for key in self.kept}
         if self.module is None:
-            command, expected = reached[COMMAND], (len(measured[STEP]), 1, 1)
-            if command.shape != expected:
-                found = f"{list(command.shape)}; expected {list(expected)}, one row per vehicle"
-                raise ConfigError(f"{self.name} returns {found}")
-            return command.flatten(), after
+            return reached[COMMAND].flatten(), after
         columns = [value(reached, name) for name in self.module.names]
         return self.module(torch.stack(columns, -1)).flatten(), after
 

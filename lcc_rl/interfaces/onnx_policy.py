@@ -198,6 +198,5 @@ class OnnxPolicy(Controller):
         """Return the commands, and the memory where there is one."""
         count, rows = len(self.program.names), entries[0].shape[:-1]
         given = [torch.cat(entries[:count], -1), *entries[count:]]
-        wanted, *memory = self.program(*(value.reshape(rows.numel(), -1) for value in given))
-        wanted = wanted.clamp(-self.max_acceleration, self.max_acceleration)
-        return tuple(value.view(*rows, -1) for value in (wanted, *memory))
+        found = self.program(*(value.reshape(rows.numel(), -1) for value in given))
+        return tuple(value.view(*rows, -1) for value in found)

@@ -92,8 +92,7 @@ class Bridge:
             The accelerations commanded, by vehicle [m/s²].
 
         Raises:
-            LccError: if a controller returns another shape than a row per vehicle, or what is no
-                number; SUMO would drive with its own model instead.
+            Diverged: if a command is no number; SUMO would drive with its own model instead.
         """
         cars = self.sumo.vehicle
         present = cars.getIDList()

@@ -150,6 +150,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
     def _write(self, values: Tensor | Sequence[Tensor], reached: State) -> None:
         values = (values,) if isinstance(values, Tensor) else values
+        if len(values) != len(self.targets):
+            raise ValueError(f"it returned {len(values)} instead of {len(self.targets)} entries")
         reached.update(zip(self.targets, values, strict=True))
 
     @dispatch(auto_batch_size=False)  # entries of vehicles have one dimension more

@@ -34,6 +34,7 @@ from lcc_rl.settings import Number, Positive
 
 # The names of the random streams: an episode's seed means the same episode under either.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
+LARGEST = 3.0  # command to automated vehicles, in both directions [m/s²]
 
 
 def stream_name(role: str) -> str:
@@ -62,7 +63,8 @@ class Controller(StepTransform):
 
     Where the role has a safety filter, it writes ``("wanted", role)``, which this reads.
 
-    The role that it drives is its name in an environment.
+    The role that it drives is its name in an environment. Commands to automated vehicles are held
+    within ±3 m/s², or, of whatever role, within the controller's setting ``max_acceleration``.
     """
 
     name: ClassVar[str] = AUTOMATED
@@ -99,6 +101,9 @@ class Controller(StepTransform):
             **more: see :meth:`lcc_rl.pieces.base.StepTransform.wire`.
         """
         self.role, self.string, self.time_step = self.name, world.string, world.time_step
+        largest = getattr(self, "max_acceleration", LARGEST if self.role == AUTOMATED else None)
+        # Of the commands [m/s²]; None where they are executed as they are.
+        self.limits: tuple[float, float] | None = None if largest is None else (-largest, largest)
         self.names = tuple(reads)
         known = world.sensed(self.role, reads)
         wish = WANTED if self.role in world.filtered else COMMAND
@@ -106,7 +111,17 @@ class Controller(StepTransform):
 
     def compute(self, *entries: Tensor) -> Any:
         """Return the commands, and what else is written."""
-        return self.command(*self.views(*entries))
+        return self.limited(*self.views(*entries))
+
+    def limited(self, *read: Tensor) -> Any:
+        """Return what :meth:`command` returns, its commands within the limits."""
+        found = self.command(*read)
+        if self.limits is None:
+            return found
+        if isinstance(found, Tensor):
+            return found.clamp(*self.limits)
+        command, *kept = found
+        return (command.clamp(*self.limits), *kept)
 
 
 class Action(Controller):
@@ -123,6 +138,7 @@ class Action(Controller):
     def setup(self, world: World) -> None:
         """Read the role's action."""
         self.drive(world, [f"{self.name}.action"])
+        self.limits = None  # within ±1 the action is read
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commands."""

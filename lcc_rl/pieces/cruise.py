@@ -24,8 +24,7 @@ class Cruise(Controller):
     def command(self, speed: Tensor, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the commands."""
         constants = (getattr(self, name) for name in self.constants_of_rule)
-        wanted = type(self).law(speed, gap, relative_speed, *constants)
-        return wanted.clamp(-self.max_acceleration, self.max_acceleration)
+        return type(self).law(speed, gap, relative_speed, *constants)
 
 
 class IDMACC(Cruise):

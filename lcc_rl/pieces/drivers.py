@@ -85,6 +85,7 @@ class Drivers(Controller):
         names += [".".join(key) for key in history]
         options = constants[:1]
         self.drive(world, names, history, constants=constants, reset_options=options)
+        self.limits = None  # drives as a person, in automated vehicles, too
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
         self.time_gap_factors = world.deviations(self.time_gap_range)

@@ -52,6 +52,7 @@ class RecordedDriver(Controller):
         self.register_buffer("records", found)
         self.register_buffer("offsets", world.profiles.offsets)
         self.drive(world, self.reads)
+        self.limits = None
 
     def command(
         self, speed: Tensor, gap: Tensor, profile: Tensor, first: Tensor, step: Tensor

@@ -59,8 +59,8 @@ class Averaging(Controller):
         return total(past, -1) / (step + 1).clamp(max=self.samples), past
 
     def towards(self, wanted: Tensor, speed: Tensor) -> Tensor:
-        """Return the acceleration [m/s²] to a speed, within the limits."""
-        return ((wanted - speed) / self.time_step).clamp(*self.limits)
+        """Return the acceleration [m/s²] to a speed."""
+        return (wanted - speed) / self.time_step
 
     def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
         specs = super().written_specs(batch, device)
@@ -172,13 +172,14 @@ class Handover(Controller):
             constants=[key for inner in both for key in inner.constants],
             reset_options=[key for inner in both for key in inner.reset_options],
         )
+        self.limits = None  # each has its own
         self.from_step = round(self.from_s / world.time_step)
 
     def command(self, step: Tensor, *entries: Tensor) -> Any:
         """Return the commands of whoever drives, and what both write besides."""
         place = len(self.before.names)
-        first = self.before.command(*entries[:place])
-        second = self.after.command(*entries[place:])
+        first = self.before.limited(*entries[:place])
+        second = self.after.limited(*entries[place:])
         first, second = (x if isinstance(x, tuple) else (x,) for x in (first, second))
         command = torch.where(step < self.from_step, first[0], second[0])
         return (command, *first[1:], *second[1:])

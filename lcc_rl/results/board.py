@@ -109,17 +109,17 @@ def _cells(row: Row) -> dict[str, str]:
     }
 
 
-def as_markdown(documents: Sequence[Mapping[str, Any]]) -> str:
+def as_markdown(documents: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a Markdown table for each task: on each source, who was scored and what was saved.
 
     Args:
-        documents: contents of the files of ``lcc-rl score``.
+        documents: contents of the files of ``lcc-rl score``, by their names.
 
     Raises:
-        ConfigError: if two rows of one task and source are not comparable.
+        ConfigError: if two rows of one task and source are not comparable, or have one name.
     """
     check_alike(documents)
-    every = [{**row, "who": one["name"]} for one in documents for row in one["results"]]
+    every = [{**row, "who": one["name"]} for one in documents.values() for row in one["results"]]
     parts = []
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
@@ -134,21 +134,28 @@ def as_markdown(documents: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(parts)
 
 
-def check_alike(documents: Sequence[Mapping[str, Any]]) -> None:
-    """Check that all rows of a task and source were measured on the same data and settings.
+def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
+    """Check that the rows of a task and source share data and settings, and differ in name.
 
     Raises:
-        ConfigError: naming the document, the row, and what differs.
+        ConfigError: naming the file, the row, and what differs.
     """
     first: dict[tuple[str, str], Row] = {}
-    for document in documents:
+    files: dict[tuple[str, str, str], str] = {}
+    for file, document in documents.items():
         for row in document["results"]:
             place = (row["task"], row["source"])
             known = first.setdefault(place, row)
+            other = files.setdefault((document["name"], *place), file)
+            require(
+                other == file,
+                f"{other} and {file} both score {document['name']} in {place[0]} behind "
+                f"{place[1]}: remove one, or give it another name",
+            )
             for key in ("data", "settings"):
                 require(
                     row[key] == known[key],
-                    f"{document['name']}: {place[0]} behind {place[1]} was measured with other "
+                    f"{file}: {place[0]} behind {place[1]} was measured with other "
                     f"{key} ({row[key][:8]}, not {known[key][:8]})",
                 )
 

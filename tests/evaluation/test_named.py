@@ -189,6 +189,18 @@ class Wide(Steady):
         return super().command(*entries).expand(-1, -1, 2)
 
 
+class Forgetful(Steady):
+    remembers = ("integral",)
+
+    def command(self, gap, speed, ahead_speed, integral):
+        return super().command(gap, speed, ahead_speed)
+
+
+class Talkative(Steady):
+    def command(self, *entries):
+        return super().command(*entries), entries[0]
+
+
 class Unwritten(Steady):
     reads = ("self.gap", "self.speed", "my.last")
 
@@ -199,9 +211,11 @@ class Unwritten(Steady):
         (unknown, r"\.unknown reads vehicles.velocity, .* only .*vehicles.gap, .*vehicles.speed"),
         (
             plain_number,
-            r"\.plain_number .*: 'float' .* must return command.automated as tensors \[",
+            r"\.plain_number .* float .* must return command.automated as tensors \[",
         ),
         (Wide, r"Wide writes command.automated as \[1, 2\]"),
+        (Forgetful, r"returned 1 instead of 2 .* command.automated and automated.integral as"),
+        (Talkative, r"returned 2 instead of 1 .* must return command.automated as tensors"),
         (Unwritten, r"Unwritten reads my.last, which no piece of the scenario writes;"),
     ],
 )
@@ -247,6 +261,44 @@ def test_what_a_controller_remembers_is_its_roles_entry_from_zero_on() -> None:
         assert torch.equal(data["next", "command", role][..., 0, 0], 0.01 * (found - 1.0))
         first = data["vehicles", "speed"][:, :1, int(role == "human"), 0]
         assert (data["next", role, "first_speed"][..., 0, 0] == first).all()
+
+
+class Hard(Controller):
+    """Brakes harder than an automated vehicle may."""
+
+    reads = ("self.speed",)
+
+    def command(self, speed):
+        return torch.full_like(speed, -5.0)
+
+
+class Harder(Hard):
+    max_acceleration: Positive = 4.0  # [m/s²]
+
+
+@pytest.mark.parametrize(
+    ("node", "least"),
+    [
+        ({TARGET: f"{__name__}.Hard"}, -3.0),
+        ({TARGET: f"{__name__}.Harder"}, -4.0),
+        (
+            {
+                TARGET: "lcc_rl.pieces.Handover",
+                "before": {TARGET: f"{__name__}.Harder"},
+                "after": {TARGET: f"{__name__}.Hard"},
+                "from_s": 0.2,
+            },
+            (-4.0, -4.0, -3.0),
+        ),
+    ],
+)
+def test_commands_to_automated_vehicles_alone_are_bounded(node, least) -> None:
+    cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
+    cfg.scenario.controllers |= {AUTOMATED: node, "human": {TARGET: f"{__name__}.Hard"}}
+    command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next", "command"]
+    expected = torch.tensor(least).expand(2, 3)
+    assert torch.equal(command[AUTOMATED][..., 0, 0], expected)
+    assert (command["human"] == -5.0).all()
 
 
 def test_a_law_reads_what_its_parameters_name() -> None:

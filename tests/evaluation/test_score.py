@@ -84,6 +84,8 @@ def test_the_hash_is_of_the_code_of_an_own_controller(tmp_path, monkeypatch) -> 
         (["idm", "--source", "../x", "leader=i24"], "expected a new name"),
         (["idm", "--source", "x", "agent=ddpg"], "expected settings of data, "),
         (["idm", "data=stream"], "each task has its own"),
+        (["idm", "--name", "idm_acc"], "--name idm_acc: expected a new name"),
+        (["acc_filtered", "--task", "i80-follow"], "no safety filter: score acc, .* without one"),
     ],
 )
 def test_mistakes_are_named(words, message, tmp_path) -> None:
@@ -92,8 +94,24 @@ def test_mistakes_are_named(words, message, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_table_of_scores_refuses_those_of_other_windows_or_settings() -> None:
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("b", "3", r"b\.json: t behind s .* other data"),
+        ("a", "1", r"a\.json and b\.json both score a"),
+    ],
+)
+def test_a_table_of_scores_refuses_other_windows_and_a_name_twice(name, data, words) -> None:
     row = {"task": "t", "source": "s", "data": "1", "settings": "2"}
-    other = {"name": "b", "results": [{**row, "data": "3"}]}
-    with pytest.raises(ConfigError, match=r"b: t behind s .* other data"):
-        board.check_alike([{"name": "a", "results": [row]}, other])
+    other = {"name": name, "results": [{**row, "data": data}]}
+    with pytest.raises(ConfigError, match=words):
+        board.check_alike({"a.json": {"name": "a", "results": [row]}, "b.json": other})
+
+
+def test_a_score_has_the_name_given_and_a_failed_one_says_why_in_its_folder(tmp_path) -> None:
+    source = ("--source", "mine", "leader=i24", "leader.path=nowhere.parquet")
+    words = ["idm_acc", "--name", "my IDM", *ON, *source]
+    with pytest.raises(ConfigError, match="--source mine could not be played"):
+        main([*words, "--out", str(tmp_path / "a")])
+    assert json.loads((tmp_path / "a" / "score.json").read_text())["name"] == "my IDM"
+    assert (tmp_path / "a" / "error.txt").read_text().startswith("--source mine could not be")

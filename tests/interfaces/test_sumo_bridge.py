@@ -183,17 +183,17 @@ def alone(gap, speed):
     return gap.mean()
 
 
-@pytest.mark.parametrize(
-    ("who", "words"),
-    [
-        (nobody_knows, r"nobody_knows.*: the command of own is nan at 0\.1 s"),
-        (alone, r"alone.* returns \[\]; expected \[1, 1, 1\], one row per vehicle"),
-    ],
-)
-def test_what_is_no_command_is_refused_before_sumo_drives_instead(who, words, tmp_path) -> None:
+def test_a_command_that_is_no_number_is_refused_before_sumo_drives_instead(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
-    with pytest.raises(LccError, match=words):
-        Bridge(who, "own").command()
+    bridge = Bridge(nobody_knows, "own")
+    with pytest.raises(LccError, match=r"nobody_knows.*: the command of own is nan at 0\.1 s"):
+        bridge.command()
+
+
+def test_another_shape_than_a_row_per_vehicle_is_refused_at_once(tmp_path) -> None:
+    start(tmp_path, {})
+    with pytest.raises(LccError, match=r"alone writes .* \[\] .* expected \[1, 1\] .* per vehicle"):
+        Bridge(alone, "own")
 
 
 def test_sumo_is_imported_without_its_line_about_pyarrow() -> None:

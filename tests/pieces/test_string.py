@@ -249,11 +249,11 @@ def test_follower_stopper_keeps_time_gaps_and_its_limits() -> None:
     # At 20 m/s: 0.4, 0.6 and 0.8 s are 8, 12 and 16 m. 10 m: half of 20 m/s; 14 m: 25 m/s.
     wanted = [0.0, 10.0, 25.0, 30.0]
     gap, speed = column(7.0, 10.0, 14.0, 17.0), column(*[20.0] * 4)
-    got = piece.command(speed, gap, speed)
+    got = piece.limited(speed, gap, speed)
     limited = [min(max((v - 20.0) / 0.1, -3.0), 1.5) for v in wanted]
     assert got.flatten().tolist() == pytest.approx(limited)
     slow = (
-        FollowerStopper(desired_speed=30.0).bind(World(time_step=10.0)).command(speed, gap, speed)
+        FollowerStopper(desired_speed=30.0).bind(World(time_step=10.0)).limited(speed, gap, speed)
     )
     assert slow.flatten().tolist() == pytest.approx([(v - 20.0) / 10.0 for v in wanted])
 
@@ -264,7 +264,7 @@ def test_follower_stopper_desires_its_own_mean_speed() -> None:
     # The mean of what was driven, from the first step on.
     for step, (speed, mean) in enumerate(((3.0, 3.0), (6.0, 4.5), (9.0, 6.0), (9.0, 8.0))):
         own, at = torch.full((1, 1, 1), speed), torch.full((1, 1, 1), step)
-        command, history = piece.command(own, torch.full_like(own, gap), ahead, at, history)
+        command, history = piece.limited(own, torch.full_like(own, gap), ahead, at, history)
         assert float(command) == pytest.approx(min(max(mean - speed, -3.0), 1.5))
 
 
