@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Column, checked, lacking
-from lcc_rl.data.text import cells_of, is_text, parse_text, reading, single_spaces
+from lcc_rl.data.text import cells_of, is_text, parse_text, reading, single_spaces, unended
 from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
 from lcc_rl.errors import Concern, DataError
 
@@ -121,6 +121,8 @@ def read_ngsim(
     wanted = None if location is None else location.strip().lower()
     for name in rows.report.files:
         for block in _blocks(name):
+            last = block.first_line + block.lines.count(b"\n")
+            rows.report.notes += unended(block.lines, f"{name}: line {last}")
             rows.add(block, wanted)
     if not rows.chunks:
         found = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())

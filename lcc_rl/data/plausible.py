@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.tables import SI, UNITS, TableFile
+from lcc_rl.data.tables import SI, SPEEDS, UNITS, TableFile
 from lcc_rl.data.trajectories import divided, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
@@ -20,9 +20,12 @@ SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,windo
 SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
 WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
-LEAST_WINDOWS, LEAST_CHANGE = 20, 0.5  # fewer, or smaller ones [m], say nothing
+# Fewer windows, of all records or of one, or smaller changes [m], say nothing.
+LEAST_WINDOWS, LEAST_OF_ONE, LEAST_CHANGE = 20, 10, 0.5
 NEAR = 1.15  # factor by which gap_rate may be off 1 in the right units: noise of speeds lowers it
 STANDING = 0.5  # both cars stand below it [m/s]
+LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
+ROLES = ("follower", "leader")
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
 Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
@@ -34,9 +37,9 @@ Fault = tuple[str, str, NDArray[np.float64], str, Mask]
 class Plausible(Settings):
     """Thresholds of recorded motion; records are cut where a sample is outside of one.
 
-    The data are refused where more than ``max_share`` of the samples would be left out, or where
-    gaps change by a factor of more than ``max_mismatch``, either way, of what the speeds say
-    (:func:`gap_rate`).
+    The data are refused where more than ``max_share`` of the samples would be left out, where gaps
+    change by a factor of more than ``max_mismatch``, either way, of what the speeds say
+    (:func:`gap_rate`), or where a car drives by that factor farther than its leader.
     """
 
     max_speed: Positive = 70.0  # beyond it, a column is rather in km/h or ft/s [m/s]
@@ -87,7 +90,8 @@ class Plausible(Settings):
         """
         starts = starts_of(table["episode"].to_numpy())
         wrong, lines, advice = self._outside(table, starts, place, setting, remedy)
-        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST)
+        numbered = table.assign(row=np.arange(len(table)))  # for messages, by the place of a row
+        kept = divided(numbered, wrong, np.zeros_like(wrong), SHORTEST)
         lost = 1 - len(kept) / len(table)
         if lost > self.max_share or kept.empty:
             raise DataError(
@@ -105,7 +109,13 @@ class Plausible(Settings):
             )
             lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
-        return kept, [*lines, *more_lines, *self._check_units(kept, source, setting, units or {})]
+
+        def first_of(episode: int, column: str) -> str:
+            return place(int(kept["row"][kept["episode"] == episode].iloc[0]), column)
+
+        self._check_each(kept, source, first_of, setting, units or {})
+        more_lines += self._check_units(kept, source, setting, units or {})
+        return kept.drop(columns="row"), [*lines, *more_lines]
 
     def _outside(
         self,
@@ -133,6 +143,41 @@ class Plausible(Settings):
             advice = advice or f"{said}; mend the file or its units{more}, or raise that threshold"
             wrong |= new
         return wrong, lines, advice
+
+    def _check_each(
+        self,
+        kept: pd.DataFrame,
+        source: str,
+        place: Place,
+        setting: str,
+        units: Mapping[str, str],
+    ) -> None:
+        """Check that no car is in other units than the others: it hides in means over all.
+
+        ``place`` describes the first sample of an episode, by the episode's number.
+        """
+        if not set(kept.columns) >= OF_PAIRS:
+            return
+        limit = f"{setting}.max_mismatch={self.max_mismatch:g}"
+        ways = farther(kept)
+        if (ways["factor"] > self.max_mismatch).any():
+            worst = int(np.argmax(ways["factor"]))
+            own, ahead, factor = ways.iloc[worst]
+            follower, leader = (place(ways.index[worst], f"{role}_speed_mps") for role in ROLES)
+            raise DataError(
+                f"{source}: {follower}: by its speed, this vehicle drives {own:.4g} m, its leader "
+                f"({leader}) {ahead:.4g} m, {limit}; is one of these speeds in {_nearest(factor)}?"
+            )
+        rates = gap_rates(kept)
+        off = (rates > self.max_mismatch) | (rates < 1 / self.max_mismatch)
+        gap = {key: unit for key, unit in units.items() if key == "gap"}
+        for number, rate in zip(rates.index[off], rates[off], strict=True):
+            # Gaps of a faulty sensor fit no unit; where all are off, the check of all says so.
+            if (advice := fitting(rate, gap)) and not off.all():
+                raise DataError(
+                    f"{source}: {place(number, 'gap_m')} changes by {rate:.2f} m where the speeds "
+                    f"of leader and follower say 1 m, {limit}; for this vehicle alone, {advice}"
+                )
 
     def _check_units(
         self, kept: pd.DataFrame, source: str, setting: str, units: Mapping[str, str]
@@ -294,24 +339,72 @@ def gap_rate(episodes: pd.DataFrame) -> float | None:
     """
     if not set(episodes.columns) >= OF_PAIRS or episodes.empty:
         return None
+    slope = _slopes(_changes(episodes).assign(episode=0), LEAST_WINDOWS)
+    return None if slope.empty else float(slope.iloc[0])
+
+
+def gap_rates(episodes: pd.DataFrame) -> pd.Series:
+    """Return :func:`gap_rate` of each episode in which enough changes, by its number."""
+    return _slopes(_changes(episodes), LEAST_OF_ONE)
+
+
+def _slopes(changes: pd.DataFrame, least: int) -> pd.Series:
+    products = changes.assign(both=changes["said"] * changes["seen"], said=changes["said"] ** 2)
+    sums = products.groupby("episode")[["both", "said"]].sum()
+    count = products.groupby("episode").size()
+    enough = (count >= least) & (sums["said"] >= count * LEAST_CHANGE**2)
+    return (sums["both"] / sums["said"])[enough]
+
+
+def _changes(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Change of the gap in windows of 5 s as seen, and as the speeds say; see :func:`gap_rate`."""
     episode = episodes["episode"].to_numpy()
     first = np.append(True, episode[1:] != episode[:-1])
-    time, gap, leader, follower = (
-        episodes[name].to_numpy(np.float64)
-        for name in ("time_s", "gap_m", "leader_speed_mps", "follower_speed_mps")
-    )
-    relative = leader - follower
-    step = np.where(first, 0.0, np.diff(time, prepend=time[0]))
-    way = np.cumsum(step * (relative + np.roll(relative, 1)) / 2)
+    time, gap = (episodes[name].to_numpy(np.float64) for name in ("time_s", "gap_m"))
+    way = np.cumsum(_steps(episodes, "leader") - _steps(episodes, "follower"))
     number = np.cumsum(first) - 1
     window = np.floor((time - time[first][number]) / WINDOW)
     marks = np.flatnonzero(first | (np.diff(window, prepend=0.0) != 0))
     same = np.diff(number[marks]) == 0
-    group = number[marks][1:][same]
-    said = _centred(np.diff(way[marks])[same], group)
-    seen = _centred(np.diff(gap[marks])[same], group)
-    enough = len(said) >= LEAST_WINDOWS and np.sqrt(np.mean(said**2)) >= LEAST_CHANGE
-    return float(said @ seen / (said @ said)) if enough else None
+    found = {"said": np.diff(way[marks])[same], "seen": np.diff(gap[marks])[same]}
+    changes = pd.DataFrame(found).assign(episode=episode[marks][1:][same])
+    return changes - changes.groupby("episode").transform("mean").assign(episode=0)
+
+
+def _steps(episodes: pd.DataFrame, role: str) -> NDArray[np.float64]:
+    """Way from the sample before, by the speed of leader or follower; 0 as an episode begins."""
+    speed = episodes[f"{role}_speed_mps"].astype(np.float64)
+    way = (speed + speed.shift()) / 2 * episodes["time_s"].diff()
+    return way.where(episodes["episode"].diff() == 0, 0.0).to_numpy()
+
+
+def farther(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Return how much farther one car of a pair drives than the other, by their speeds.
+
+    The way of the leader may be less by what the gap grows. Whichever is nearer to the follower's
+    counts, since a gap may jump to another car.
+
+    Args:
+        episodes: see :func:`gap_rate`.
+
+    Returns:
+        By episodes of at least 50 m: the ways of follower and leader, own and ahead [m], and the
+        factor, at least 1.
+    """
+    own, ahead = (_steps(episodes, role) for role in ROLES)
+    ways = pd.DataFrame({"own": own, "ahead": ahead}).groupby(episodes["episode"].to_numpy()).sum()
+    gap = episodes.groupby("episode")["gap_m"]
+    others = ways["ahead"], ways["ahead"] - (gap.last() - gap.first())
+    factors = [np.exp(np.abs(np.log(ways["own"].clip(1.0) / way.clip(1.0)))) for way in others]
+    ways["factor"] = np.minimum(*factors)
+    return ways[ways[["own", "ahead"]].max(axis=1) >= LEAST_WAY]
+
+
+def _nearest(factor: float) -> str:
+    """Return the unit of speeds that is this factor of m/s; all of them where none is."""
+    found = {unit: abs(log(factor * size)) for unit, size in SPEEDS.items() if size != 1.0}
+    near = min(found, key=found.__getitem__)
+    return near if found[near] < log(NEAR) else ", ".join(found)
 
 
 def fitting(rate: float, units: Mapping[str, str]) -> str:
@@ -336,9 +429,3 @@ def fitting(rate: float, units: Mapping[str, str]) -> str:
                 words = f"with {option} it would be {there:.2f} m"
                 found.append((declared == SI[quantity], abs(log(there)), words))
     return ", ".join(words for *_, words in sorted(found))
-
-
-def _centred(values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Values without the mean of their group."""
-    count = np.maximum(np.bincount(group), 1)
-    return values - (np.bincount(group, values) / count)[group]

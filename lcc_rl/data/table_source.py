@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, without_blank
+from lcc_rl.data.plausible import LEAST_WAY, SMOOTHING, Place, Plausible, without_blank
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
@@ -45,10 +45,10 @@ MEASURED = ("time", "speed", "position")  # a row in which one is blank is left 
 UNEVEN = 0.1  # of a step, by which a time may be off the common grid
 LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
-LEAST_WAY = 50.0  # m, below which that is not compared
 EXACT, ALONE = "exact duplicate (vehicle, time)", "stretch without a sample on the time grid"
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 
 class TableSource(Settings):
@@ -235,7 +235,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
             f"vehicle {_name(rows, row, report)}; expected steps of about {step:g} s"
         )
     first = ~together | (steps > HOLE * step)
-    _check_way(rows, first, report.source)
+    _check_way(rows, together, first, names, report)
     report.vehicles, report.segments = int((~together).sum()), int(first.sum())
     origin = rows.groupby("recording").time.min().reindex(range(len(names))).to_numpy()
     frames = (rows.time - origin[rows.recording]).to_numpy() / FRAME
@@ -264,20 +264,37 @@ def _sorted(rows: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
     return rows.iloc[order].reset_index(drop=True)
 
 
-def _check_way(rows: pd.DataFrame, first: NDArray[np.bool_], source: str) -> None:
-    """Check that positions and speeds tell of the same way: direction and units."""
+def _check_way(
+    rows: pd.DataFrame, together: Mask, first: Mask, names: list[str], report: ReadReport
+) -> None:
+    """Check that positions and speeds tell of the same way: direction and units.
+
+    Where some vehicles agree, the worst is named: it hides among many, and spoils a mean of few.
+    """
     if "position" not in rows:
         return
-    inner, speed = ~first, rows.speed
-    way = float(rows.position.diff()[inner].sum())
-    driven = float(((speed + speed.shift()) / 2 * rows.time.diff())[inner].sum())
-    if driven < LEAST_WAY or AGREE[0] <= way / driven <= AGREE[1]:
-        return
-    backward = "; positions must grow in the direction of travel" if way < 0 else ""
-    raise DataError(
-        f"{source}: by their positions the vehicles drive {way:.4g} m, by their speeds "
-        f"{driven:.4g} m{backward}; check data.units and data.columns of time, speed and position"
-    )
+    driven = (rows.speed + rows.speed.shift()) / 2 * rows.time.diff()
+    ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(pd.Series(first), 0.0)
+    each = ways.groupby(np.cumsum(~together)).sum()
+    far = each.max(axis=1) >= LEAST_WAY
+    off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
+    worst = int(np.argmax(off * far))
+    row = int(np.flatnonzero(~together)[worst])
+    place = f"recording {names[rows.recording[row]]}, from data row {rows.row[row] + 1}"
+    found = [
+        (f"vehicle {_name(rows, row, report)} ({place}) drives", "its", each.iloc[worst]),
+        ("the vehicles drive", "their", each.sum()),
+    ]
+    for who, whose, (way, driven) in (
+        found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
+    ):
+        if max(way, driven) >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
+            backward = "; positions must grow in the direction of travel" if way < 0 else ""
+            raise DataError(
+                f"{report.source}: by {whose} positions {who} {way:.4g} m, by {whose} speeds "
+                f"{driven:.4g} m{backward}; check data.units and data.columns of time, speed and "
+                "position"
+            )
 
 
 def _interpolated(

@@ -31,6 +31,7 @@ from lcc_rl.data.text import (
     reading,
     separator_of,
     single_spaces,
+    unended,
 )
 from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError, unknown_name
@@ -224,6 +225,7 @@ class TableFile:
             return {name: pa.chunked_array([], pa.string()) for name in names}
         places = {str(self.header.index(name)): name for name in names}
         table = parse_text(self.rows, len(self.header), self.separator, [*places], str(self.path))
+        self.notes += unended(self.rows, f"{self.path}: data row {table.num_rows}")
         return {name: table[place] for place, name in places.items()}
 
 

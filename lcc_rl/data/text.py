@@ -15,7 +15,7 @@ from typing import IO, Any
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 from lcc_rl.io.memory import available, require_memory
 
 BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
@@ -178,6 +178,20 @@ def parse_text(
         place = f", from line {first} on" if first else ""
         raise DataError(f"{source}: a quote is not closed, or a line end is stray{place}")
     return table
+
+
+def unended(rows: bytes, place: str) -> list[Concern]:
+    """Return a warning if the last row has no line end, so that its last cell may be cut.
+
+    It is no error: many programs write no last line end, and nothing tells a number that lost
+    its last digits from a whole one.
+    """
+    if rows.endswith(b"\n"):
+        return []
+    shown = rows[rows.rfind(b"\n") + 1 :].decode()[-40:]
+    return [
+        Concern(f"{place}, the last, ends in {shown!r} without a line end; is the file cut off?")
+    ]
 
 
 def _odd_row(row: pa_csv.InvalidRow, rows: bytes, width: int, source: str, first: int) -> DataError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -10,7 +11,7 @@ import pytest
 from ngsim_text import OFFICIAL, cells, csv_text, native_text, pair, portal_text
 from table_text import READERS, long_table, openacc_text, pairs
 
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 
 GOOD = csv_text(pair())
 TABLE = long_table()
@@ -141,6 +142,31 @@ def test_a_bad_table_gives_one_line(tmp_path: Path, reader: str, content, words:
         READERS[reader](str(path))
     assert "bad.csv" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("reader", "content", "place"),
+    [
+        ("table", csv(TABLE), "data row 1200"),
+        ("table", csv(TABLE).replace("\n", "\r\n"), "data row 1200"),
+        ("episodes", csv(pairs()), "data row 600"),
+        ("openacc", openacc_text(), "data row 400"),
+        ("source", csv_text(pair(range(200))), "line 401"),
+        ("source", native_text(pair(range(200))).rstrip() + "0\n", "line 400"),
+    ],
+)
+def test_a_file_that_ends_within_its_last_cell_is_read_with_a_warning(
+    tmp_path: Path, reader: str, content: str, place: str
+) -> None:
+    path = tmp_path / "cut.csv"
+    path.write_bytes(content.encode())
+    whole = READERS[reader](str(path)).report
+    path.write_bytes(content.rstrip().encode()[:-1])
+    lines = [line for line in READERS[reader](str(path)).report if line not in whole]
+    assert [type(line) for line in lines] == [Concern]
+    assert re.fullmatch(
+        rf"{path}: {place}, the last, ends in '.*' without a line end; .*", lines[0]
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 not really PAR1", None])

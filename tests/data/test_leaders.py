@@ -188,7 +188,7 @@ def test_the_first_car_of_native_openacc_files_leads(tmp_path) -> None:
 @pytest.mark.parametrize("step", [0.1, 0.25])
 def test_leaders_of_a_trajectory_file_at_any_step(tmp_path: Path, step: float) -> None:
     leader = [cells(9, k, Local_Y=10.0 * k + 60, v_Vel=round(20 + 0.2 * k, 1)) for k in range(201)]
-    (tmp_path / "file.txt").write_text(csv_text(pair(range(201))[:201] + leader))
+    (tmp_path / "file.txt").write_text(csv_text(pair(range(201), v_Vel=40)[:201] + leader))
     profiles = from_trajectories(tmp_path / "file.txt", step)
     assert profiles.names == ("2005-04-13T22:58:55Z/9@0.0s",)
     time = step * np.arange(round(20 / step) + 1)

@@ -12,7 +12,7 @@ from table_text import pairs
 
 from lcc_rl.data.episodes import validate_episodes, write_episodes
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import Plausible, gap_rate, hard_share
+from lcc_rl.data.plausible import Plausible, farther, gap_rate, hard_share
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import DataError
@@ -88,6 +88,16 @@ def test_gaps_in_other_units_than_the_speeds_are_refused(columns, factor, said) 
         Plausible(max_speed=100.0, min_gap=-1e3).select(
             table, "f.csv", lambda row, column: f"row {row}"
         )
+
+
+def test_a_gap_that_jumps_to_another_car_is_no_other_unit() -> None:
+    table = wavy(20.0)  # of about 300 m
+    jump = table.assign(gap_m=table["gap_m"] + 150.0 * (table.index >= 100) * (table.index < 200))
+    Plausible().select(jump, "f.csv", lambda row, column: f"row {row}")
+    table.loc[:199, "follower_speed_mps"] /= 2.23694
+    assert farther(table)["factor"].round(1).tolist() == [2.2, 1.0, 1.0]
+    with pytest.raises(DataError, match=r"f\.csv: row 0: by its speed, .* in mph\?"):
+        Plausible().select(table, "f.csv", lambda row, column: f"row {row}")
 
 
 def test_speeds_and_gaps_in_other_units_that_agree_are_refused(shared_data: Path) -> None:

@@ -216,6 +216,32 @@ def test_a_unit_declared_for_si_is_named(tmp_path, units, first) -> None:
         TableSource(path=path, columns=BY_GAP, units={"time": "ms"}).load()
 
 
+@pytest.mark.parametrize(
+    ("columns", "factors", "car", "words"),
+    [
+        (BY_GAP, {"v": 3.6}, 2, "vehicle 3, .* drives [67].* m, its leader .*vehicle 2, .*in km/h"),
+        (BY_GAP, {"v": 3.6}, 1, "row 601, vehicle 2, .* its leader .*row 1, vehicle 1, .*in km/h"),
+        (BY_GAP, {"gap": 1 / FOOT}, 3, "row 1201, vehicle 3, .*'gap' changes by 3.2.*gap=ft it w"),
+        (
+            BY_LANE,
+            {"v": 3.6},
+            7,
+            r"vehicle 7 \(recording my, from data row 3601\) drives 726 m, by its",
+        ),
+        (BY_LANE, {"x": 1 / FOOT}, 7, "by its positions vehicle 7 .* drives 2382 m, by its sp"),
+    ],
+)
+def test_one_vehicle_in_another_unit_is_named(tmp_path, columns, factors, car, words) -> None:
+    frame = long_table(cars=8, rows=600)
+    for name, factor in factors.items():
+        frame.loc[frame["id"] == car, name] *= factor
+    source = TableSource(
+        path=written(tmp_path, frame), columns=columns, plausible=Plausible(max_acceleration=30.0)
+    )
+    with pytest.raises(DataError, match=rf"my\.csv, with .*{words}"):
+        source.load()
+
+
 def test_the_report_of_an_extraction_without_episode_is_divided_by_semicolons(tmp_path) -> None:
     path = written(tmp_path, long_table(rows=100))
     with pytest.raises(
