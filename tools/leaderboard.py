@@ -40,7 +40,7 @@ from lcc_rl.results.cells import signed
 from lcc_rl.results.headline import saved
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import load_config
-from lcc_rl.results.scores import LEAST, SHARE, Task, keeps, limited, scores
+from lcc_rl.results.scores import FLOW, LEAST, SHARE, Task, keeps, limited, scores
 
 BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
 DECISIONS, WARM_UP = 200, 20
@@ -98,16 +98,17 @@ def scored(folder: Path) -> tuple[str, pd.DataFrame]:
 
 def drawn(task: Task, table: pd.DataFrame) -> str:
     """Return the Markdown table of a task; the kept scores hold every measure."""
-    head = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h]", "limits"]
+    head = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h] (%)", "limits"]
     lines = [[*head, "decision [ms]"]]
+    whole = table.set_index("strategy").loc[task.against, FLOW]
     for row in table.to_dict("records"):
         share = (100.0 * row[f"saving{end}"] for end in ("", "_low", "_high"))
         cells = [
             in_words(str(row["strategy"])),
             f"{row['score']:.2f}",
             saved(*share),
-            signed(round(-100.0 * row["distance_lost"], 1) + 0.0),
-            f"{row['flow_vph']:,.0f}",
+            signed(-100.0 * row["distance_lost"]),
+            f"{row[FLOW]:,.0f} ({signed(100.0 * (row[FLOW] / whole - 1.0))})",
             "kept" if row["kept"] else broken(task, row),
             f"{row['decision_ms']:.2f}" if np.isfinite(row["decision_ms"]) else "",
         ]

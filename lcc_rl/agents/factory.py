@@ -32,16 +32,10 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     """Build the agent of a configuration.
 
     Raises:
-        ConfigError: naming the option at fault; if there is none, or nobody for it to drive.
+        ConfigError: naming the option at fault; if there is none.
     """
-    string = cfg.scenario.vehicles
     if not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: it has no agent")
-    if not string.count(AUTOMATED):
-        raise ConfigError(
-            f"scenario.string={cfg.scenario.string}: nobody is automated, so nothing can be "
-            "learned; use agent=none to evaluate it"
-        )
     world = world_of(cfg, population=population)
     observation = build(cfg.observation, "observation", Observation, world=world)
     driver = cfg.scenario.controllers.get(AUTOMATED) or {}

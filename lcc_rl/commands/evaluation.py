@@ -126,7 +126,7 @@ def complete(cfg: EvaluateConfig, folder: Path) -> None:
 def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
     prepare_torch(cfg)
     check_measured(cfg)
-    if cfg.policy not in (None, PRETRAINED) and not learns(cfg):
+    if cfg.policy not in (None, PRETRAINED) and not learns(cfg) and not _nobody_drives(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
     own = own and not only_named(cfg)
     if own:
@@ -174,7 +174,8 @@ def only_named(cfg: EvaluateConfig) -> bool:
 def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
     """Return whom ``compare`` names: controllers by their names in tables, and policies.
 
-    Policies have the name that was given, or the place of their file.
+    Policies have the name that was given, or the place of their file. Nobody is left where no
+    vehicle of the string is automated, as at the share 0 of a sweep.
 
     Raises:
         ConfigError: if two have one name, or one has that of somebody else, or a controller is
@@ -197,6 +198,11 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
         _check_label(label, who, str(who).removesuffix(FILTERED))
         if who != DIRECT:
             controller_of(who)
+    if _nobody_drives(cfg):
+        if left := [*named, *filter(None, [cfg.policy])]:
+            log.warning("no vehicle is automated; left out: %s", ", ".join(left))
+        return {}, {}
+    for label in rivals:
         require(applies(cfg, label), f"compare={label}: it has no vehicle to drive in this string")
     return rivals, policies
 
@@ -208,6 +214,10 @@ def _check_label(label: str, who: Any, own: str) -> None:
         in_words(plain) in (plain, in_words(own)),
         f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
     )
+
+
+def _nobody_drives(cfg: StudyConfig) -> bool:
+    return AUTOMATED not in cfg.scenario.vehicles.names
 
 
 def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:

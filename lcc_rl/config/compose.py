@@ -186,10 +186,13 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
 
 
 def _learns(content: Mapping[str, Any]) -> bool:
-    """Whether there is an agent, and a controller that carries out its actions."""
-    agent, driver = content.get("agent"), content.get("scenario", {}).get("controllers", {})
+    """Whether there is an agent, and vehicles whose controller carries out its actions."""
+    agent, scenario = content.get("agent"), content.get("scenario", {})
     if not isinstance(agent, dict) or TARGET not in agent:  # a recipe's settings of an agent
         return False
+    if "string" in scenario and not parse_string(scenario["string"]).count(AUTOMATED):
+        return False
+    driver = scenario.get("controllers", {})
     if not isinstance(driver, Mapping) or AUTOMATED not in driver:
         return True
     return takes_action(driver[AUTOMATED])

@@ -27,7 +27,8 @@ def check_used(content: Mapping[str, Any], overrides: Sequence[str], sweep: bool
         return
     reasons = dict(_of_traffic(content))
     if not sweep:
-        reasons |= dict(_of_agent(content)) | {"sweep": "it names the folder of a sweep, -m"}
+        reasons |= dict(_of_roles(content)) | dict(_of_agent(content))
+        reasons["sweep"] = "it names the folder of a sweep, -m"
     typed = {item: item.lstrip("+~").partition("=")[0].partition("@")[0] for item in overrides}
     for item, key in typed.items():
         for unused, reason in reasons.items():
@@ -53,10 +54,6 @@ def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if set(string.names) == {AUTOMATED} and not _is_human(scenario["controllers"].get(AUTOMATED)):
         for key in ("drivers", "evaluation.drivers"):
             yield key, f"there is no human driver in scenario.string={scenario['string']}"
-    for group in ("controllers", "start"):
-        for role in scenario[group]:
-            if role not in string.names:
-                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
     unused = {
         "episodes": ("evaluation.full_length", "leader.cases", "leader.full_length"),
         "vehicles": tuple(f"evaluation.{name}" for name in OF_EPISODES),
@@ -66,13 +63,24 @@ def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield name, f"it is unused with evaluation.rows={rows}"
 
 
+def _of_roles(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield settings of roles that no vehicle has, and why they have no effect."""
+    scenario = content["scenario"]
+    for group in ("controllers", "start", "filters", "actuators", "sensors"):
+        for role in scenario.get(group, ()):
+            if role not in parse_string(scenario["string"]).names:
+                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+
+
 def _of_agent(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield settings of learning without effect, and why."""
     agent: Any = content.get("agent")
     if not is_node(agent):
         driver = content["scenario"]["controllers"].get(AUTOMATED)
         reason = f"variant {content['variant']} learns nothing"
-        if is_node(driver) and not takes_action(driver):
+        if not parse_string(content["scenario"]["string"]).count(AUTOMATED):
+            reason = "no vehicle of the string is automated"
+        elif is_node(driver) and not takes_action(driver):
             kind = short_name(driver[TARGET])
             reason += f": {kind} drives the automated vehicles and takes no action of a policy"
         for key in ("agent", "training"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -101,7 +101,7 @@ def world_of(
         nominal,
         _by_role(scenario, "actuators", Actuation),
         _by_role(scenario, "sensors", Sensors),
-        [role for role, node in scenario.filters.items() if node is not None],
+        list(_nodes(scenario, "filters")),
     )
 
 
@@ -130,16 +130,26 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     return cfg
 
 
-def _by_role(scenario: Any, group: str, kind: type[Piece]) -> dict[str, Any]:
-    """Build the settings of a group of pieces by role.
+def _nodes(scenario: Any, group: str) -> dict[str, Any]:
+    """Return what a group describes by role, of the roles that the string has.
 
     Raises:
-        ConfigError: naming the option at fault.
+        ConfigError: if it names a role that has no controller.
     """
-    nodes = {role: node for role, node in getattr(scenario, group).items() if node is not None}
-    for role in nodes:
-        if role not in scenario.vehicles.names:
-            raise ConfigError(f"scenario.{group}.{role}: no vehicle has that role")
+    nodes = getattr(scenario, group)
+    _check_roles(nodes, f"scenario.{group}", scenario)
+    return {role: nodes[role] for role in scenario.vehicles.names if nodes.get(role) is not None}
+
+
+def _check_roles(roles: Iterable[str], where: str, scenario: Any) -> None:
+    for role in roles:
+        if role not in scenario.controllers:
+            raise unknown_name(f"role ({where})", role, list(scenario.controllers))
+
+
+def _by_role(scenario: Any, group: str, kind: type[Piece]) -> dict[str, Any]:
+    """Build the settings of a group of pieces by role."""
+    nodes = _nodes(scenario, group)
     return {role: build(node, f"scenario.{group}.{role}", kind) for role, node in nodes.items()}
 
 
@@ -168,9 +178,7 @@ def build_pieces(
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), world)
     drivers = _drivers(scenario, world)
-    for role in energy.roles:
-        if role not in scenario.controllers:
-            raise unknown_name("role (energy.roles)", role, list(scenario.controllers))
+    _check_roles(energy.roles, "energy.roles", scenario)
     classes = [EnergyClasses().bind(world)] if len(energy.models) > 1 else []
     actuators, sensors = (
         [own.bind(world, role) for role, own in group.items()]
@@ -222,22 +230,19 @@ def _leader(scenario: Any, node: Any, world: World) -> list[Piece]:
 
 def _drivers(scenario: Any, world: World) -> list[Any]:
     """Build the controllers of the roles that occur, and their safety filters."""
-    pieces, roles = [], world.string.names
-    for group, needed in (("controllers", True), ("filters", False)):
-        nodes = getattr(scenario, group)
-        for role in roles:
-            if nodes.get(role) is not None:
-                pieces.append(_build(nodes[role], f"scenario.{group}", world, role))
-            elif needed:
-                known = ", ".join(name for name in nodes if nodes[name] is not None)
-                raise ConfigError(
-                    f"scenario.string has the role {role!r}, but scenario.controllers names only "
-                    f"{known}; use +controller@scenario.controllers.{role}=… for another"
-                )
-        strange = [role for role in nodes if not needed and role not in roles]
-        if strange:
-            raise ConfigError(f"scenario.{group}.{strange[0]}: no vehicle has that role")
-    return pieces
+    drivers = _nodes(scenario, "controllers")
+    for role in world.string.names:
+        if role not in drivers:
+            known = ", ".join(name for name, node in scenario.controllers.items() if node)
+            raise ConfigError(
+                f"scenario.string has the role {role!r}, but scenario.controllers names only "
+                f"{known}; use +controller@scenario.controllers.{role}=… for another"
+            )
+    return [
+        _build(node, f"scenario.{group}", world, role)
+        for group in ("controllers", "filters")
+        for role, node in _nodes(scenario, group).items()
+    ]
 
 
 def _motion(scenario: Any, world: World) -> StringMotion:

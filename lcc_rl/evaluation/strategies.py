@@ -159,7 +159,7 @@ def by_people(cfg: StudyConfig) -> StudyConfig:
 def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose string lacks the automated vehicles."""
     roles = [role for role in cfg.scenario.vehicles.roles if role != AUTOMATED]
-    cfg = by_people(cfg)
+    cfg = deepcopy(cfg)
     cfg.scenario.string = " ".join(roles)
     return cfg
 

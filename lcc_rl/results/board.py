@@ -16,7 +16,7 @@ from lcc_rl.results.headline import Shown, saved
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import DRIVE
-from lcc_rl.results.scores import PER_DISTANCE, Task, keeps, limited
+from lcc_rl.results.scores import FLOW, FLOW_LOST, NAMED, PER_DISTANCE, Task, keeps, limited
 
 Row = Mapping[str, Any]
 COLUMNS = (
@@ -24,14 +24,22 @@ COLUMNS = (
     Shown("score", "score"),
     Shown("saved", "saved [%]\nagainst"),
     Shown("distance", "dis-\ntance\n[%]"),
-    Shown("flow", "flow\n[1/h]"),
+    Shown("flow_pct", "flow\n[%]"),
     Shown("ratio", "string\nratio"),
     Shown("drives", "dri-\nves"),
     Shown("kept", "limits\nkept"),
 )
-HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "limits not kept"]
+HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits not kept"]
 SHARE = ("saving", "saving_low", "saving_high")
-COPIED = ("score", *SHARE, "distance_lost", "flow_vph", "string_ratio", "final_speed_spread_mps")
+COPIED = (
+    "score",
+    *SHARE,
+    "distance_lost",
+    FLOW,
+    FLOW_LOST,
+    "string_ratio",
+    "final_speed_spread_mps",
+)
 
 
 def row_of(
@@ -82,9 +90,9 @@ def as_rich(who: str, rows: Sequence[Row]) -> Table:
             lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
-        "saved, distance: against the baseline; 95 % interval over drives; over windows where "
-        "there are fewer than five drives, too narrow if one drive has several; score.json has "
-        "every limit and value."
+        "saved, distance, flow: against the baseline; 95 % interval over drives; over "
+        "windows where there are fewer than five drives, too narrow if one drive has several; "
+        "score.json has every limit and value."
     )
     return headline.as_rich(pd.DataFrame(lines), in_words(who), caption, COLUMNS)
 
@@ -97,12 +105,13 @@ def unit_of(row: Row) -> str:
 def _cells(row: Row) -> dict[str, str]:
     """Return the cells of a row as text."""
     share = [np.nan if row[key] is None else 100.0 * row[key] for key in SHARE]
-    ratio, flow = row["string_ratio"], row["flow_vph"]
+    ratio, flow, lost = row["string_ratio"], row[FLOW], row[FLOW_LOST]
     return {
         "score": f"{row['score']:.2f}",
         "saved": saved(*share),
         "distance": signed(-100.0 * row["distance_lost"]),
         "flow": headline.MISSING if flow is None else f"{flow:,.0f}",
+        "flow_pct": headline.MISSING if lost is None else signed(-100.0 * lost),
         "ratio": headline.MISSING if ratio is None else f"{ratio:.2f}",
         "drives": str(row["drives"]),
         "kept": "yes" if row["kept"] else ",\n".join(broken(row)),
@@ -167,10 +176,15 @@ def _sample(row: Row) -> str:
 
 
 def _markdown(row: Row) -> list[str]:
-    """Return saving, flow, and the limits that are not kept; the saving in bold where all are."""
+    """Return saving, flow, and the limits that are not kept.
+
+    A saving is bold where all limits are kept, and a flow where much of it is lost.
+    """
     cells = _cells(row)
     share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
-    return [share, cells["flow"], ", ".join(broken(row))]
+    much = (row[FLOW_LOST] or 0.0) > NAMED
+    flow = f"**{cells['flow_pct']}**" if much else cells["flow_pct"]
+    return [share, cells["flow"], flow, ", ".join(broken(row))]
 
 
 def broken(row: Row) -> list[str]:

@@ -22,8 +22,8 @@ class Column(NamedTuple):
     number: bool
 
 
-def signed(value: float, form: str = "+.1f") -> str:
-    """Return a number with its sign, a minus as in print.
+def signed(value: float, form: str = "+z.1f") -> str:
+    """Return a number with its sign, a minus as in print, and no negative zero.
 
     Examples:
         >>> signed(-2.34), signed(2.34)

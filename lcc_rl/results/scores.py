@@ -27,7 +27,9 @@ PER_DISTANCE = {
 }
 PLAIN = ("final_speed_spread_mps", "speed_std_mps", "string_ratio")
 SCORE, DISTANCE, DAMPING = "score", "distance_m", "damping_time_s"
-MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", "flow_vph", "string_ratio")
+FLOW, FLOW_LOST = "flow_vph", "flow_lost"
+NAMED = 0.05  # share of the flow from which on a table says that it is lost
+MEANS = ("mean_gap_m", "mean_speed_mps", "final_speed_spread_mps", FLOW, "string_ratio")
 # Columns that may have a limit, and what tables call them.
 HEADINGS = {
     "max_gap_m": "gap\n≤ {:g}\n[m]",
@@ -89,22 +91,22 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
 
     Returns:
         One row per strategy: seeds, windows, drives, score, the share saved against
-        ``task.against`` with its interval, the share of the distance that is lost against it, means
-        of gap, speed and traffic, on a ring the share of episodes that are damped and their mean
-        damping time, the value of every limit, collisions, and whether the strategy
-        keeps all limits and never collides.
+        ``task.against`` with its interval, the shares of the distance and the flow that are lost
+        against it, means of gap, speed and traffic, on a ring the share of episodes that are
+        damped and their mean damping time, the value of every limit, collisions, and whether the
+        strategy keeps all limits and never collides.
 
     Raises:
         ConfigError: if the column of a limit, or the strategy ``task.against``, is missing.
     """
     check_unit(task.unit, energy)
-    missing = [column for column in task.limits if column not in episodes]
+    rows, per = _scored(episodes, task), [DISTANCE] if task.score in PER_DISTANCE else []
+    missing = [column for column in task.limits if column not in rows]
     if missing:
         raise ConfigError(f"task.limits.{missing[0]}: episodes.parquet has no such column")
     if task.against not in set(episodes["strategy"]):
         raise ConfigError(f"task.against={task.against}: it is not among the strategies evaluated")
-    rows, per = _scored(episodes, task), [DISTANCE] if task.score in PER_DISTANCE else []
-    whole = rows.loc[rows["strategy"] == task.against, DISTANCE].mean()
+    whole = rows[rows["strategy"] == task.against]
     found = []
     for name, part in rows.groupby("strategy", sort=False):
         value, share = float(part[SCORE].mean()), NOTHING
@@ -117,7 +119,8 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
         row |= {"windows": part["profile_id"].nunique()}
         row |= {"drives": part.get(DRIVE, part["profile_id"]).nunique()}
         row |= {"score": value, **share.columns("saving")}
-        row |= {"distance_lost": 1.0 - part[DISTANCE].mean() / whole}
+        row |= {"distance_lost": _lost(part, whole, DISTANCE)}
+        row |= {FLOW_LOST: _lost(part, whole, FLOW)} if FLOW in part else {}
         row |= {column: part[column].mean() for column in MEANS if column in part}
         if DAMPING in part:  # on a ring; the mean is over the episodes that are damped
             row |= {"damped": part[DAMPING].notna().mean(), DAMPING: part[DAMPING].mean()}
@@ -128,15 +131,32 @@ def scores(episodes: pd.DataFrame, task: Task, energy: Fleet) -> pd.DataFrame:
 
 
 def _scored(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
-    """Return the rows with score, an energy as such, and distance of all vehicles."""
+    """Return the rows with score, an energy as such, and distance of all vehicles.
+
+    Where no vehicle is automated, none has a value that a limit bounds.
+    """
     parts = [name for name in WAYS if name in episodes]
-    rows = episodes.assign(**{DISTANCE: episodes[parts].sum(axis=1)})
+    none = {} if WAYS[0] in parts else dict.fromkeys(task.limits, float("nan"))
+    rows = episodes.assign(**none, **{DISTANCE: episodes[parts].sum(axis=1)})
     column = PER_DISTANCE.get(task.score, task.score)
     score = rows[column] if column in rows else pd.Series(float("nan"), rows.index)
     alone = column.replace("total", "hdv")  # where nobody is automated
     if alone in rows:
         score = score.fillna(rows[alone])
     return rows.assign(**{SCORE: score})
+
+
+def _lost(part: pd.DataFrame, whole: pd.DataFrame, column: str) -> float:
+    """Return the share of the mean of a column that rows lose against others."""
+    return float(1.0 - part[column].mean() / whole[column].mean())
+
+
+def flow_note(table: pd.DataFrame, against: str) -> str:
+    """Return in a sentence which strategies lose much of the flow; empty if none does."""
+    lost = table.set_index("strategy").get(FLOW_LOST, pd.Series(dtype=float))
+    lost = lost[lost > NAMED]
+    parts = [f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in lost.items()]
+    return f"Flow lost against {in_words(against)}: {'; '.join(parts)}." if parts else ""
 
 
 def _worst(part: pd.DataFrame, column: str) -> float:
@@ -161,14 +181,16 @@ def _scale(column: str) -> float:
     return 100.0 if column.startswith(SHARE) else 1.0
 
 
+def _bounded(column: str, bound: float) -> str:
+    """Return a limit in words, with line breaks as in the heading of a column."""
+    return HEADINGS[column].format(_scale(column) * bound)
+
+
 def _columns(task: Task, table: pd.DataFrame) -> tuple[Shown, ...]:
     """Return the columns of scores on the terminal: those of every table, and the limits."""
-    flows = "flow_vph" in table and table["flow_vph"].notna().any()
-    way = Shown("flow_vph", "flow\n[1/h]") if flows else Shown("distance_pct", "dis-\ntance\n[%]")
-    limits = [
-        Shown(name, HEADINGS[name].format(_scale(name) * bound))
-        for name, bound in task.limits.items()
-    ]
+    flows = FLOW in table and table[FLOW].notna().any()
+    way = Shown(FLOW, "flow\n[1/h]") if flows else Shown("distance_pct", "dis-\ntance\n[%]")
+    limits = [Shown(name, _bounded(name, bound)) for name, bound in task.limits.items()]
     return (
         COLUMNS[0],
         Shown("score", task.label.replace(" ", "\n")),
@@ -192,8 +214,8 @@ def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     caption = (
         f"saved: against {in_words(task.against)}, with the 95 % interval over "
         f"{resampled(table)}; kept: all limits, without a collision; "
-        "all measures: table=all or --all."
-    )
+        f"all measures: table=all or --all. {flow_note(table, task.against)}"
+    ).strip()
     found.attrs |= {"against": task.against, "caption": caption, "shown": shown}
     found.attrs |= {"score": SCORE, "label": task.label}
     return found
@@ -211,15 +233,16 @@ def in_full(table: pd.DataFrame, title: str, task: Task) -> Group:
         ("mean gap [m]", "mean_gap_m", "{:.1f}"),
         ("mean speed [m/s]", "mean_speed_mps", "{:.2f}"),
         ("spread of speeds at the end [m/s]", "final_speed_spread_mps", "{:.2f}"),
-        ("flow [vehicles/h]", "flow_vph", "{:.0f}"),
+        ("flow [vehicles/h]", FLOW, "{:.0f}"),
+        ("flow lost", FLOW_LOST, "{:+.2%}"),
         ("episodes whose wave is damped", "damped", "{:.0%}"),
         ("  their mean damping time [s]", DAMPING, "{:.0f}"),
         ("string ratio", "string_ratio", "{:.2f}"),
         *(
             (
-                f"{column} (limit {task.limits[column]:g})",
+                f"limit: {' '.join(_bounded(column, task.limits[column]).split())}",
                 column,
-                "{:.4f}" if column.startswith(SHARE) else "{:.2f}",
+                "{:.2%}" if column.startswith(SHARE) else "{:.2f}",
             )
             for column in limits
         ),

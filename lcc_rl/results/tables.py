@@ -19,7 +19,7 @@ from lcc_rl.runs.output import PLAIN
 LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 PER_KM = "path_energy_kj_per_km"  # and vehicle; who falls back gains nothing by it
 FASTER = "share_leader_faster"
-BESIDE = 4  # strategies beside each other, within 80 characters
+WIDTH, LEAST = 80, len("automated")  # of all strategies beside each other, and of one
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
 CAR_COLUMNS = (
@@ -176,6 +176,8 @@ def strategies_side_by_side(
 ) -> Group:
     """Return tables for the terminal with a column per strategy, as many as fit 80 characters.
 
+    Names are wrapped at spaces only.
+
     Args:
         table: one row per strategy, named in the column ``strategy``.
         rows: label, column of ``table`` and number format, in order; columns without any value
@@ -184,10 +186,21 @@ def strategies_side_by_side(
         caption: below it.
     """
     rows = [row for row in rows if table[row[1]].notna().any()]
-    starts = range(0, len(table), BESIDE)
-    drawn = [_beside(table.iloc[start : start + BESIDE], rows) for start in starts]
+    room = WIDTH - max(len(label) for label, _, _ in rows)
+    widths = [1 + _width(name) for name in table["strategy"]]
+    starts = [0]
+    for place in range(1, len(table)):
+        if sum(widths[starts[-1] : place + 1]) > room:
+            starts.append(place)
+    ends = [*starts[1:], len(table)]
+    drawn = [_beside(table.iloc[a:b], rows) for a, b in zip(starts, ends, strict=True)]
     drawn[0].title, drawn[-1].caption = escape(title), escape(caption)
     return Group(*drawn)
+
+
+def _width(strategy: object) -> int:
+    """Return the width of a strategy's column: that of the longest word of its name."""
+    return max([LEAST, *map(len, in_words(str(strategy)).split())])
 
 
 def _beside(table: pd.DataFrame, rows: Sequence[tuple[str, str, str]]) -> Table:
@@ -195,7 +208,7 @@ def _beside(table: pd.DataFrame, rows: Sequence[tuple[str, str, str]]) -> Table:
     drawn.add_column("")
     for strategy in table["strategy"]:
         name = escape(in_words(str(strategy)))
-        drawn.add_column(name, justify="right", max_width=len("automated"), overflow="fold")
+        drawn.add_column(name, justify="right", max_width=_width(strategy), overflow="fold")
     for label, key, form in rows:
         known = np.isfinite(table[key].astype(float))
         cells = (form.format(x) if k else "–" for x, k in zip(table[key], known, strict=True))

@@ -61,7 +61,6 @@ WRONG = {
     # what does not fit together
     "scenario.string='automated bus'": "role 'bus', but .* only automated, human",
     "scenario.string='automated (human*2'": "never closed at character 11",
-    "scenario.string={size: 10, penetration: 0}": "nobody is automated",
     "variant=hcfs task=i80-follow": "hcfs is of connected vehicles.* task=platoon-us06",
     "variant=cacc task=i80-follow": "cacc is of connected vehicles.* task=platoon-us06",
     "~scenario.pieces.ttc": "'ttc'.*, which the evaluation measures",
@@ -78,6 +77,7 @@ IGNORED = {
     f"controller@{AUTO}=handover agent=td3": "handover drives the .* takes no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "variant=idm training.episodes=20": "variant idm learns nothing",
+    "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
     "sweep=mine": "names the folder of a sweep, -m",
     "evaluation.full_length=true": "unused with evaluation.rows=episodes",

@@ -25,6 +25,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
 
 from lcc_rl.envs import Inputs, build_env, make_env
 from lcc_rl.envs.checks import check_pieces
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import parse_string
@@ -206,7 +207,7 @@ def test_a_piece_that_does_not_fit_is_refused(piece, words) -> None:
         ("alcc", [string("automated truck")], "has the role 'truck', but scenario.controllers nam"),
         ("alcc", [string("automated human"), "scenario.road=ring"], "a ring road has no leader"),
         ("alcc", ["scenario.circumference=100"], "circumference=100 has no effect: it belongs to"),
-        ("direct", ["+filter=cbf"], r"filters\.automated: no vehicle has that role"),
+        ("alcc", ["scenario.filters={auto: null}"], r"unknown role \(scenario\.filters\) 'auto'"),
         ("alcc", ["scenario.start.human=null"], r"scenario\.start lacks human"),
         ("alcc", [string("automated (human")], "this bracket is never closed at character 11"),
         ("alcc", ["reward.terms=null"], "terms"),
@@ -215,3 +216,9 @@ def test_a_piece_that_does_not_fit_is_refused(piece, words) -> None:
 def test_a_configuration_that_does_not_fit_is_refused(variant, overrides, words) -> None:
     with pytest.raises(ConfigError, match=words):
         small_env(variant, 2, overrides)
+
+
+@pytest.mark.parametrize("choice", ["+filter=cbf", "+faults=all"])
+def test_a_role_without_vehicles_has_no_pieces(choice) -> None:
+    plain, further = (small_env("direct", 2, words) for words in ([], [choice]))
+    assert list(map(type, pieces_of(further))) == list(map(type, pieces_of(plain)))

@@ -70,6 +70,18 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
         table_again([str(tmp_path), "--columns", "saved"])
 
 
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("name", ["i24-mixed", "ring-22"])
+def test_the_share_0_of_a_task_is_a_table_of_humans(name, tmp_path, capsys, caplog) -> None:
+    share = "scenario.string={size: 8, penetration: 0}"
+    words = [f"task={name}", "compare=[pretrained,idm_acc]", *FEW, *MORE.get(name, ()), share]
+    rows = evaluation.run(load("evaluate", words), tmp_path)
+    assert set(rows["strategy"]) == {"direct"}
+    (line,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith("no automated car"))
+    assert line.split()[-2:] == ["0", "yes"]
+    assert "left out: pretrained, idm_acc" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -133,7 +133,10 @@ def test_followers_stay_beside_their_leaders() -> None:
     ("words", "message"),
     [
         (["leader=udds"], "compare=recorded: nobody was recorded behind these leaders"),
-        (["scenario=ring"], "compare=recorded: it has no vehicle to drive in this string"),
+        (
+            ["scenario=ring", "scenario.string=automated human*3"],
+            "compare=recorded: it has no vehicle to drive in this string",
+        ),
     ],
 )
 def test_a_recorded_driver_that_cannot_be_played_is_never_silent(words, message, caplog) -> None:

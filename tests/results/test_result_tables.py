@@ -12,7 +12,7 @@ from lcc_rl.energy import CirclesFuel, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measure
 from lcc_rl.results.headline import show
-from lcc_rl.results.scores import Task, in_full, scores
+from lcc_rl.results.scores import Task, headline, in_full, scores
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.studies.hcfs.tables import win_rates
@@ -187,6 +187,30 @@ def test_a_table_in_a_pipe_is_as_wide_as_its_content_or_as_columns(monkeypatch, 
         show(table)
         widths[columns] = max(map(len, capsys.readouterr().out.splitlines()))
     assert widths["80"] == 80 < widths[""]
+
+
+def test_a_table_says_who_loses_more_than_5_percent_of_the_flow() -> None:
+    flows = {"human": 2000.0, "idm_acc": 1920.0, "pi_saturation": 1600.0}
+    rows = pd.concat(driven(name, 1.0, flow_vph=flow) for name, flow in flows.items())
+    found = scores(rows, TASK, MOTOR)
+    assert found["flow_lost"].tolist() == pytest.approx([0.0, 0.04, 0.2])
+    said = headline(found, TASK).attrs["caption"]
+    assert said.endswith(" Flow lost against simulated drivers: PI with saturation 20 %.")
+    assert found["kept"].all()
+
+
+def test_all_scores_name_limits_in_words_and_wrap_names_at_spaces_only(capsys) -> None:
+    others = ("follower_stopper", "pi_saturation", "constant", "mpc_far")
+    rows = pd.concat(driven(name, 1.0, share_ttc_unsafe=0.001) for name in ("human", *others))
+    task = Task(name="mine", limits={**TASK.limits, "share_ttc_unsafe": 0.0005})
+    show(in_full(scores(rows, task, MOTOR), "", task))
+    printed = capsys.readouterr().out
+    words = printed.split()
+    assert {"FollowerStopper", "saturation", "simulated"} <= set(words)
+    assert max(map(len, printed.splitlines())) <= 80
+    lines = [line.split() for line in printed.splitlines() if "limit:" in line]
+    assert lines[0][:5] == ["limit:", "gap", "≤", "120", "[m]"]
+    assert lines[2][:9] == ["limit:", "TTC", "<", "4", "s", "≤", "0.05", "%", "0.10%"]
 
 
 @pytest.mark.parametrize(
