@@ -87,14 +87,16 @@ def headline(
         filtered: whether there is a safety filter, for the caption.
 
     Returns:
-        A row per strategy with a controlled car, those that draw most first: path energy per
-        vehicle and km [kJ/km], of several strategies the share saved [%] against
+        A row per strategy with a controlled car, if any has one, those that draw most first: path
+        energy per vehicle and km [kJ/km], of several strategies the share saved [%] against
         :func:`baseline_of` with its interval and the distance [%] against it, the shares of the
         time [%] with an unsafe time-to-collision and a long time gap, and collisions. Its
         ``attrs`` hold the baseline (``against``), the column that is compared (``score``) and its
         name with unit (``label``), the columns that are ``shown`` and the ``caption``.
     """
-    cars = found[found[PATH].notna()].sort_values(PER_KM, ascending=False, kind="stable")
+    # Beside others, a string without controlled cars is of fewer vehicles, and not to be compared.
+    cars = found[found[PATH].notna()] if found[PATH].notna().any() else found
+    cars = cars.sort_values(PER_KM, ascending=False, kind="stable")
     against = baseline_of(cars["strategy"]) if len(cars) > 1 else None
     table = pd.DataFrame({"strategy": cars["strategy"]})
     table["who"] = [in_words(str(name)) for name in cars["strategy"]]

@@ -37,7 +37,7 @@ CAR_COLUMNS = (
     FASTER,
 )
 SHOWN = CAR_COLUMNS[CAR_COLUMNS.index("share_ttc_unsafe") :]  # as means
-HUMAN_COLUMNS = ("hdv_energy_kj", "hdv_net_energy_kj", "hdv_distance_m")
+HUMAN_COLUMNS = ("hdv_energy_kj", "hdv_net_energy_kj", "hdv_path_energy_kj", "hdv_distance_m")
 
 
 def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
@@ -76,8 +76,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         kilometres = (total["cav_distance_m"] + total["hdv_distance_m"]) / 1e3
         whose = "hdv" if np.isnan(mean["total_energy_kj"]) else "total"
         row["kj_per_km"] = total[f"{whose}_energy_kj"] / kilometres if kilometres else np.nan
-        driven = kilometres and not np.isnan(mean[PATH])  # by an automated car among others
-        row[PER_KM] = total[PATH] / kilometres if driven else np.nan
+        row[PER_KM] = total[f"{whose}_path_energy_kj"] / kilometres if kilometres else np.nan
         row["distance_m"] = 1e3 * kilometres / total["rows"]
         for baseline in BASELINES:
             for kind, energy in by_window.items():

@@ -112,6 +112,14 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
     assert table["distance_pct"].tolist() == pytest.approx([0.0, -100.0 / 30.0, 0.0])
 
 
+def test_humans_alone_have_a_row_and_none_beside_controlled_cars() -> None:
+    humans = episodes()[lambda rows: rows["strategy"] == "direct"].assign(cav_distance_m=np.nan)
+    (row,) = headline(summary(humans)).to_dict("records")
+    assert row["who"] == "no automated car"
+    assert row["energy_kj_per_km"] == pytest.approx(humans["hdv_path_energy_kj"].mean() / 0.15)
+    assert "direct" not in headline(summary(episodes()))["strategy"].tolist()
+
+
 def test_every_table_of_strategies_fits_80_columns() -> None:
     table = headline(summary(episodes(profiles=8).replace({"strategy": {"idm": "human"}})))
     table["saved_pct"], table["saved_pct_low"], table["saved_pct_high"] = -9.3, -10.8, -8.1
