@@ -303,11 +303,16 @@ def config_hash(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def identity(cfg: Any) -> str:
-    """Return the hash of everything in a configuration that determines the results."""
+def identity(cfg: Any, *unused: str) -> str:
+    """Return the hash of everything in a configuration that determines the results.
+
+    Args:
+        cfg: the configuration.
+        *unused: further keys of settings that do not.
+    """
     content = as_plain(cfg)
     forget_places(content)
-    for key in NOT_IDENTITY:
+    for key in (*NOT_IDENTITY, *unused):
         *path, last = key.split(".")
         node = content
         for part in path:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from pages import ROOT
 
 import lcc_rl
 from lcc_rl.commands.score import about, main, scored
@@ -115,3 +116,16 @@ def test_a_score_has_the_name_given_and_a_failed_one_says_why_in_its_folder(tmp_
         main([*words, "--out", str(tmp_path / "a")])
     assert json.loads((tmp_path / "a" / "score.json").read_text())["name"] == "my IDM"
     assert (tmp_path / "a" / "error.txt").read_text().startswith("--source mine could not be")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "source"), [("ring-22", "ring"), ("i80-follow", "platoons")])
+def test_rows_of_the_leaderboard_come_out_again(task: str, source: str, tmp_path) -> None:
+    found = scores(tmp_path / "a", f"pretrained/{task}", "--task", task, "--on", source)
+    kept = json.loads((ROOT / "outputs" / "reference" / "scores" / f"{task}.json").read_text())
+    assert found["sha256"] == kept["sha256"]
+    same = [row for row in kept["results"] if (row["task"], row["source"]) == (task, source)]
+    for key in ("data", "settings", "kept"):
+        assert [row[key] for row in found["results"]] == [row[key] for row in same]
+    (row,), (before,) = numbers(found), numbers({"results": same})
+    assert row == pytest.approx(before, rel=1e-3, abs=1e-4)
