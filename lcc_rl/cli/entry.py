@@ -22,7 +22,15 @@ from omegaconf import DictConfig
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.cli.help import FULL_HELP, HELP
 from lcc_rl.cli.help import text as help_text
-from lcc_rl.config import HYDRA_ERRORS, as_meant, explained, is_sweep, parsed, root_key
+from lcc_rl.config import (
+    HYDRA_ERRORS,
+    as_meant,
+    check_own_files,
+    explained,
+    is_sweep,
+    parsed,
+    root_key,
+)
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
 from lcc_rl.runs.interrupts import ending_quietly, was_interrupted
@@ -52,6 +60,7 @@ def entry_point(
     def decorate(function: Callable[[Any], Any]) -> Callable[[], None]:
         def checked(config: DictConfig) -> Any:
             logging.raiseExceptions = False  # a log that cannot be written ends no run
+            check_own_files()
             cfg = parsed(config, config_name, list(HydraConfig.get().overrides.task), is_sweep())
             with ending_quietly():
                 import_module(work)
@@ -163,7 +172,8 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
 def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """Leave nothing of a command that was refused, and ``error.txt`` of one that failed at work.
 
-    A command that names another run by mistake leaves it as it was.
+    One that was interrupted at work names the command that goes on. A command that names another
+    run by mistake leaves it as it was.
     """
 
     def recording(cfg: DictConfig) -> Any:
@@ -173,7 +183,13 @@ def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], An
             result = function(cfg)
         except (Interrupted, Busy):
             raise
-        except Exception as error:
+        except (KeyboardInterrupt, Exception) as error:
+            if was_interrupted(error):
+                if "resume" in cfg and (folder / CONFIG).exists():
+                    name = HydraConfig.get().job.config_name
+                    command = f"lcc-rl {'run' if name == 'pipeline' else name} resume={folder}"
+                    raise Interrupted(f"stopped; go on with: {command}") from error
+                raise
             given = isinstance(input_error(error) or error, (LccError, OSError))
             if given and not (folder / CONFIG).exists() and SweepCallback.made:
                 withdraw(SweepCallback.made)

@@ -1,4 +1,4 @@
-"""Entry point: show the state of the runs in a folder, ``lcc-rl status FOLDER``."""
+"""Show the state of the runs in a folder, by default of all below outputs."""
 
 from __future__ import annotations
 

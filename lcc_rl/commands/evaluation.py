@@ -28,7 +28,7 @@ from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy
-from lcc_rl.errors import ConfigError, Interrupted, require
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
 from lcc_rl.evaluation.fit import check_policy, other_traffic
@@ -60,7 +60,7 @@ from lcc_rl.results.totals import sources_of
 from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.runs.states import check_present, claim, forget
+from lcc_rl.runs.states import CONFIG, check_present, claim, forget, run_folders
 
 log = logging.getLogger("lcc_rl")
 
@@ -183,6 +183,7 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
     """
     named = cfg.compare
     if not isinstance(named, Mapping):
+        named = [one for who in named for one in _runs_of(who)]
         labels = [who if is_policy(who) else label_of(who) for who in named]
         for label, count in Counter(labels).items():
             require(
@@ -212,8 +213,17 @@ def _check_label(label: str, who: Any, own: str) -> None:
     plain = label.removesuffix(FILTERED)
     require(
         in_words(plain) in (plain, in_words(own)),
-        f"compare names {who} {label}, which stands for {in_words(label)!r}: choose another",
+        f"compare names {label_of(who)} {label}, which stands for {in_words(label)!r}: choose "
+        "another",
     )
+
+
+def _runs_of(who: Any) -> list[Any]:
+    """Return the runs that have a policy in the folder of a sweep; else who is named."""
+    folder = Path(who) if is_policy(who) else None
+    if folder is None or not folder.is_dir() or (folder / CONFIG).exists():
+        return [who]
+    return [str(run) for run in run_folders(folder) if (run / POLICY).is_file()] or [who]
 
 
 def _nobody_drives(cfg: StudyConfig) -> bool:
@@ -339,13 +349,8 @@ def _by_blocks(
     """Play all episodes, block by block, and write them as one table."""
     plan = episodes.plan_of(cfg, inputs)
     store = Store(folder, strategies, plan.own)
-    try:
-        for place, strategy in enumerate(strategies):
-            _play_missing(place, strategy, store, plan, cfg, inputs, folder)
-    except KeyboardInterrupt as error:
-        if len(plan.own) == 1:
-            raise
-        raise Interrupted(f"stopped; go on with: lcc-rl evaluate resume={folder}") from error
+    for place, strategy in enumerate(strategies):
+        _play_missing(place, strategy, store, plan, cfg, inputs, folder)
     check_present(folder)
     write_parquet(store.steps(), folder / STEPS, metadata)
     write_parquet(store.rows(), folder / EPISODES, metadata)  # last, as above

@@ -292,6 +292,19 @@ def _unknown_option(name: str) -> ConfigError:
     return unknown_name("option", name, known)
 
 
+def check_own_files() -> None:
+    """Refuse files of ``--config-dir`` that Hydra passes over: the package's of that name is read.
+
+    Raises:
+        ConfigError: naming the file.
+    """
+    for source in HydraConfig.get().runtime.config_sources:
+        folder = Path(source.path)
+        for path in folder.rglob("*.yaml") if source.provider == "command-line" else ():
+            if files(CONF).joinpath(*path.relative_to(folder).parts).is_file():
+                raise ConfigError(f"{path}: the package has a file of this name: choose another")
+
+
 def own_file(group: str, name: str) -> str:
     """Return what makes a file of the user's own a choice."""
     return f"A file of your own, {group}/{name}.yaml, needs --config-dir <its folder>."

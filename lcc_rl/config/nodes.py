@@ -47,6 +47,8 @@ def find_target(target: str, where: str) -> Any:
         found = getattr(import_module(module), name)
     except Exception as error:  # a module of the user's own may raise anything
         hint = ""
+        if not isinstance(error, (ImportError, AttributeError, ValueError)):
+            raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
         if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
             hint = "; if it is a file of your own, export PYTHONPATH=<its folder>"
         raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error

@@ -84,7 +84,7 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     Raises:
         DataError: if the file cannot be read or its content is not a valid table.
     """
-    return load_episodes([str(path)])[0]
+    return load_episodes([str(path)])[0][[*COLUMNS]]
 
 
 def load_episodes(
@@ -100,8 +100,8 @@ def load_episodes(
         units: their units by key; SI for those that are not named.
 
     Returns:
-        The columns ``SCHEMA``, samples 0.1 s apart, and lines on what was read. Holes divide an
-        episode. Speeds and gaps may be negative.
+        The columns ``SCHEMA``, samples 0.1 s apart, and ``row``, the one in the file, from 0; and
+        lines on what was read. Holes divide an episode. Speeds and gaps may be negative.
 
     Raises:
         DataError: naming file, row and column, if a cell is missing or no number, or rows
@@ -152,7 +152,7 @@ def _table(
             notes.append(words)
     table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
     table, more = _even(table.assign(row=places), file, codes)
-    table = table[[*COLUMNS]].astype({**SCHEMA, "recording": str})
+    table = table[[*COLUMNS, "row"]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED)

@@ -159,6 +159,7 @@ class Plausible(Settings):
         if not set(kept.columns) >= OF_PAIRS:
             return
         limit = f"{setting}.max_mismatch={self.max_mismatch:g}"
+        declared = next((units[key] for key in units if key.endswith("speed")), SI["speed"])
         ways = farther(kept)
         if (ways["factor"] > self.max_mismatch).any():
             worst = int(np.argmax(ways["factor"]))
@@ -166,7 +167,8 @@ class Plausible(Settings):
             follower, leader = (place(ways.index[worst], f"{role}_speed_mps") for role in ROLES)
             raise DataError(
                 f"{source}: {follower}: by its speed, this vehicle drives {own:.4g} m, its leader "
-                f"({leader}) {ahead:.4g} m, {limit}; is one of these speeds in {_nearest(factor)}?"
+                f"({leader}) {ahead:.4g} m, {limit}; is one of these speeds in "
+                f"{_nearest(factor, declared)}?"
             )
         rates = gap_rates(kept)
         off = (rates > self.max_mismatch) | (rates < 1 / self.max_mismatch)
@@ -400,11 +402,12 @@ def farther(episodes: pd.DataFrame) -> pd.DataFrame:
     return ways[ways[["own", "ahead"]].max(axis=1) >= LEAST_WAY]
 
 
-def _nearest(factor: float) -> str:
-    """Return the unit of speeds that is this factor of m/s; all of them where none is."""
-    found = {unit: abs(log(factor * size)) for unit, size in SPEEDS.items() if size != 1.0}
-    near = min(found, key=found.__getitem__)
-    return near if found[near] < log(NEAR) else ", ".join(found)
+def _nearest(factor: float, declared: str) -> str:
+    """Return the unit of speeds that is larger or smaller than another by a factor, if one is."""
+    sizes = {**SPEEDS, declared: UNITS["speed"][declared]}
+    off = {unit: abs(log(size / sizes[declared])) for unit, size in sizes.items()}
+    near = min(off, key=lambda unit: abs(off[unit] - log(factor)))
+    return near if abs(off[near] - log(factor)) < log(NEAR) else f"another unit than {declared}"
 
 
 def fitting(rate: float, units: Mapping[str, str]) -> str:

@@ -100,7 +100,18 @@ class EpisodesSource(Settings):
         named = {**{key: OWN[key] for key in self.units}, **self.columns}
         source += read_as(FIELDS, named, self.units)
         units = units_of(FIELDS, OWN, self.units)
-        return _plausible(self.plausible, episodes, source, lines, units=units)
+        return _plausible(self.plausible, episodes, source, lines, place=self._place, units=units)
+
+    def _place(self, episodes: pd.DataFrame) -> Place:
+        """Return what describes a sample by its row and column in the file."""
+        names = {OWN[key]: name for key, name in self.columns.items()}
+
+        def place(number: int, column: str) -> str:
+            row = episodes.iloc[number]
+            where = f"recording {row['recording']}, data row {row['row'] + 1}"
+            return f"{where}, column {names.get(column, column)!r}"
+
+        return place
 
 
 def episodes_of(

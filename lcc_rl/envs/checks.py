@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import torch
@@ -176,9 +177,11 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
                     f"{piece.title} reads {'.'.join(key)}, but only automated vehicles "
                     "have an action"
                 )
-            near = ", ".join(sorted(".".join(other) for other in known if other[0] == key[0]))
+            near = sorted(".".join(other) for other in known if other[0] == key[0])
+            close = get_close_matches(".".join(key), near, n=1)
+            hint = f" Did you mean {close[0]}?" if close else ""
+            where = ", only " + ", ".join(near) if near else "; vehicles' are self.x and ahead.x"
             raise ConfigError(
                 f"{piece.title} reads {'.'.join(key)}, which no piece of the scenario writes"
-                f"{near and f', only {near}'}; was a piece removed, or does it belong to another "
-                "scenario=…?"
+                f"{where}; was a piece removed, or does it belong to another scenario=…?{hint}"
             )

@@ -33,7 +33,7 @@ from lcc_rl.evaluation.rows import (
     traffic,
 )
 from lcc_rl.evaluation.strategies import Strategy
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.tables import FASTER
@@ -207,6 +207,8 @@ class Episodes:
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired)
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy)
+        if self.cfg.scenario.road == RING:  # where nobody leads
+            leader[:] = np.nan
         measured = measures(groups, alive, time_step, self.energy)
         measured |= traffic(record, alive, self.cfg.scenario.vehicle_length, time_step)
         rows = pd.concat([described, leader, as_frame(measured)], axis=1)

@@ -15,6 +15,7 @@ from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, writ
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import MASK, STREAM, hash_bits
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
+from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.string import COMMAND, WANTED
 
 # Reads and writes a TensorDict; None where a rule drives.
@@ -67,8 +68,15 @@ class Player:
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
         needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
         self.step = Step(needed, self.horizon)
-        # What the policy and every controller wish is checked, too, whatever a filter makes of it.
-        wishes = [key for piece in needed for key in piece.targets if key[0] in (WANTED, COMMAND)]
+        # What the policy and every controller wish is checked, too, whatever a filter makes of it,
+        # and what they remember.
+        wishes = [
+            key
+            for piece in needed
+            for key in piece.targets
+            if key[0] in (WANTED, COMMAND)
+            or (isinstance(piece, Controller) and key[1] in piece.remembers)
+        ]
         driven = [] if policy is None else [ACTION]
         self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
         self.compiled = compiled
@@ -92,7 +100,7 @@ class Player:
 
         Raises:
             Diverged: if the action, or an entry that is written, is not a number; what the policy
-                and every controller wish counts, not what a filter makes of it.
+                and every controller wish and remember counts, not what a filter makes of it.
         """
         state, record = self._begin(given), self.record
         running, alive = torch.ones_like(state[TERMINATED]), []

@@ -299,11 +299,17 @@ def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     """Return strategies whose names differ wherever their training differs by more than the seed.
 
     A variant that several kinds of agents learned gets the agent's name; one whose settings differ
-    otherwise, or that has a seed twice, gets the name of the file or folder of its policy.
+    otherwise, or that has a seed twice, gets the name of the file or folder of its policy; several
+    seeds of one training keep one name, that of the folder that holds them.
     """
     kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
     found = _where_several(strategies, kinds, kinds)
-    return _where_several(found, _trainings(found), [_place(one) for one in found])
+    marks = _trainings(found)
+    groups = [(one.name, mark) for one, mark in zip(found, marks, strict=True)]
+    places = [
+        _place(one, groups.count(group) > 1) for one, group in zip(found, groups, strict=True)
+    ]
+    return _where_several(found, marks, places)
 
 
 def _where_several(
@@ -329,9 +335,11 @@ def _trainings(strategies: Sequence[Strategy]) -> list[Hashable]:
     return found
 
 
-def _place(strategy: Strategy) -> str:
+def _place(strategy: Strategy, of_sweep: bool) -> str:
+    """Return the name of a policy's file or run, or of the folder that holds its runs."""
     path = Path(strategy.source)
-    name = path.parent.name if path.name == POLICY else path.name.removesuffix(".pt")
+    path = path.parent if path.name == POLICY else path
+    name = path.parent.name if of_sweep else path.name.removesuffix(".pt")
     return DATED.sub(r"\1", name)  # of a run's folder the time of day
 
 

@@ -69,7 +69,7 @@ def check_ending(path: Path, episodes: int = 1) -> None:
     if path.suffix not in FORMS:
         raise unknown_name("ending of an animation", path.suffix, FORMS)
     if episodes > 1 and path.suffix != ".svg":
-        raise ConfigError(f"{path.suffix} shows one strategy; --out ring.svg shows several")
+        raise ConfigError(f"{path.suffix} shows one strategy; of a ring, an .svg shows several")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise ConfigError("an .mp4 needs ffmpeg, which is not installed; write a .html or .gif")
 

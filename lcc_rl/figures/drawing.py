@@ -50,11 +50,12 @@ COLOURS = {
     "reference": "#d55e00",
     "own_energy": "#009e73",
     "rule": "#e69f00",
+    **dict.fromkeys(("idm_acc", "idm_acc_filtered"), "#56b4e9"),
     "idm": "#6b6b6b",
     "human": "#b0a080",
     "direct": INK,
 }
-OTHERS = ("#cc79a7", "#e69f00", "#56b4e9")
+OTHERS = ("#cc79a7", "#882255", "#117733")  # of the user's own; none of whom they are compared with
 
 
 def colour(strategy: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from textwrap import shorten
+from textwrap import fill, shorten
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from lcc_rl.figures.drawing import (
     dots,
     in_file,
     legend_above,
+    lines_of,
     new_figure,
     paper,
     rows_of,
@@ -142,8 +143,8 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     style(axes[2], "time [s]", "gap ahead [m]")
     legend_above(axes[0])
     figure.suptitle(
-        f"{in_words(strategy)}; human driver behind: desired\n"
-        f"speed {first['desired_speed_mps']:.1f} m/s, time gap {first['time_gap_s']:.2f} s"
+        f"{fill(in_words(strategy), 50)};\nhuman driver behind: desired speed "
+        f"{first['desired_speed_mps']:.1f} m/s, time gap {first['time_gap_s']:.2f} s"
     )
     return figure
 
@@ -153,7 +154,8 @@ def overview(
     episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, table: pd.DataFrame
 ) -> Figure:
     """Speeds of one episode, and what each strategy of a printed table saves."""
-    figure = new_figure(PAGE, 2.7)
+    lines = sum(len(lines_of(str(name)).splitlines()) for name in table["strategy"])
+    figure = new_figure(PAGE, max(2.7, 0.9 + 0.15 * lines))
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")

@@ -20,6 +20,7 @@ from lcc_rl.results.motion import Motion, motion_of, sample_episodes, telling
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
 EVERY = 5  # steps between the points of a line
 WIDEST = 3  # panels
+RIMS = {True: "controlled", False: "human"}  # the fewer of both
 # Red stands, blue drives: ends that differ without red and green, and nothing fades into white.
 COLOURS = LinearSegmentedColormap.from_list("speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"])
 
@@ -30,7 +31,7 @@ def space_time(
 ) -> Figure | None:
     """Positions over time of one sample episode, a panel per strategy (the same episode).
 
-    Lines of automated vehicles are framed in black.
+    Lines of automated vehicles are framed in black, of others where most are automated.
 
     Args:
         steps: rows of steps.parquet.
@@ -64,8 +65,13 @@ def space_time(
         unbox(axis)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
-    figure.colorbar(lines, ax=axes, label="speed [m/s]; black rim: controlled")
+    figure.colorbar(lines, ax=axes, label=f"speed [m/s]; black rim: {RIMS[_few(found[whole[0]])]}")
     return figure
+
+
+def _few(motion: Motion) -> bool:
+    """Whether at most half of the vehicles are automated."""
+    return 2 * motion.roles.count(AUTOMATED) <= len(motion.roles)
 
 
 def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollection:
@@ -76,8 +82,9 @@ def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollec
         points = np.stack([motion.time, shown[:, vehicle]], -1)
         parts = np.stack([points[:-1], points[1:]], 1)
         whole = np.abs(parts[:, 1, 1] - parts[:, 0, 1]) < 0.5 * around
-        above = 3 if role == AUTOMATED else 2  # no other line hides the frame
-        if role == AUTOMATED:
+        framed = (role == AUTOMATED) == _few(motion)
+        above = 3 if framed else 2  # no other line hides the frame
+        if framed:
             frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.0, zorder=above)
             axis.add_collection(frame)
         lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=0.8, zorder=above)

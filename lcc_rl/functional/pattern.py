@@ -99,7 +99,9 @@ class _Parser:
     def parse(self) -> list[str]:
         roles = self._sequence(0)
         if self.place < len(self.text.rstrip()):
-            raise self._error("expected a role, '(' or the end", self.place)
+            times = self.text[self.place :].lstrip().startswith("*")
+            what = "a number behind '*'" if times else "a role, '(' or the end"
+            raise self._error(f"expected {what}", self.place)
         return roles
 
     def _sequence(self, depth: int) -> list[str]:

@@ -17,7 +17,7 @@ from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
+from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
@@ -90,7 +90,8 @@ class Driver:
 
     def __init__(self, name: Any, time_step: float, trust: Sequence[str] = ()) -> None:
         who = setting_of(name)
-        self.name, self.time_step = str(who), time_step
+        self.name = who if isinstance(who, str) else label_of(who)
+        self.time_step = time_step
         self.module: ExportedPolicy | None = None
         pieces: list[StepTransform] = []
         if is_policy(who):
@@ -108,7 +109,7 @@ class Driver:
         if abs(trained - self.time_step) > 1e-9:
             raise ConfigError(
                 f"{name} was trained with steps of {trained:g} s, the simulation has "
-                f"{self.time_step:g} s; start it with --step-length {trained:g}"
+                f"{self.time_step:g} s (of SUMO: --step-length {trained:g})"
             )
         memory = cfg.scenario.pieces.get("memory")
         wanted = any(column.startswith("memory.") for column in self.module.names)

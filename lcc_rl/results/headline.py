@@ -143,7 +143,11 @@ def verdict(found: pd.DataFrame, of_few: bool = True) -> str:
         return ""
     learned = [name for name, row in rows.items() if row["seeds"] and name not in RULES]
     names = [NETWORK] if NETWORK in rows else learned
-    return "\n".join(filter(None, (_sentence(rows, name, other, of_few) for name in names)))
+    words = [said for name in names if (said := _sentence(rows, name, other, of_few))]
+    least = min(rows, key=lambda name: rows[name][PER_KM])
+    if words and least not in (*names, other):  # a rule of the user's own, or a network
+        words.append(f"Least energy: {in_words(least)}, {rows[least][PER_KM]:,.1f} kJ/km.")
+    return "\n".join(words)
 
 
 def _sentence(rows: Mapping[str, Any], name: str, other: str, of_few: bool) -> str:

@@ -12,7 +12,7 @@ from lcc_rl.results.intervals import Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
-BASELINES = ("idm", "human", "idm_acc_filtered", "idm_acc", "rule", "reference")
+BASELINES = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
 RULE = "rule"  # the IDM tuned on the same data, by the gradient
 # Whom networks are compared with. All but the rule learn nothing.
 UNTRAINED = (

@@ -211,10 +211,12 @@ def headline(table: pd.DataFrame, task: Task) -> pd.DataFrame:
     shown = _columns(task, found)
     ends = [f"saved_pct{end}" for end in ("_low", "_high")]
     found = found[["strategy", *(column.key for column in shown), *ends]]
+    saved = (
+        f"saved: against {in_words(task.against)}, with the 95 % interval over {resampled(table)}; "
+    )
     caption = (
-        f"saved: against {in_words(task.against)}, with the 95 % interval over "
-        f"{resampled(table)}; kept: all limits, without a collision; "
-        f"all measures: table=all or --all. {flow_note(table, task.against)}"
+        f"{saved * (len(table) > 1)}kept: all limits, without a collision; all measures: "
+        f"table=all or --all. {flow_note(table, task.against)}"
     ).strip()
     found.attrs |= {"against": task.against, "caption": caption, "shown": shown}
     found.attrs |= {"score": SCORE, "label": task.label}

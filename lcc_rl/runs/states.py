@@ -162,7 +162,7 @@ def _holds_only(folder: Path, names: set[str]) -> bool:
     return False
 
 
-def record(folder: Path, error: Exception) -> None:
+def record(folder: Path, error: BaseException) -> None:
     """Write ``error.txt``: the error in one line, with a traceback unless it is an input error.
 
     An error that followed from an interrupt is no failure and leaves no file.

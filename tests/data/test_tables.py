@@ -242,6 +242,19 @@ def test_one_vehicle_in_another_unit_is_named(tmp_path, columns, factors, car, w
         source.load()
 
 
+def test_one_pair_in_another_unit_is_named_as_the_file_calls_it(tmp_path) -> None:
+    table = pairs(episodes=3, rows=60).rename(columns={"follower_speed_mps": "v"})
+    table[["v", "leader_speed_mps"]] *= 3.6
+    table.loc[table["episode"] == 1, "v"] /= 3.6
+    source = EpisodesSource(
+        path=written(tmp_path, table),
+        columns={"follower_speed": "v"},
+        units={"follower_speed": "km/h", "leader_speed": "km/h"},
+    )
+    with pytest.raises(DataError, match=r"data row 61, column 'v': by its .* in m/s\?$"):
+        source.load()
+
+
 def test_the_report_of_an_extraction_without_episode_is_divided_by_semicolons(tmp_path) -> None:
     path = written(tmp_path, long_table(rows=100))
     with pytest.raises(

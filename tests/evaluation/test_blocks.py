@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from commands import run_command, tiny
+from commands import NO_AGENT, run_command, tiny
 from helpers import POPULATION, compose, network, slow_but, wavy_profiles
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import Inputs
-from lcc_rl.errors import Interrupted, ResultsError
+from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.blocks import BLOCKS, Store
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.strategies import Strategy
@@ -103,7 +104,7 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
     folder = tmp_path / "run"
     with monkeypatch.context() as patched:
         stop_after(patched, count)
-        with pytest.raises(Interrupted, match=f"resume={folder}"):
+        with pytest.raises(KeyboardInterrupt):
             evaluation.run(settings(BLOCK), folder, quiet=True)
     assert not (folder / "episodes.parquet").exists()
     played = []
@@ -115,13 +116,24 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
     assert not (folder / BLOCKS).exists()
 
 
+def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch) -> None:
+    words = (*NO_AGENT, "variant=idm", "evaluation.drivers=2", "hydra.run.dir=run")  # one block
+    with monkeypatch.context() as patched:
+        stop_after(patched, 2)
+        done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
+    assert done.returncode == 130
+    said = re.search(r"stopped; go on with: lcc-rl evaluate (resume=\S+)", done.stderr)
+    run_command("lcc_rl.cli.evaluate", said.group(1), cwd=tmp_path, check=True)
+    assert (tmp_path / "run" / "episodes.parquet").exists()
+
+
 @pytest.mark.slow
 def test_a_damaged_block_and_one_of_other_weights_are_played_again(
     whole, tmp_path, monkeypatch
 ) -> None:
     with monkeypatch.context() as patched:
         stop_after(patched, 6)
-        with pytest.raises(Interrupted):
+        with pytest.raises(KeyboardInterrupt):
             evaluation.run(settings(BLOCK), tmp_path, quiet=True)
     kept = sorted(path for path in (tmp_path / BLOCKS).iterdir() if "steps" not in path.name)
     assert len(kept) == 6

@@ -165,6 +165,31 @@ def test_who_cannot_drive_is_told_how(who, words) -> None:
         controller_of(who)
 
 
+class Winding(Steady):
+    """Its command is a number, its memory is not."""
+
+    remembers = ("wound",)
+
+    def command(self, gap, speed, ahead_speed, wound):
+        wanted = super().command(gap, speed, ahead_speed)
+        return wanted + wound.nan_to_num(), wound + torch.inf
+
+
+def test_a_memory_that_is_no_number_ends_an_evaluation(tmp_path) -> None:
+    with pytest.raises(LccError, match=r"Winding: automated\.wound is inf at step 1 of"):
+        lcc_rl.compare([Winding], overrides=SMALL, folder=tmp_path)
+
+
+def test_a_file_that_the_package_hides_is_refused(tmp_path) -> None:
+    path = tmp_path / "mine" / "controller" / "acc.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(f"_target_: {PATH}\n")
+    words = ["--config-dir", str(tmp_path / "mine"), "experiment=smoke", "compare=[acc]"]
+    done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"{path}: the package has a file of this name" in done.stderr
+
+
 def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
     for who in (lambda gap: gap, partial(steady, gain=0.1)):
         with pytest.raises(LccError, match="at the top of a module"):

@@ -63,6 +63,10 @@ def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
     other = replace(ddpg, cfg=compose("alcc", "agent.gamma=0.5"), source="runs/b/policy.pt")
     named = named_apart([replace(ddpg, source="runs/a.pt"), other])
     assert [one.name for one in named] == ["alcc a", "alcc b"]
+    # Seeds of one training keep one name beside another training.
+    runs = [replace(ddpg, seed=x, source=f"runs/sweep/seed={x}") for x in range(2)]
+    named = [one.name for one in named_apart([*runs, other])]
+    assert named == ["alcc sweep", "alcc sweep", "alcc b"]
     dated = replace(other, source="runs/2026-11-25_14-26-58-976217_alcc_seed0/policy.pt")
     named = named_apart([replace(ddpg, source="runs/a.pt"), dated])
     assert [one.name for one in named] == ["alcc a", "alcc 14-26-58"]

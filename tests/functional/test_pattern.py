@@ -47,7 +47,7 @@ def test_what_a_pattern_means(pattern, roles) -> None:
         ("*3 human", "expected a role before '*'", 1),
         ("human*0", "expected a number that makes 1…10000 vehicles", 6),
         ("human*99999", "expected a number that makes 1…10000 vehicles", 6),
-        ("automated human*-2", "expected a role, '(' or the end", 16),
+        ("automated human*-2", "expected a number behind '*'", 16),
         ("automated, human", "expected a role, '(' or the end", 10),
         ("automated*5000 human*5001", "more than 10000 vehicles", 16),
         ("human*2*3", "expected a role before '*'", 8),
