@@ -154,8 +154,8 @@ def overview(
     episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, table: pd.DataFrame
 ) -> Figure:
     """Speeds of one episode, and what each strategy of a printed table saves."""
-    lines = sum(len(lines_of(str(name)).splitlines()) for name in table["strategy"])
-    figure = new_figure(PAGE, max(2.7, 0.9 + 0.15 * lines))
+    lines = max(len(lines_of(str(name)).splitlines()) for name in table["strategy"])
+    figure = new_figure(PAGE, max(2.7, 0.9 + 0.13 * lines * len(table)))
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
