@@ -143,7 +143,7 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     style(axes[2], "time [s]", "gap ahead [m]")
     legend_above(axes[0])
     figure.suptitle(
-        f"{fill(in_words(strategy), 50)};\nhuman driver behind: desired speed "
+        f"{fill(in_words(strategy), 45)}\nhuman behind: desired speed "
         f"{first['desired_speed_mps']:.1f} m/s, time gap {first['time_gap_s']:.2f} s"
     )
     return figure

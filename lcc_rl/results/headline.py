@@ -136,7 +136,7 @@ def verdict(found: pd.DataFrame, of_few: bool = True) -> str:
         of_few: whether windows that are too few for a finding have a sentence, too.
     """
     rows: dict[str, Any] = {
-        str(row["strategy"]): row for row in found[found[PER_KM].notna()].to_dict("records")
+        str(row["strategy"]): row for row in found[found[PATH].notna()].to_dict("records")
     }
     other = next((name for name in (*RULES, HUMAN) if name in rows), None)
     if other is None:
@@ -145,7 +145,8 @@ def verdict(found: pd.DataFrame, of_few: bool = True) -> str:
     names = [NETWORK] if NETWORK in rows else learned
     words = [said for name in names if (said := _sentence(rows, name, other, of_few))]
     least = min(rows, key=lambda name: rows[name][PER_KM])
-    if words and least not in (*names, other):  # a rule of the user's own, or a network
+    # It may be a rule of the user's own.
+    if words and rows[least]["windows"] >= FEW and least not in (*names, other):
         words.append(f"Least energy: {in_words(least)}, {rows[least][PER_KM]:,.1f} kJ/km.")
     return "\n".join(words)
 

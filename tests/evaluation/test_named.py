@@ -195,7 +195,7 @@ def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
         with pytest.raises(LccError, match="at the top of a module"):
             lcc_rl.compare([who], overrides=SMALL, folder=tmp_path)
     for name in ("rule", "alcc", "idm_acc", "acc_filtered"):
-        with pytest.raises(LccError, match=f"names {PATH} {name}, which stands for '.+': choose"):
+        with pytest.raises(LccError, match=f"names Steady {name}, which stands for '.+': choose"):
             lcc_rl.compare({name: PATH}, overrides=SMALL, folder=tmp_path)
     with pytest.raises(LccError, match="two Steady: give each a name"):
         evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)

@@ -161,8 +161,10 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     frame.loc[frame["strategy"] == "human", "training_seed"] = np.nan
     both = [frame.replace({"strategy": {"alcc": name}}) for name in ("near", "far")]
     found = summary(pd.concat(both).drop_duplicates())
-    first, second = verdict(found).splitlines()
-    assert first == words.replace("the network, for all", "near", 1)
+    first, second, least = verdict(found).splitlines()
+    most = headline(found).iloc[-1]
+    assert least == f"Least energy: {most['who']}, {most['energy_kj_per_km']:,.1f} kJ/km."
+    assert first == words.splitlines()[0].replace("the network, for all", "near", 1)
     assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
     few = verdict(summary(frame[frame["profile_id"] < 4]))
