@@ -171,11 +171,12 @@ def only_named(cfg: EvaluateConfig) -> bool:
     return bool(cfg.compare) and cfg.policy is None and learns(cfg)
 
 
-def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
+def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Return whom ``compare`` names: controllers by their names in tables, and policies.
 
-    Policies have the name that was given, or the place of their file. Nobody is left where no
-    vehicle of the string is automated, as at the share 0 of a sweep.
+    Policies are their name, where one was given, and path; the folder of a sweep stands for those
+    of its runs. Nobody is left where no vehicle of the string is automated, as at the share 0 of a
+    sweep.
 
     Raises:
         ConfigError: if two have one name, or one has that of somebody else, or a controller is
@@ -183,7 +184,6 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
     """
     named = cfg.compare
     if not isinstance(named, Mapping):
-        named = [one for who in named for one in _runs_of(who)]
         labels = [who if is_policy(who) else label_of(who) for who in named]
         for label, count in Counter(labels).items():
             require(
@@ -193,8 +193,13 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
         named = dict(zip(labels, named, strict=True))
     task_of(cfg)  # its settings are checked before the data are read
     task = _task_name(cfg)
-    policies = {label: of_task(str(who), task) for label, who in named.items() if is_policy(who)}
-    rivals = {label: who for label, who in named.items() if label not in policies}
+    policies = [
+        (label if named is cfg.compare else "", of_task(run, task))
+        for label, who in named.items()
+        if is_policy(who)
+        for run in _runs_of(Path(who))
+    ]
+    rivals = {label: who for label, who in named.items() if not is_policy(who)}
     for label, who in rivals.items():
         _check_label(label, who, str(who).removesuffix(FILTERED))
         if who != DIRECT:
@@ -202,7 +207,7 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], dict[str, str]]:
     if _nobody_drives(cfg):
         if left := [*named, *filter(None, [cfg.policy])]:
             log.warning("no vehicle is automated; left out: %s", ", ".join(left))
-        return {}, {}
+        return {}, []
     for label in rivals:
         require(applies(cfg, label), f"compare={label}: it has no vehicle to drive in this string")
     return rivals, policies
@@ -218,12 +223,11 @@ def _check_label(label: str, who: Any, own: str) -> None:
     )
 
 
-def _runs_of(who: Any) -> list[Any]:
-    """Return the runs that have a policy in the folder of a sweep; else who is named."""
-    folder = Path(who) if is_policy(who) else None
-    if folder is None or not folder.is_dir() or (folder / CONFIG).exists():
-        return [who]
-    return [str(run) for run in run_folders(folder) if (run / POLICY).is_file()] or [who]
+def _runs_of(path: Path) -> list[str]:
+    """Return the runs that have a policy in the folder of a sweep; else the path."""
+    sweep = path.is_dir() and not (path / CONFIG).exists()
+    runs = [run for run in run_folders(path) if (run / POLICY).is_file()] if sweep else []
+    return list(map(str, runs or [path]))
 
 
 def _nobody_drives(cfg: StudyConfig) -> bool:
@@ -249,10 +253,9 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
         log.info(line)
     check_evaluation(cfg, inputs)
     strategies = _rules(cfg, rivals, inputs)
-    for name, path in paths.items():
-        one = trained(cfg, path, policies[name], inputs.population)
-        named = isinstance(cfg.compare, Mapping)
-        strategies.append(dataclasses.replace(one, name=name) if named else one)
+    for (name, path), file in zip(paths, policies, strict=True):
+        one = trained(cfg, path, file, inputs.population)
+        strategies.append(dataclasses.replace(one, name=name or one.name))
     if own:
         strategies += studied(cfg, policy, inputs.population)
     strategies = beside_filtered(cfg, strategies) + strategies
@@ -266,9 +269,9 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
 
 
 def _read_policies(
-    cfg: EvaluateConfig, paths: Mapping[str, str]
-) -> tuple[TrainedPolicy | None, dict[str, TrainedPolicy]]:
-    """Read the policy under study, where there is one, and those compared, by their names."""
+    cfg: EvaluateConfig, compared: Sequence[tuple[str, str]]
+) -> tuple[TrainedPolicy | None, list[TrainedPolicy]]:
+    """Read the policy under study, where there is one, and those compared."""
 
     def read(path: str) -> TrainedPolicy:
         weights, own = load_policy(path, cfg.variant, tuple(cfg.trust))
@@ -280,9 +283,9 @@ def _read_policies(
     policy = read(of_task(str(cfg.policy), _task_name(cfg))) if studied_too else None
     if policy is not None:
         check_policy(cfg, policy[1])
-    policies = {name: read(path) for name, path in paths.items()}
-    for name in paths if isinstance(cfg.compare, Mapping) else ():
-        _check_label(name, paths[name], policies[name][1].variant)
+    policies = [read(path) for _, path in compared]
+    for (name, path), (_, own) in zip(compared, policies, strict=True):
+        _check_label(name, path, own.variant)
     return policy, policies
 
 

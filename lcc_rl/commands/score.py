@@ -261,9 +261,10 @@ def _own_name(name: str) -> str:
     """Return a name that the command line gives; nobody of the package has it."""
     plain = name.removesuffix(FILTERED)
     new = not is_shipped(plain) and in_words(plain) == plain
+    require(new, f"--name {name} stands for {in_words(name)!r} in tables: choose another")
     require(
-        new and re.fullmatch(r"\w[\w .+-]*", name) is not None,
-        f"--name {name}: expected a new name of letters, digits, spaces and _.+-",
+        re.fullmatch(r"\w[\w .+-]*", name) is not None,
+        f"--name {name}: expected letters, digits, spaces and _.+-",
     )
     return name
 

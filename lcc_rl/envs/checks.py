@@ -131,8 +131,9 @@ def _attempt(piece: Piece, action: object) -> None:
     except Exception as error:
         shape = ", ".join(map(str, ("batch", *piece.event_shape)))
         returned = " and ".join(".".join(key) for key in piece.targets)
+        branch = " (use torch.where in place of if)" if "Boolean value" in str(error) else ""
         raise ConfigError(
-            f"{piece.title} does not fit the string of vehicles: {error}; it must return "
+            f"{piece.title} does not fit the string of vehicles: {error}{branch}; it must return "
             f"{returned} as tensors [{shape}]"
         ) from error
 

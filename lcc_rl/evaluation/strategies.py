@@ -192,7 +192,8 @@ def no_policy(cfg: StudyConfig) -> ConfigError:
     """Return the error for a learned variant without a policy."""
     return ConfigError(
         f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
-        f"(lcc-rl train variant={cfg.variant} makes one) or policy=pretrained"
+        f"(lcc-rl train variant={cfg.variant} makes one) or policy=pretrained, or name others "
+        "alone by compare=[human]"
     )
 
 

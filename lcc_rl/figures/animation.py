@@ -82,7 +82,7 @@ def page(motion: Motion, title: str) -> str:
     data = {
         "title": title,
         "time": _numbers(short.time),
-        "roles": [role if role == AUTOMATED else HUMAN for role in motion.roles],
+        "roles": [HUMAN if role == HUMAN else AUTOMATED for role in motion.roles],
         "speed": [_numbers(column) for column in short.speed.T],
         "gap": [_numbers(column) for column in short.gap.T],
         "front": _numbers(short.front),
@@ -134,7 +134,7 @@ def frames(motion: Motion, title: str) -> Iterator[Figure]:
 
 
 def _hues(motion: Motion) -> list[str]:
-    return [COLOURS.get(role, COLOURS[HUMAN]) for role in motion.roles]
+    return [COLOURS.get(role, COLOURS[AUTOMATED]) for role in motion.roles]
 
 
 def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Series | None) -> None:
@@ -143,9 +143,9 @@ def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Serie
         axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
     named = set()
     for vehicle, (role, hue) in enumerate(zip(motion.roles, _hues(motion), strict=True)):
-        bold = role == AUTOMATED or len(motion.roles) <= FEW
+        bold = role != HUMAN or len(motion.roles) <= FEW
         look: dict[str, Any] = {"lw": 1.4, "zorder": 3} if bold else {"lw": 0.6, "alpha": 0.3}
-        name = None if hue in named else NAMES[role == AUTOMATED]
+        name = None if hue in named else NAMES[role != HUMAN]
         named.add(hue)
         axis.plot(motion.time, values[:, vehicle], color=hue, label=name, **look)
     axis.set_xlim(motion.time[0], motion.time[-1])

@@ -257,7 +257,8 @@ def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
     value, low, high = (100 * x for x in (found.value, found.low, found.high))
     text = f"mean {signed(value)} %"
     if np.isfinite(low):
-        over = "windows, 1 seed" if rows["training_seed"].nunique() == 1 else "windows and seeds"
+        seeds = min(rows["training_seed"].nunique(), 2)
+        over = ("windows", "windows, 1 seed", "windows and seeds")[seeds]
         axis.axhspan(low, high, color=SOFT, alpha=0.3, lw=0)
         text += f" ({signed(low)} … {signed(high)})\nband: 95 % interval over {over}"
     else:

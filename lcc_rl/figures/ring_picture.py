@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.figures.space_time import COLOURS
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.results.motion import Motion, Series
 
 FASTER, STEP = 20.0, 1.5  # times as fast as it was driven; between two key frames [s]
@@ -60,7 +60,7 @@ def _panel(name: str, motion: Motion, place: int, top: float) -> str:
     angles = -turn * (shown.position - 0.5 * motion.length)
     long = math.radians(turn) * RADIUS * motion.length
     cars = [
-        _car(role == AUTOMATED, angles[:, car], shown.speed[:, car] / top, long, _time_of(motion))
+        _car(role != HUMAN, angles[:, car], shown.speed[:, car] / top, long, _time_of(motion))
         for car, role in enumerate(motion.roles)
     ]
     last = motion.speed[motion.time > motion.time[-1] - 60.0]

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import COLUMN, PAGE, lines_of, new_figure, paper, unbox
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.results.motion import Motion, motion_of, sample_episodes, telling
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
@@ -31,7 +31,7 @@ def space_time(
 ) -> Figure | None:
     """Positions over time of one sample episode, a panel per strategy (the same episode).
 
-    Lines of automated vehicles are framed in black, of others where most are automated.
+    Lines of controlled vehicles are framed in black, of people where most are controlled.
 
     Args:
         steps: rows of steps.parquet.
@@ -65,13 +65,15 @@ def space_time(
         unbox(axis)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
-    figure.colorbar(lines, ax=axes, label=f"speed [m/s]; black rim: {RIMS[_few(found[whole[0]])]}")
+    first = found[whole[0]]
+    rims = f"; black rim: {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
+    figure.colorbar(lines, ax=axes, label=f"speed [m/s]{rims}")
     return figure
 
 
 def _few(motion: Motion) -> bool:
-    """Whether at most half of the vehicles are automated."""
-    return 2 * motion.roles.count(AUTOMATED) <= len(motion.roles)
+    """Whether at least half of the vehicles are people's."""
+    return 2 * motion.roles.count(HUMAN) >= len(motion.roles)
 
 
 def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollection:
@@ -82,7 +84,7 @@ def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollec
         points = np.stack([motion.time, shown[:, vehicle]], -1)
         parts = np.stack([points[:-1], points[1:]], 1)
         whole = np.abs(parts[:, 1, 1] - parts[:, 0, 1]) < 0.5 * around
-        framed = (role == AUTOMATED) == _few(motion)
+        framed = (role != HUMAN) == _few(motion)
         above = 3 if framed else 2  # no other line hides the frame
         if framed:
             frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.0, zorder=above)

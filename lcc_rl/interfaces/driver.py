@@ -16,7 +16,7 @@ from torch import Tensor
 from lcc_rl.config.nodes import build
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
@@ -24,6 +24,7 @@ from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World
+from lcc_rl.results.names import FILTERED
 from lcc_rl.results.policies import load_policy
 
 # Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
@@ -94,6 +95,8 @@ class Driver:
         self.time_step = time_step
         self.module: ExportedPolicy | None = None
         pieces: list[StepTransform] = []
+        filtered = isinstance(who, str) and who.endswith(FILTERED)
+        require(not filtered, f"{who}: there is no safety filter here, but that of a policy")
         if is_policy(who):
             pieces += self._policy(who, trust)
         else:
@@ -109,7 +112,7 @@ class Driver:
         if abs(trained - self.time_step) > 1e-9:
             raise ConfigError(
                 f"{name} was trained with steps of {trained:g} s, the simulation has "
-                f"{self.time_step:g} s (of SUMO: --step-length {trained:g})"
+                f"{self.time_step:g} s (--step-length {trained:g} sets SUMO's)"
             )
         memory = cfg.scenario.pieces.get("memory")
         wanted = any(column.startswith("memory.") for column in self.module.names)

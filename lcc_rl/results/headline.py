@@ -167,9 +167,10 @@ def _sentence(rows: Mapping[str, Any], name: str, other: str, of_few: bool) -> s
     within = "" if low > 0.0 else ", within the uncertainty"
     own, theirs = (100.0 * rows[who][long] for who in (name, other))
     article = "the " if in_words(name) != name else ""
+    interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
     return (
-        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % ({low:.1f} … "
-        f"{high:.1f}) {less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
+        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % {interval} "
+        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
         f"the time against {theirs:.2f} %."
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.config.nodes import TARGET
 from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
 
@@ -154,6 +155,14 @@ def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     return speed.index.to_numpy(float), leader, own, gap.to_numpy(float), roles
 
 
+def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
+    """Return what tells people from controllers by their role: a role of people is ``human``."""
+    nodes = scenario.get("controllers", {})
+    kinds = {role: node[TARGET] for role, node in nodes.items() if node}
+    people = {role for role, kind in kinds.items() if kind == kinds.get(HUMAN)} - {AUTOMATED}
+    return lambda role: HUMAN if role in people else role
+
+
 def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     """Read rows with all vehicles each."""
     cars, others = _vehicles(rows, "cav"), _vehicles(rows, "hdv")
@@ -164,6 +173,9 @@ def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     own, rest = iter(cars), iter(others)
     names = [next(own) if place in places else next(rest) for place in range(count)]
     roles = tuple(AUTOMATED if place in places else HUMAN for place in range(count))
+    if isinstance(scenario["string"], str):
+        known = parse_string(scenario["string"], scenario["road"]).roles
+        roles = tuple(map(_driver_of(scenario), known)) if len(known) == count else roles
     time = rows["time_s"].to_numpy(float)
     speed, gap = (rows[[f"{x}_{entry}" for x in names]] for entry in ("speed", "gap"))
     leader = rows.get("leader_speed")

@@ -237,8 +237,8 @@ def in_full(table: pd.DataFrame, title: str, task: Task) -> Group:
         ("spread of speeds at the end [m/s]", "final_speed_spread_mps", "{:.2f}"),
         ("flow [vehicles/h]", FLOW, "{:.0f}"),
         ("flow lost", FLOW_LOST, "{:+.2%}"),
-        ("episodes whose wave is damped", "damped", "{:.0%}"),
-        ("  their mean damping time [s]", DAMPING, "{:.0f}"),
+        ("episodes that end calm", "damped", "{:.0%}"),
+        ("  from when on, mean [s]", DAMPING, "{:.0f}"),
         ("string ratio", "string_ratio", "{:.2f}"),
         *(
             (

@@ -104,18 +104,21 @@ class Totals:
         """Count who is worse off with a strategy than with a baseline, pair by pair."""
         if self.paired_by not in frame:
             return
-        way = frame[[name for name in WAYS if name in frame]].sum(axis=1)
-        energy = paired(frame.assign(per_way=frame[self.paired_by] / way), "per_way")
-        for baseline in (name for name in self.baselines if name in energy):
-            for strategy in (str(name) for name in energy if name != baseline):
-                both = energy[[strategy, baseline]].dropna().astype(np.float64)
-                place = (strategy, baseline)
-                count, worse = self.pairs.get(place, (0, 0))
+        ways = frame[[name for name in WAYS if name in frame]].sum(axis=1)
+        frame = frame.assign(way=ways, per_way=frame[self.paired_by] / ways)
+        energy, way, per_way = (paired(frame, x) for x in (self.paired_by, "way", "per_way"))
+        for baseline in (name for name in self.baselines if name in per_way):
+            for strategy in (str(name) for name in per_way if name != baseline):
+                place = [strategy, baseline]
+                both = per_way[place].dropna().astype(np.float64)
+                count, worse = self.pairs.get((strategy, baseline), (0, 0))
                 more = int((both[strategy] > both[baseline]).sum())
-                self.pairs[place] = (count + len(both), worse + more)
-                sums = both.groupby("driver_id").sum()
-                known = self.drivers.get(place)
-                self.drivers[place] = sums if known is None else known.add(sums, fill_value=0.0)
+                self.pairs[strategy, baseline] = (count + len(both), worse + more)
+                parts = {"energy": energy.loc[both.index, place], "way": way.loc[both.index, place]}
+                sums = pd.concat(parts, axis=1).groupby("driver_id").sum()
+                known = self.drivers.get((strategy, baseline))
+                total = sums if known is None else known.add(sums, fill_value=0.0)
+                self.drivers[strategy, baseline] = total
 
     def sums(self) -> pd.DataFrame:
         """Return the sum of each column of means by strategy, and the number of ``rows``."""
@@ -137,12 +140,16 @@ class Totals:
         return rows.assign(**{DRIVE: rows["profile_id"].map(self.drives)}) if self.drives else rows
 
     def worse_off(self, strategy: str, baseline: str) -> dict[str, float]:
-        """Return :func:`lcc_rl.results.savings.worse_off`; NaN if a strategy is missing."""
+        """Return the shares of pairs and of drivers who take more per distance; NaN without any.
+
+        As a saving, that of a driver is of the sums over its windows.
+        """
         count, worse = self.pairs.get((strategy, baseline), (0, 0))
         if not count:
             return {"pairs": np.nan, "drivers": np.nan}
         sums = self.drivers[strategy, baseline]
-        return {"pairs": worse / count, "drivers": (sums[strategy] > sums[baseline]).mean()}
+        per_way = sums["energy"] / sums["way"]
+        return {"pairs": worse / count, "drivers": (per_way[strategy] > per_way[baseline]).mean()}
 
 
 def _folded(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:

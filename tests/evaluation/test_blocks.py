@@ -211,6 +211,23 @@ def test_pairs_are_counted_with_their_repeat(tmp_path) -> None:
     assert row["drivers_worse_than_idm"] == 0.0  # driver 0 draws 4 and 3
 
 
+def test_a_driver_is_worse_off_by_the_sums_over_its_windows_as_savings_are() -> None:
+    rows = pd.DataFrame(
+        {
+            "strategy": ["idm"] * 2 + ["alcc"] * 2,
+            "training_seed": pd.array([None] * 2 + [0] * 2, dtype="Int64"),
+            "profile_id": [0, 1] * 2,
+            "driver_id": 0,
+            "total_path_energy_kj": [1.0, 10.0, 2.0, 8.0],
+            "cav_distance_m": [1.0, 10.0] * 2,
+            "collided": False,
+        }
+    )
+    row = summary(rows).set_index("strategy").loc["alcc"]
+    assert row["km_saving_vs_idm"] == pytest.approx(1.0 / 11.0)
+    assert (row["drivers_worse_than_idm"], row["pairs_worse_than_idm"]) == (0.0, 0.5)
+
+
 # -- compiled -------------------------------------------------------------------------------------
 
 COMPILER = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its own making

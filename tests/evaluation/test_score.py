@@ -85,7 +85,7 @@ def test_the_hash_is_of_the_code_of_an_own_controller(tmp_path, monkeypatch) -> 
         (["idm", "--source", "../x", "leader=i24"], "expected a new name"),
         (["idm", "--source", "x", "agent=ddpg"], "expected settings of data, "),
         (["idm", "data=stream"], "each task has its own"),
-        (["idm", "--name", "idm_acc"], "--name idm_acc: expected a new name"),
+        (["idm", "--name", "idm_acc"], "--name idm_acc stands for .tuned IDM. in"),
         (["acc_filtered", "--task", "i80-follow"], "no safety filter: score acc, .* without one"),
     ],
 )

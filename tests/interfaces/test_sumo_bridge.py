@@ -236,6 +236,7 @@ def test_a_policy_keeps_a_wave_from_growing(tmp_path) -> None:
     [
         ("follow_stopper", STEP, "Did you mean 'follower_stopper'"),
         ("pretrained/ring-22", 0.5, "--step-length 0.1"),
+        ("acc_filtered", STEP, "acc_filtered: there is no safety filter here"),
         ({"_target_": "lcc_rl.pieces.CACC"}, STEP, "vehicles.gap_error, which is not measured"),
     ],
 )

@@ -176,7 +176,7 @@ def test_all_scores_of_a_ring_name_the_damped_episodes_and_their_mean_time(capsy
     found = scores(pd.concat([never, own]), TASK, MOTOR)
     show(in_full(found, "", TASK))
     lines = capsys.readouterr().out.splitlines()
-    rows = [line.split()[-2:] for line in lines if "damp" in line]
+    rows = [line.split()[-2:] for line in lines if "calm" in line or "from when on" in line]
     assert rows == [["0%", "67%"], ["–", "35"]]
 
 
