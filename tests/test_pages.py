@@ -234,6 +234,8 @@ class Runner(Reader):
         made = self.folder.glob(f"outputs/{where}/**/{holds[1:]}")
         runs = sorted(made, key=lambda path: path.stat().st_mtime)
         folder = runs[-1].parent if runs and not name.startswith("other") else self.run
+        if name == "sweep" and (folder.parent / "sweep.json").exists():
+            folder = folder.parent
         return f"{folder}{file or ''}"
 
 
