@@ -135,6 +135,7 @@ def test_windows_are_held_out_only_from_a_training(tmp_path, capsys, words, titl
 # -- as functions ----------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(
     trained, tmp_path, caplog
 ) -> None:

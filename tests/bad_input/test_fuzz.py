@@ -35,7 +35,7 @@ from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.errors import LccError
 from lcc_rl.io import memory
 
-EXAMPLES = int(os.environ.get("FUZZ", "8"))
+EXAMPLES = int(os.environ.get("FUZZ", "4"))
 SECONDS, GIGABYTES = 60.0, 6  # of a case
 CONF = Path(lcc_rl.conf.__path__[0])
 CHOICES = {

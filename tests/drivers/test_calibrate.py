@@ -56,7 +56,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
         assert text in out.getvalue()
 
 
-@pytest.mark.parametrize("model", slow_but(["idm", "gipps"], list(LAWS)))
+@pytest.mark.parametrize("model", slow_but(["gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     cfg.calibration["model"], cfg.calibration["objective"] = model, "both"
     cfg.calibration["holdout"] = 0.3

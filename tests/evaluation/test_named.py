@@ -40,6 +40,7 @@ def steady(gap, speed, ahead_speed, gain=0.2):
     return (gain * (gap - 2.0 - 1.3 * speed) + 0.8 * (ahead_speed - speed)).clamp(-3.0, 3.0)
 
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 PATH = f"{__name__}.Steady"
 SMALL = [*NO_AGENT, "evaluation.drivers=2"]
 ENERGY = "total_path_energy_kj"
