@@ -183,6 +183,12 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
             unknown or has nobody to drive.
     """
     named = cfg.compare
+    for who in named.values() if isinstance(named, Mapping) else named:
+        require(
+            isinstance(who, (str, Mapping)),
+            f"compare names {who!r}: expected a name, a path or a node; of several runs the folder "
+            "that holds them",
+        )
     if not isinstance(named, Mapping):
         labels = [who if is_policy(who) else label_of(who) for who in named]
         for label, count in Counter(labels).items():

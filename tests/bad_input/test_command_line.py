@@ -50,6 +50,8 @@ REFUSED = {
     "train data=ngsim data.path=[]": "no file is named",
     "train resume=nowhere": "nowhere",
     "evaluate variant=alcc policy=nowhere": "nowhere",
+    "evaluate variant=alcc compare=[null]": "compare names None: expected a name",
+    "evaluate variant=alcc compare={a:[b,c]}": "compare names .'b', 'c'.: expected a name",
     "run variants=[]": "variants",
     "run variant=idm": "variant=idm has no effect on lcc-rl run",
     f"train -m variant=idm {' '.join(LISTS)}": "at most 100000 runs",
