@@ -114,7 +114,7 @@ def complete(cfg: EvaluateConfig, folder: Path) -> None:
     if made_by(table) == identity(cfg):
         named = cfg.compare.values() if isinstance(cfg.compare, Mapping) else cfg.compare
         made, names = table.stat().st_mtime, (cfg.policy, *named)
-        paths = [Path(name) for name in names if isinstance(name, str)]
+        paths = [Path(run) for who in names if isinstance(who, str) for run in _runs_of(Path(who))]
         files = [path / POLICY if path.is_dir() else path for path in paths]
         if all(path.stat().st_mtime <= made for path in files if path.exists()):
             log.info("%s: finished before", folder.name)
