@@ -55,7 +55,7 @@ from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import Task
-from lcc_rl.results.tables import leader_too_fast, summary
+from lcc_rl.results.tables import leader_too_fast, remarks, summary
 from lcc_rl.results.totals import sources_of
 from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
@@ -341,7 +341,7 @@ def evaluate_and_write(
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
-    for line in leader_too_fast(rows, cfg.task is not None):
+    for line in [*leader_too_fast(rows, cfg.task is not None), *remarks(rows)]:
         log.warning(line)
     if not quiet:
         show_tables(rows, cfg, inputs)
@@ -405,7 +405,7 @@ class Found(NamedTuple):
         table: a row per strategy.
         shorten: returns what a reader asks first.
         draw_all: draws the whole table under a title.
-        verdict: a sentence below it; empty for none.
+        verdict: sentences below it; empty for none.
     """
 
     of: str
@@ -440,16 +440,17 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
     task, energy = task_of(cfg), build_energy(cfg)
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source in sources_of(rows):
+        limits = remarks(rows, source)
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
             short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
-            yield Found(source, scores.scores(part, task, energy), short, full)
+            yield Found(source, scores.scores(part, task, energy), short, full, "\n".join(limits))
         else:
             short = partial(headline.headline, energy=energy, filtered=filtered)
             table = summary(rows, source)
-            said = headline.verdict(table, of_few=False)
-            yield Found(source, table, short, headline.in_full, said)
+            said = [x for x in (headline.verdict(table, of_few=False), *limits) if x]
+            yield Found(source, table, short, headline.in_full, "\n".join(said))
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:

@@ -45,7 +45,7 @@ from lcc_rl.io.settings import read_text
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
 from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, save_config
 from lcc_rl.results.savings import RULE
-from lcc_rl.results.tables import summary
+from lcc_rl.results.tables import remarks, summary
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -159,11 +159,12 @@ def _run(
         filtered = final.scenario.filters.get(AUTOMATED) is not None
         table = headline(found, build_energy(final), filtered)
         write_figures(folder / FINAL, tables=[table])
-        words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
+        said = "\n".join([verdict(found), *remarks(rows)])
+        words = f"{said}\n\n{caption_of(table, limit)}"
         page = write_page(folder, [command], found, words, (size, table))
         title = f"Leader, car, human behind it: {size}"
         show(as_rich(table, title, caption_of(table, limit)))
-        show(Text(verdict(found)))
+        show(Text(said))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

@@ -12,7 +12,7 @@ from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
 
-Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
+Quantity = Callable[[EnergyModel, Tensor, Tensor], Any]
 
 
 class Fleet:
@@ -72,22 +72,28 @@ class Fleet:
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
         """Return what accelerating loses [W]; None unless all models have such a part."""
-        return self._known(EnergyModel.acceleration_loss, speed, acceleration, kind)
+        if not all(self._defined("acceleration_loss")):
+            return None
+        return self._of(lambda model, *x: model.acceleration_loss(*x), speed, acceleration, kind)
 
     def infeasible(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
-        """Return where a vehicle cannot accelerate like this; None unless all models say."""
-        return self._known(EnergyModel.infeasible, speed, acceleration, kind)
-
-    def _known(
-        self, method: Any, speed: Tensor, acceleration: Tensor, kind: Tensor | None
-    ) -> Tensor | None:
-        """Return what all models have; None if one has it not."""
-        name = method.__name__
-        if any(getattr(type(model), name) is method for model in self.models):
+        """Return where a vehicle cannot accelerate like this; None if no model defines it."""
+        if not any(self._defined("infeasible")):
             return None
-        return self._of(lambda model, *x: getattr(model, name)(*x), speed, acceleration, kind)
+        nowhere = torch.zeros_like(speed, dtype=torch.bool)
+
+        def beyond(model: EnergyModel, *motion: Tensor) -> Tensor:
+            found = model.infeasible(*motion)
+            return nowhere if found is None else found
+
+        return self._of(beyond, speed, acceleration, kind)
+
+    def _defined(self, name: str) -> list[bool]:
+        """Return which models have a method of their own by this name."""
+        base = getattr(EnergyModel, name)
+        return [getattr(type(model), name) is not base for model in self.models]
 
     def _of(
         self, quantity: Quantity, speed: Tensor, acceleration: Tensor, kind: Tensor | None

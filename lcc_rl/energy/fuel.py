@@ -39,6 +39,8 @@ class CirclesFuel(EnergyModel):
     Below a deceleration that grows with speed the engine gets no fuel: a jump, exact in
     :meth:`power` and bridged over a ``width`` in :meth:`smooth_power`. An acceleration beyond
     what the vehicle can do counts as the largest that it can (:meth:`infeasible` tells where).
+    The published model does the same at speeds that the engine cannot hold, where this largest
+    acceleration is a deceleration. Here it is zero there: the speed is driven, so it is paid for.
     """
 
     vehicle: str = "midBase"  # Compact, midBase, midSUV, Pickup, Class4PND or Class8Tractor
@@ -92,7 +94,7 @@ class CirclesFuel(EnergyModel):
     def _rate(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the fuel rate [g/s] of an engine that gets fuel."""
         own, grade = self.own, self.grade
-        acceleration = torch.minimum(acceleration, self._strongest(speed))
+        acceleration = torch.minimum(acceleration, self._strongest(speed).clamp(min=0.0))
         linear = own["p0"] + speed * (own["p1"] + speed * own["p2"])
         quadratic = own["q0"] + own["q1"] * speed
         vertex = -linear / (2.0 * quadratic).clamp(min=1e-9)

@@ -20,6 +20,8 @@ LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 PER_KM = "path_energy_kj_per_km"  # and vehicle; who falls back gains nothing by it
 FASTER = "share_leader_faster"
 WIDTH, LEAST = 80, len("automated")  # of all strategies beside each other, and of one
+REACH = ("cav_share_infeasible", "hdv_share_infeasible")
+MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 
 CAR_COLUMNS = (
@@ -57,7 +59,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         Values that a strategy does not have are NaN.
     """
     # A string without automated vehicles, or without others, has no energies of them.
-    columns = [*CAR_COLUMNS, *HUMAN_COLUMNS, "collided"]
+    columns = [*CAR_COLUMNS, *HUMAN_COLUMNS, *REACH, "collided"]
     found = Totals(episodes, columns, ["min_ttc_s"], PATH, BASELINES, source)
     windows, every, sums = found.per_window(), found.mean(), found.sums()
     by_window = {"km_": Windows.of(windows, PATH, WAYS), "": Windows.of(windows, "total_energy_kj")}
@@ -87,6 +89,7 @@ def summary(episodes: Rows, source: str = "") -> pd.DataFrame:
         row["collisions"] = int(total["collided"])
         row["min_ttc_s"] = found.low("min_ttc_s", strategy)
         row |= {column: mean[column] for column in SHOWN}
+        row["share_infeasible"] = every.loc[strategy, list(REACH)].max()
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -122,11 +125,41 @@ ROWS = (
     ("  above 1 m/s", "share_time_gap_long_moving", "{:.2%}"),
     ("RMS jerk [m/s³]", "rms_jerk_mps3", "{:.2f}"),
     ("time with a leader faster than v0", FASTER, "{:.1%}"),
+    ("time beyond the energy model's reach", "share_infeasible", "{:.1%}"),
     ("windows", "windows", "{:d}"),
     ("drives", "drives", "{:d}"),
     ("training seeds", "seeds", "{:d}"),
     ("episodes", "episodes", "{:d}"),
 )
+
+
+def remarks(episodes: Rows, source: str = "") -> list[str]:
+    """Return sentences on what limits the numbers of an evaluation, for the log and the table.
+
+    Args:
+        episodes: rows of an evaluation.
+        source: of the leaders whose rows count; empty for all.
+    """
+    total = _means(episodes, REACH, source)
+    beyond = total.max(axis=1)
+    named = [f"{in_words(str(x))} {share:.1%}" for x, share in beyond[beyond > MUCH].items()]
+    if not named:
+        return []
+    return [
+        "Vehicles accelerate harder, or hold a higher speed, than their energy model allows for "
+        f"more than {MUCH:.0%} of the time ({', '.join(named)}): their energies are lower bounds."
+    ]
+
+
+def _means(episodes: Rows, columns: Sequence[str], source: str = "") -> pd.DataFrame:
+    """Return the means of columns by strategy; NaN where no row has a value."""
+    sums, counts = [], []
+    for frame in frames(episodes, ["strategy", *columns], source):
+        groups = frame.reindex(columns=["strategy", *columns]).groupby("strategy", sort=False)
+        sums.append(groups.sum())
+        counts.append(groups.count())
+    total, count = (pd.concat(x).groupby(level=0, sort=False).sum() for x in (sums, counts))
+    return total / count
 
 
 def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
@@ -147,15 +180,7 @@ def leader_too_fast(episodes: Rows, of_task: bool = False) -> list[str]:
     remedies["human"] = remedies["direct"]
     if of_task:
         remedies["idm"] = "compare with human, whose v0 is that of drivers=…"
-    parts = [
-        frame.groupby("strategy")[FASTER].agg(["sum", "count"])
-        for frame in frames(episodes, ["strategy", FASTER])
-        if FASTER in frame
-    ]
-    if not parts:
-        return []
-    total = pd.concat(parts).groupby(level=0).sum()
-    shares = total["sum"] / total["count"]
+    shares = _means(episodes, [FASTER])[FASTER]
     people = [shares[name] for name in ("human", "direct") if name in shares]
     for name in shares.index if people else ():
         if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():

@@ -1,4 +1,4 @@
-"""Leaders faster than any driver wants to be: measured, and said with the remedy."""
+"""What limits the numbers of an evaluation is measured, and said in the log and the table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from lcc_rl.data.leaders import stretch
 from lcc_rl.data.profiles import from_records
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rows import leader_faster
-from lcc_rl.results.tables import FASTER, leader_too_fast
+from lcc_rl.results.names import in_words
+from lcc_rl.results.tables import FASTER, REACH, leader_too_fast, remarks
 
 
 def test_the_share_of_time_by_hand() -> None:
@@ -56,3 +57,34 @@ def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:
     assert stretch("udds", 0.1, scale=2.0).speeds.max() > 50.0
     with pytest.raises(ConfigError, match=r"udds at scale=100 drives up to .* m/s, leader.plaus"):
         stretch("udds", 0.1, scale=100.0)
+
+
+CARS = ("compact", "midsize", "suv", "pickup", "electric")
+ONLY_TRUCKS = ["energy=mixture", *(f"energy.shares.{name}=0" for name in CARS)]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["variant=idm", "energy=fuel", "energy.vehicle=Class8Tractor"],
+        ["variant=idm", *ONLY_TRUCKS],
+        ["task=i24-follow5", "compare=[idm_acc]", "task.unit=kJ/km", *ONLY_TRUCKS],
+    ],
+)
+def test_what_no_truck_can_do_is_said_in_log_and_table(tmp_path, caplog, words) -> None:
+    cfg = tiny("evaluate", *words, agent=False)
+    with caplog.at_level(logging.WARNING, logger="lcc_rl"):
+        rows = evaluation.run(cfg, tmp_path, quiet=True)
+    (line,) = remarks(rows)
+    shares = rows.groupby("strategy")[list(REACH)].mean().max(axis=1)
+    assert f"{in_words(shares.idxmax())} {shares.max():.1%}" in line
+    assert line in caplog.text
+    (found,) = evaluation.found(rows, cfg)
+    assert line in found.verdict
+
+
+def test_a_hundredth_of_the_time_beyond_reach_needs_no_words() -> None:
+    rows = pd.DataFrame({"strategy": ["human", "mine"], "cav_share_infeasible": [0.009, 0.02]})
+    (line,) = remarks(rows)
+    assert "(mine 2.0%)" in line
+    assert remarks(rows[:1]) == []

@@ -1,5 +1,6 @@
 """Energy models against published figures and their own parts."""
 
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -9,8 +10,10 @@ import pytest
 import torch
 from scipy.interpolate import PchipInterpolator
 
+from lcc_rl.config import load
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, PaperMotor
 from lcc_rl.energy.fuel import coefficients
+from lcc_rl.envs.inputs import build_energy
 
 POINTS = Path(__file__).parent / "circles_fuel_check_points.csv"
 MODELS: dict[str, EnergyModel] = {
@@ -40,6 +43,32 @@ def test_fuel_equals_the_published_model_at_its_check_points(vehicle) -> None:
             model.fuel(*motion), torch.tensor(part["fuel_g_per_s"].to_numpy()), atol=1e-5, rtol=0.0
         )
         assert model.infeasible(*motion).tolist() == part["infeasible"].astype(bool).tolist()
+
+
+FAST = torch.linspace(25.0, 45.0, 201, dtype=torch.float64)
+MIXTURE = build_energy(load("train", ["energy=mixture"]))
+
+
+@pytest.mark.parametrize("name", [*MODELS, *(f"mixture.{name}" for name in MIXTURE.names)])
+@pytest.mark.parametrize("grade", [0.0, 0.03])
+def test_faster_never_takes_less_per_km(name, grade) -> None:
+    kind = name.removeprefix("mixture.")
+    model = MODELS[name] if kind == name else MIXTURE.models[MIXTURE.names.index(kind)]
+    model = replace(model, grade=grade) if hasattr(model, "grade") else model
+    for acceleration in (0.0, 0.5, 3.0):  # what a vehicle cannot do is no cheaper than its speed
+        motion = FAST, torch.full_like(FAST, acceleration)
+        per_km = model.power(*motion) / FAST
+        assert (per_km >= model.power(FAST, torch.zeros_like(FAST)) / FAST - 1e-9).all()
+        if acceleration == 0.0:
+            assert (per_km.diff() > 0.0).all()
+
+
+def test_a_truck_pays_for_the_speed_that_it_cannot_hold() -> None:
+    speed = torch.tensor([30.0, 35.0, 45.0], dtype=torch.float64)
+    truck = MODELS["Class8Tractor"]
+    assert truck.infeasible(speed, torch.zeros(3)).tolist() == [False, True, True]
+    per_km = truck.power(speed, torch.zeros(3)) / speed
+    assert per_km.tolist() == pytest.approx([14776.0, 18421.0, 27529.0], rel=1e-4)
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -83,7 +112,7 @@ def test_a_path_takes_what_is_drawn_less_what_is_stored(name) -> None:
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "motor"])
 def test_power_has_a_finite_gradient_everywhere(name) -> None:
     speed, acceleration = torch.meshgrid(
-        torch.linspace(0.0, 35.0, 71), torch.linspace(-5.0, 3.0, 81), indexing="ij"
+        torch.linspace(0.0, 45.0, 91), torch.linspace(-5.0, 3.0, 81), indexing="ij"
     )
     speed, acceleration = (x.clone().requires_grad_() for x in (speed, acceleration))
     for function in (MODELS[name].power, MODELS[name].smooth_power, MODELS[name].path_power):

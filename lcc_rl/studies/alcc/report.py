@@ -19,7 +19,7 @@ from lcc_rl.results.means import WINDOWS, Means
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, EPISODES
 from lcc_rl.results.savings import LEADER
-from lcc_rl.results.tables import leader_too_fast
+from lcc_rl.results.tables import leader_too_fast, remarks
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.alcc.paper_tables import PAPER_HUMAN, PAPER_TABLE_IV
 from lcc_rl.studies.alcc.study import ABLATIONS
@@ -130,6 +130,7 @@ def _headline(page: Page, means: Means) -> None:
         text += """ Every controller was trained with one seed only: intervals are over windows,
             and single seeds differ by about as much as the controllers do."""
     warnings = [*leader_too_fast(windows), few_windows(windows["profile_id"].nunique())]
+    warnings += [line.removesuffix(".") for line in remarks(windows)]
     text += "".join(f"\n\nWarning: {line}." for line in warnings if line)
     caption = """Counterpart of Fig. 11: path energy of controlled car and human driver by strategy;
         a driver's value is its mean over profiles and seeds."""
