@@ -80,7 +80,7 @@ class Objective:
             Diverged: naming the first of them.
         """
         parts = [
-            factor * self.limits.price(term.name) * term.compute(*_entries(term, data)).squeeze(-1)
+            factor * self.limits.price(term.name) * term.computed(_entries(term, data)).squeeze(-1)
             for term, factor in self.terms
         ]
         if any_lost(parts):

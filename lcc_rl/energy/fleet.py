@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from lcc_rl.energy.base import EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.functional.guard import unchanged
 
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Any]
 
@@ -98,10 +100,14 @@ class Fleet:
     def _of(
         self, quantity: Quantity, speed: Tensor, acceleration: Tensor, kind: Tensor | None
     ) -> Tensor:
-        found = quantity(self.models[0], speed, acceleration)
+        def of(model: EnergyModel) -> Tensor:
+            title, motion = type(model).__name__, (speed, acceleration)
+            return unchanged(partial(quantity, model), motion, title, ("speed", "acceleration"))
+
+        found = of(self.models[0])
         if kind is not None:
             for number, model in enumerate(self.models[1:], 1):
-                found = torch.where(kind == number, quantity(model, speed, acceleration), found)
+                found = torch.where(kind == number, of(model), found)
         return found
 
 

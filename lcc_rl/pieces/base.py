@@ -25,6 +25,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.guard import unchanged
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.views import NEXT as NEXT
@@ -106,6 +107,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
         # As plain tuples: TorchRL's properties convert at every access.
         self.needs = [(as_key(key)[0] == NEXT, root_key(key)) for key in reads]
         self.targets = [root_key(key) for key in writes]
+        self.read_names = [".".join(as_key(key)) for key in reads]
 
     def see(
         self,
@@ -143,7 +145,11 @@ class Piece(Part, TensorDictModuleBase, Transform):
         values = self._entries(before, reached)
         if detached:
             values = [value.detach() for value in values]
-        self._write(self.compute(*values), reached)
+        self._write(self.computed(values), reached)
+
+    def computed(self, values: Sequence[Tensor]) -> Any:
+        """Return what :meth:`compute` returns; a ConfigError if it changes an entry in place."""
+        return unchanged(self.compute, values, self.title, self.read_names)
 
     def _entries(self, before: State, reached: State) -> list[Tensor]:
         return [(reached if late else before)[key] for late, key in self.needs]
@@ -158,7 +164,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         reads = self.in_keys if self.needs else ()  # an unbound piece raises here
-        values = self.compute(*(tensordict.get(key) for key in reads))
+        values = self.computed([tensordict.get(key) for key in reads])
         values = (values,) if isinstance(values, Tensor) else values
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
@@ -251,7 +257,7 @@ class StepTransform(Piece):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = [(next_tensordict if late else tensordict).get(key) for late, key in self.needs]
         reached: State = {}
-        self._write(self.compute(*entries), reached)
+        self._write(self.computed(entries), reached)
         reached.update((key, tensordict.get(key)) for key in self.constants)
         for key, value in reached.items():
             next_tensordict.set(key, value)
