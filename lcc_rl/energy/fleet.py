@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.guard import unchanged
 
-Quantity = Callable[[EnergyModel, Tensor, Tensor], Any]
+Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
 
 
 class Fleet:
@@ -74,28 +73,33 @@ class Fleet:
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
         """Return what accelerating loses [W]; None unless all models have such a part."""
-        if not all(self._defined("acceleration_loss")):
-            return None
-        return self._of(lambda model, *x: model.acceleration_loss(*x), speed, acceleration, kind)
+        return self._known("acceleration_loss", all, speed, acceleration, kind)
 
     def infeasible(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
         """Return where a vehicle cannot accelerate like this; None if no model defines it."""
-        if not any(self._defined("infeasible")):
+        return self._known("infeasible", any, speed, acceleration, kind)
+
+    def _known(
+        self,
+        name: str,
+        enough: Callable[[list[bool]], bool],
+        speed: Tensor,
+        acceleration: Tensor,
+        kind: Tensor | None,
+    ) -> Tensor | None:
+        """Return what models define, false of the others; None unless enough define it."""
+        base = getattr(EnergyModel, name)
+        if not enough([getattr(type(model), name) is not base for model in self.models]):
             return None
         nowhere = torch.zeros_like(speed, dtype=torch.bool)
 
-        def beyond(model: EnergyModel, *motion: Tensor) -> Tensor:
-            found = model.infeasible(*motion)
+        def of(model: EnergyModel, *motion: Tensor) -> Tensor:
+            found = getattr(model, name)(*motion)
             return nowhere if found is None else found
 
-        return self._of(beyond, speed, acceleration, kind)
-
-    def _defined(self, name: str) -> list[bool]:
-        """Return which models have a method of their own by this name."""
-        base = getattr(EnergyModel, name)
-        return [getattr(type(model), name) is not base for model in self.models]
+        return self._of(of, speed, acceleration, kind)
 
     def _of(
         self, quantity: Quantity, speed: Tensor, acceleration: Tensor, kind: Tensor | None

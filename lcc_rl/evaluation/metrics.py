@@ -87,8 +87,8 @@ def safety_measures(
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
             each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first one;
-            behind a safety filter, for which steps it answers, ``promised``, what it was told,
-            ``wanted``, and its ``command`` [m/s²].
+            behind a safety filter, for which steps it answers, ``promised``, which begin
+            ``safe``, what it was told, ``wanted``, and its ``command`` [m/s²].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
@@ -128,6 +128,12 @@ def safety_measures(
     if "promised" in series:
         found["share_promised"] = average(series["promised"])
         found["share_ttc_unpromised"] = average(unsafe & (series["promised"] == 0.0))
+        # Of the last step nobody knows: safety is known when the step after it begins.
+        safe = series["safe"] > 0.0
+        turned = torch.zeros_like(safe)
+        turned[:-1] = safe[:-1] & ~safe[1:] & alive[1:]
+        found["share_turned_unsafe"] = average(turned)
+        found["share_promise_broken"] = average(turned & (series["promised"] > 0.0))
     return found
 
 

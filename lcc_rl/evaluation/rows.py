@@ -55,7 +55,8 @@ KEYS = [("leader", name) for name in ("speed", "acceleration")]
 KEYS += [("vehicles", name) for name in RECORDED]
 INDEX = (AUTOMATED, "index")
 # Behind a safety filter: for which steps it answers, what it was told and what it commanded.
-BEHIND = ((AUTOMATED, "promised"), (WANTED, AUTOMATED), (COMMAND, AUTOMATED))
+BEHIND = tuple((AUTOMATED, name) for name in ("promised", "safe"))
+BEHIND += ((WANTED, AUTOMATED), (COMMAND, AUTOMATED))
 # The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
 Groups = dict[str, dict[str, Tensor]]
 

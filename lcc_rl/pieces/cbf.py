@@ -242,7 +242,12 @@ class Promised(StepTransform):
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
     is reckoned with, in the step and since the oldest measurement that may be in use:
-    time-to-collision at its end is then above the filter's limit; else 0.
+    time-to-collision at its end is then above the filter's limit; else 0. Before the filter acts
+    (``from_s``) it promises nothing.
+
+    ``(role, "safe")``, likewise, is 1 where the vehicle was safe when the step began, by its true
+    state and the actuators that the scenario declares. A step that turns unsafe though it is
+    promised shows that actuators or sensors are not as declared.
     """
 
     safety: InstanceOf[CBFFilter]  # the filter, bound
@@ -252,11 +257,13 @@ class Promised(StepTransform):
     def setup(self, world: World) -> None:
         """Read the true state, and what bounds the commands of the role."""
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
-        self.see(world, [*seen, *self.safety.memories], [(self.name, "promised")], self.name)
+        seen += [*self.safety.memories, "episode.step"]
+        self.see(world, seen, [(self.name, name) for name in ("promised", "safe")], self.name)
 
-    def compute(self, *entries: Tensor) -> Tensor:
-        """Return 1 for the steps that are covered."""
-        safety, (speed, gap, ahead, acceleration, *memories) = self.safety, self.views(*entries)
+    def compute(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
+        """Return 1 for the steps that are covered, and for those that begin safe."""
+        safety = self.safety
+        speed, gap, ahead, acceleration, *memories, step = self.views(*entries)
         actuation, sensors = safety.kept(memories, speed)
         now = Motion(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:
@@ -266,4 +273,6 @@ class Promised(StepTransform):
         past = frames_of(sensors, AHEAD_ACCELERATION)[..., : safety.sensing.oldest]
         hardest = join([acceleration, past], -1).amin(-1, keepdim=True)
         kept_up = hardest >= -safety.braking_ahead - ROUNDING
-        return ((room >= -ROUNDING) & kept_up).to(speed.dtype)
+        safe = room >= -ROUNDING
+        promised = safe & kept_up & (step >= safety.from_step)
+        return promised.to(speed.dtype), safe.to(speed.dtype)

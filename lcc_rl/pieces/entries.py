@@ -47,6 +47,7 @@ ENTRIES: dict[Key, tuple[str, str]] = {
     (ROLE, "motion_history"): ("m/s, m, m/s", "past (speed, gap, relative speed), latest first"),
     (ROLE, "correction"): ("m/s²", "what the safety filter added to a policy's command"),
     (ROLE, "promised"): ("–", "1 where the safety filter answers for the step: see CBFFilter"),
+    (ROLE, "safe"): ("–", "1 where full braking keeps the filter's limit when the step begins"),
     (ROLE, "predicted_acceleration"): ("m/s²", "acceleration of the last step as predicted"),
     (ROLE, "predicted_power"): ("W", "motor power at the predicted acceleration"),
     (ROLE, "estimate"): ("–, s", "estimated (q, T), q = (15 m/s / v0)^δ"),

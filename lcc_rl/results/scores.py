@@ -42,6 +42,7 @@ HEADINGS = {
     "share_time_gap_long_moving": "long\ngaps\n≤ {:g} %",
     "share_ttc_unsafe": "TTC\n< 4 s\n≤ {:g} %",
     "share_ttc_unpromised": "TTC\nbare\n≤ {:g} %",
+    "share_turned_unsafe": "turned\nunsafe\n≤ {:g} %",
 }
 LARGEST, LEAST, SHARE = "max_", "min_", "share_"
 

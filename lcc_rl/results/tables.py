@@ -20,6 +20,7 @@ LOST, PATH = "total_acceleration_loss_kj", "total_path_energy_kj"
 PER_KM = "path_energy_kj_per_km"  # and vehicle; who falls back gains nothing by it
 FASTER = "share_leader_faster"
 WIDTH, LEAST = 80, len("automated")  # of all strategies beside each other, and of one
+BROKEN = "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
@@ -32,6 +33,8 @@ CAR_COLUMNS = (
     "min_ttc_s",
     "share_ttc_unsafe",
     "share_ttc_unpromised",
+    "share_turned_unsafe",
+    BROKEN,
     "share_filter_acts",
     "share_time_gap_long",
     "share_time_gap_long_moving",
@@ -120,6 +123,8 @@ ROWS = (
     ("minimum time-to-collision [s]", "min_ttc_s", "{:.2f}"),
     ("time with TTC < 4 s", "share_ttc_unsafe", "{:.2%}"),
     ("  of it outside the filter's promise", "share_ttc_unpromised", "{:.2%}"),
+    ("steps that turn unsafe", "share_turned_unsafe", "{:.2%}"),
+    ("  of them promised by the filter", BROKEN, "{:.2%}"),
     ("time in which the filter acts", "share_filter_acts", "{:.1%}"),
     ("time with time gap > 2.5 s", "share_time_gap_long", "{:.2%}"),
     ("  above 1 m/s", "share_time_gap_long_moving", "{:.2%}"),
@@ -134,21 +139,24 @@ ROWS = (
 
 
 def remarks(episodes: Rows, source: str = "") -> list[str]:
-    """Return sentences on what limits the numbers of an evaluation, for the log and the table.
+    """Return sentences on what limits the numbers of an evaluation behind a source's leaders."""
+    means, found = _means(episodes, [*REACH, BROKEN], source), []
 
-    Args:
-        episodes: rows of an evaluation.
-        source: of the leaders whose rows count; empty for all.
-    """
-    total = _means(episodes, REACH, source)
-    beyond = total.max(axis=1)
-    named = [f"{in_words(str(x))} {share:.1%}" for x, share in beyond[beyond > MUCH].items()]
-    if not named:
-        return []
-    return [
-        "Vehicles accelerate harder, or hold a higher speed, than their energy model allows for "
-        f"more than {MUCH:.0%} of the time ({', '.join(named)}): their energies are lower bounds."
-    ]
+    def named(shares: pd.Series, least: float) -> str:
+        large = shares[shares > least].items()
+        return ", ".join(f"{in_words(str(name))} {share:.2%}" for name, share in large)
+
+    if names := named(means[list(REACH)].max(axis=1), MUCH):
+        found.append(
+            "Vehicles accelerate harder, or hold a higher speed, than their energy model allows "
+            f"for more than {MUCH:.0%} of the time ({names}): their energies are lower bounds."
+        )
+    if names := named(means[BROKEN], 0.0):
+        found.append(
+            f"Steps turn unsafe though the safety filter promises them ({names}): brakes, delays "
+            "or sensors are not as scenario.actuators and scenario.sensors declare."
+        )
+    return found
 
 
 def _means(episodes: Rows, columns: Sequence[str], source: str = "") -> pd.DataFrame:

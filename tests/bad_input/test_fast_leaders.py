@@ -77,7 +77,7 @@ def test_what_no_truck_can_do_is_said_in_log_and_table(tmp_path, caplog, words) 
         rows = evaluation.run(cfg, tmp_path, quiet=True)
     (line,) = remarks(rows)
     shares = rows.groupby("strategy")[list(REACH)].mean().max(axis=1)
-    assert f"{in_words(shares.idxmax())} {shares.max():.1%}" in line
+    assert f"{in_words(shares.idxmax())} {shares.max():.2%}" in line
     assert line in caplog.text
     (found,) = evaluation.found(rows, cfg)
     assert line in found.verdict
@@ -86,5 +86,5 @@ def test_what_no_truck_can_do_is_said_in_log_and_table(tmp_path, caplog, words) 
 def test_a_hundredth_of_the_time_beyond_reach_needs_no_words() -> None:
     rows = pd.DataFrame({"strategy": ["human", "mine"], "cav_share_infeasible": [0.009, 0.02]})
     (line,) = remarks(rows)
-    assert "(mine 2.0%)" in line
+    assert "(mine 2.00%)" in line
     assert remarks(rows[:1]) == []

@@ -54,7 +54,8 @@ def test_safety() -> None:
     }
     assert set(measures) == set(expected)
     named = {name for name in expected if name.startswith((LARGEST, LEAST, SHARE))}
-    assert named | {"share_leader_faster", "share_ttc_unpromised"} == set(HEADINGS)
+    filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
+    assert named | {"share_leader_faster"} | filtered == set(HEADINGS)
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 

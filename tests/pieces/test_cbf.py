@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from commands import tiny
 from helpers import ACTION, slow_but, small_env
 
+from lcc_rl.commands import evaluation
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.metrics import safety_measures
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.functional.actuation import Motion, Response
 from lcc_rl.functional.braking import Braking, safe_command
-from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces import Actuation, CBFFilter
 from lcc_rl.pieces.rewards import TERMS
+from lcc_rl.pieces.world import World
+from lcc_rl.settings import Positive
 
 WHOLE, AUTO = "scenario.horizon=300", "scenario.filters.automated"
 
@@ -144,3 +151,63 @@ def test_safety_wins() -> None:
     piece = CBFFilter(time_gap=0.5, full_speed=0.0).bind()
     speed, gap, ahead = (column(x) for x in (10.0, 20.0, 2.0))
     assert piece.filtered(column(3.0), speed, gap, ahead, column(0.0)) == -3.0
+
+
+class Mistaken(Actuation):
+    """Brakes that are not as the scenario declares."""
+
+    actual: Positive = 1.5  # hardest braking that there is [m/s²]
+
+    def setup(self, world: World) -> None:
+        super().setup(world)
+        self.response = replace(self.response, braking=self.actual)
+
+
+def mistaken(actual: float, declared: float) -> str:
+    given = f"actual: {actual}, braking: {declared}"
+    return f"scenario.actuators={{automated: {{_target_: {__name__}.Mistaken, {given}}}}}"
+
+
+@pytest.mark.parametrize(
+    ("actual", "declared", "turns"), [(1.5, 3.0, True), (2.5, 2.5, False), (3.0, 1.5, False)]
+)
+def test_steps_that_turn_unsafe_show_wrong_actuators(
+    tmp_path, actual, declared, turns, caplog
+) -> None:
+    cfg = tiny(
+        "evaluate",
+        "variant=idm",
+        "+filter=cbf",
+        mistaken(actual, declared),
+        "evaluation.baselines=[constant_filtered]",
+        "scenario.horizon=200",
+        "data.duration_s=[40,50]",
+        "compare=[constant_filtered]",
+        agent=False,
+    )
+    rows = evaluation.run(cfg, tmp_path, quiet=True).set_index("strategy")
+    alone = rows.loc["constant_filtered"]
+    assert (alone["share_turned_unsafe"].mean() > 0.0) == turns
+    assert (alone["share_promise_broken"].mean() > 0.0) == turns
+    assert (alone["share_ttc_unsafe"].mean() > 0.0) == turns
+    assert ("Steps turn unsafe though the safety filter promises" in caplog.text) == turns
+
+
+def test_a_leader_beyond_the_bound_breaks_no_promise() -> None:
+    """Steps turn unsafe behind it, whoever is to blame."""
+    entries = {"ttc": 3.0, "time_gap": 1.0, "gap": 9.0, "jerk": 0.0}
+    series = {name: torch.full((4, 1, 1, 1), x) for name, x in entries.items()}
+    series["speed"] = torch.full((5, 1, 1, 1), 9.0)
+    series["safe"] = torch.tensor([1.0, 1.0, 0.0, 1.0]).view(4, 1, 1, 1)
+    alive = torch.ones(4, 1, 1, 1, dtype=torch.bool)
+    for promised, broken in (([1.0, 0.0, 0.0, 1.0], 0.0), ([1.0, 1.0, 0.0, 1.0], 0.25)):
+        series["promised"] = torch.tensor(promised).view(4, 1, 1, 1)
+        found = safety_measures(series, alive, 0.1)
+        assert found["share_turned_unsafe"].item() == 0.25
+        assert found["share_promise_broken"].item() == broken
+
+
+def test_nothing_is_promised_before_the_filter_acts() -> None:
+    data = driven(0.0, "+filter=cbf", f"{AUTO}.from_s=5")
+    assert not data["promised"][:50].any()
+    assert data["promised"][50:].any()
