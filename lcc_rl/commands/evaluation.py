@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -55,7 +56,7 @@ from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import Task
-from lcc_rl.results.tables import leader_too_fast, remarks, summary
+from lcc_rl.results.tables import WIDTH, leader_too_fast, remarks, summary
 from lcc_rl.results.totals import sources_of
 from lcc_rl.results.units import check_unit
 from lcc_rl.runs.precision import prepare_torch
@@ -440,7 +441,7 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
     task, energy = task_of(cfg), build_energy(cfg)
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source in sources_of(rows):
-        limits = remarks(rows, source)
+        limits = [fill(line, WIDTH) for line in remarks(rows, source)]
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
