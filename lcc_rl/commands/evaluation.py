@@ -406,7 +406,8 @@ class Found(NamedTuple):
         table: a row per strategy.
         shorten: returns what a reader asks first.
         draw_all: draws the whole table under a title.
-        verdict: sentences below it; empty for none.
+        verdict: a sentence below it; empty for none.
+        remarks: sentences on what limits its numbers, for its caption.
     """
 
     of: str
@@ -414,19 +415,24 @@ class Found(NamedTuple):
     shorten: Callable[[pd.DataFrame], pd.DataFrame]
     draw_all: Callable[[pd.DataFrame, str], Group]
     verdict: str = ""
+    remarks: Sequence[str] = ()
 
     @property
     def short(self) -> pd.DataFrame:
         """The table that commands print."""
-        return self.shorten(self.table)
+        table = self.shorten(self.table)
+        table.attrs["caption"] = headline.caption_of(table, " ".join(self.remarks))
+        return table
 
     def drawn(self, title: str, full: bool = False) -> Table | Group:
         """Return the table for the terminal, with ``full`` all of it."""
+        said = [self.verdict] if self.verdict else []
         if full:
             drawn: Table | Group = self.draw_all(self.table, title)
+            said += [fill(line, WIDTH) for line in self.remarks]
         else:
             drawn = headline.as_rich(self.short, title, headline.caption_of(self.short))
-        return Group(drawn, Text(self.verdict)) if self.verdict else drawn
+        return Group(drawn, Text("\n".join(said))) if said else drawn
 
 
 def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
@@ -441,17 +447,17 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
     task, energy = task_of(cfg), build_energy(cfg)
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source in sources_of(rows):
-        limits = [fill(line, WIDTH) for line in remarks(rows, source)]
+        limits = remarks(rows, source)
         if task is not None and isinstance(rows, pd.DataFrame):
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
             short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
-            yield Found(source, scores.scores(part, task, energy), short, full, "\n".join(limits))
+            yield Found(source, scores.scores(part, task, energy), short, full, "", limits)
         else:
             short = partial(headline.headline, energy=energy, filtered=filtered)
             table = summary(rows, source)
-            said = [x for x in (headline.verdict(table, of_few=False), *limits) if x]
-            yield Found(source, table, short, headline.in_full, "\n".join(said))
+            said = headline.verdict(table, of_few=False)
+            yield Found(source, table, short, headline.in_full, said, limits)
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:

@@ -159,12 +159,12 @@ def _run(
         filtered = final.scenario.filters.get(AUTOMATED) is not None
         table = headline(found, build_energy(final), filtered)
         write_figures(folder / FINAL, tables=[table])
-        said = "\n".join([verdict(found), *remarks(rows)])
-        words = f"{said}\n\n{caption_of(table, limit)}"
+        limit = " ".join([limit, *remarks(rows)])
+        words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
         page = write_page(folder, [command], found, words, (size, table))
         title = f"Leader, car, human behind it: {size}"
         show(as_rich(table, title, caption_of(table, limit)))
-        show(Text(said))
+        show(Text(verdict(found)))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

@@ -10,6 +10,7 @@ import pytest
 import torch
 from commands import tiny
 
+from lcc_rl.api import Run
 from lcc_rl.commands import evaluation
 from lcc_rl.data.leaders import stretch
 from lcc_rl.data.profiles import from_records
@@ -80,7 +81,9 @@ def test_what_no_truck_can_do_is_said_in_log_and_table(tmp_path, caplog, words) 
     assert f"{in_words(shares.idxmax())} {shares.max():.2%}" in line
     assert line in caplog.text
     (found,) = evaluation.found(rows, cfg)
-    assert line in found.verdict.replace("\n", " ")
+    assert found.short.attrs["caption"].endswith(line)
+    for full in (False, True):
+        assert line in " ".join(Run(tmp_path, rows, cfg).printed(full).split())
 
 
 def test_a_hundredth_of_the_time_beyond_reach_needs_no_words() -> None:

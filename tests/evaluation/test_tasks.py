@@ -56,7 +56,7 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     latex = capsys.readouterr().out
     against = task_of(cfg).against
     score = run.headline.set_index("strategy").loc[against, "score"]
-    assert any(f"{in_words(against)} & {score:{form}}" in latex for form in (".1f", ",.0f"))
+    assert any(f"{in_words(against)} & {score:{form}}" in latex for form in (".2f", ".1f", ",.0f"))
     assert r"saved [\%]" in latex
     assert latex.splitlines()[-1].startswith("% ")  # the note, as a comment
     table_again([str(tmp_path), "--format", "markdown"])
