@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,25 +82,17 @@ class Fleet:
         """Return where a vehicle cannot accelerate like this; None if no model defines it."""
         return self._known("infeasible", any, speed, acceleration, kind)
 
-    def _known(
-        self,
-        name: str,
-        enough: Callable[[list[bool]], bool],
-        speed: Tensor,
-        acceleration: Tensor,
-        kind: Tensor | None,
-    ) -> Tensor | None:
+    def _known(self, name: str, enough: Any, *motion: Any) -> Tensor | None:
         """Return what models define, false of the others; None unless enough define it."""
         base = getattr(EnergyModel, name)
-        if not enough([getattr(type(model), name) is not base for model in self.models]):
+        if not enough(getattr(type(model), name) is not base for model in self.models):
             return None
-        nowhere = torch.zeros_like(speed, dtype=torch.bool)
 
-        def of(model: EnergyModel, *motion: Tensor) -> Tensor:
-            found = getattr(model, name)(*motion)
-            return nowhere if found is None else found
+        def of(model: EnergyModel, speed: Tensor, acceleration: Tensor) -> Tensor:
+            found = getattr(model, name)(speed, acceleration)
+            return torch.zeros_like(speed, dtype=torch.bool) if found is None else found
 
-        return self._of(of, speed, acceleration, kind)
+        return self._of(of, *motion)
 
     def _of(
         self, quantity: Quantity, speed: Tensor, acceleration: Tensor, kind: Tensor | None
