@@ -176,7 +176,8 @@ def play(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[st
     save_config(cfg, folder)
     evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
-    settings = identity(cfg, "evaluation.behind_filter")  # whom nobody is compared with here
+    # Whom nobody is compared with here, and what "data" is the hash of.
+    settings = identity(cfg, "evaluation.behind_filter", "inputs.data", "inputs.leader")
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
     return row_of(scores(rows, task, build_energy(cfg)), task, source, strategy.name, rows) | hashes
 

@@ -13,7 +13,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
-from lcc_rl.config import identity
+from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
@@ -23,7 +23,7 @@ from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.policies import load_policy, save_policy
-from lcc_rl.results.runs import EPISODES, check_folder, load_config, save_config
+from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import Silent
@@ -67,8 +67,8 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
             f"{folder} already holds a training; resume it with resume={folder} or choose another "
             "hydra.run.dir"
         )
-    elif not resume:
-        check_folder(cfg, folder)
+    else:
+        check_folder(with_inputs(cfg), folder, *(NOT_IDENTITY if resume else ()))
     with working(folder):
         return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
 
@@ -78,7 +78,7 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
 
     Where the rows are logged may be said anew: what is stored names no place to write.
     """
-    own: TrainConfig = load_config(folder, cfg.trust)
+    own: TrainConfig = resumed_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
         if made_by(folder / table) not in (None, identity(own)):
             raise ResultsError(
@@ -161,8 +161,6 @@ def complete(cfg: TrainConfig, folder: Path) -> Rows:
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return as_rows(table)
-    if table.exists():
-        check_folder(cfg, folder)
     return run(cfg, folder, quiet=True, resume=True)
 
 
