@@ -72,7 +72,7 @@ WRONG = {
     "+faults=sensors scenario.sensors.automated.delay=1e9": "sensors.automated.delay must be at mo",
     "+faults=sensors scenario.sensors.automated.longest_dropout=200": "dropout must be at most 100",
     "+faults=actuation scenario.actuators.automated.delay=1e9": "delay must be at most 100 s",
-    "drivers.reaction_delay=0.25 drivers=i80_energy": "reaction delay of drivers must be a multiple",
+    "drivers.reaction_delay=0.25 drivers=i80_energy": "delay of drivers must be a multiple",
     f"data.platoons={HUGE}": r"platoons × vehicles = \d+.* needs about",
 }
 # Options without effect on the variant, and why.
