@@ -442,7 +442,12 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
             short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
-            yield Found(source, scores.scores(part, task, energy), short, full)
+            table = scores.scores(part, task, energy)
+            bounds = {f"limit_{column}": bound for column, bound in task.limits.items()}
+            every = summary(part).set_index("strategy")
+            every = every[every.columns.difference(table.columns, sort=False)]
+            table = table.assign(**bounds).join(every, on="strategy")
+            yield Found(source, table, short, full)
         else:
             short = partial(headline.headline, energy=energy, filtered=filtered)
             table = summary(rows, source)

@@ -62,7 +62,7 @@ from lcc_rl.results.scores import scores
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import record
+from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
 # Where leaders come from, and human drivers who keep up with them.
 SOURCES: dict[str, tuple[str, ...]] = {
@@ -211,13 +211,16 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     name = who.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
-    folder = own_folder(options.out or default, "--out", lambda names: False)
-    try:
-        return _run(who, name, folder, options, further)
-    except Exception as error:
-        if folder.is_dir() and any(folder.iterdir()):  # a refused command leaves nothing
-            record(folder, error)
-        raise
+    folder = Path(options.out or default)
+    with claim(folder):
+        # A killed one is played again; what is scored is kept.
+        own_folder(folder, "--out", {*choices("task"), ERROR}.issuperset)
+        try:
+            return _run(who, name, folder, options, further)
+        except Exception as error:
+            if any(path.name != LOCK for path in folder.iterdir()):  # if refused, it leaves nothing
+                record(folder, error)
+            raise
 
 
 def _run(
@@ -242,6 +245,7 @@ def _run(
     document = {"name": name, **about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    forget(folder)
     tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for source in own:
