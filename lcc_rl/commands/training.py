@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -26,7 +27,7 @@ from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
-from lcc_rl.runs.loggers import Silent
+from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
 
@@ -109,7 +110,10 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
         agent = build_agent(cfg, inputs.population, cfg.device)
         _train(cfg, agent, inputs, folder, resume)
         strategy = Strategy(cfg.variant, deployed(cfg), shared_policy(agent.policy), cfg.seed)
-    return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+    rows = evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+    if isinstance(logger := build_logger(cfg), RowLogger):
+        logger.log_result(folder, measured(rows))
+    return rows
 
 
 def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
@@ -164,12 +168,17 @@ def complete(cfg: TrainConfig, folder: Path) -> Rows:
     return run(cfg, folder, quiet=True, resume=True)
 
 
-def objective(cfg: TrainConfig, rows: Rows) -> float | list[float]:
-    """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
+def measured(rows: Rows) -> dict[str, Any]:
+    """Return the last row of the summary, that of the strategy trained."""
     # By its rows: a resumed run is not of the variant that the command line composed.
     vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
     table = case_table(rows, WINDOWS) if vehicles else summary(rows)
-    found = table.iloc[-1].to_dict()
+    return {str(key): value for key, value in table.iloc[-1].items()}
+
+
+def objective(cfg: TrainConfig, rows: Rows) -> float | list[float]:
+    """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
+    found = measured(rows)
     if pd.isna(found.get("min_ttc_s")):
         found["min_ttc_s"] = NEVER  # no gap ever closed; a sweeper needs a number
     values = [float(found[name]) for name in objectives(cfg)]
