@@ -13,7 +13,6 @@ of every task, but the variant, which is the task's; they change the hash of the
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import logging
 import platform
@@ -32,7 +31,8 @@ from rich.console import Console
 from lcc_rl.commands.checks import check_evaluation, check_installed
 from lcc_rl.commands.evaluation import evaluate_and_write, task_of
 from lcc_rl.config import check_overrides, choices, identity, load, root_key
-from lcc_rl.config.nodes import TARGET, find_target
+from lcc_rl.config.inputs import compared_files
+from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env, load_inputs
@@ -41,9 +41,7 @@ from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, requir
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.named import (
     DIRECT,
-    ONNX,
     RECORDED,
-    YAML,
     controller_of,
     is_policy,
     is_shipped,
@@ -113,12 +111,7 @@ class Scored(NamedTuple):
         """
         if self.policy is not None:
             return [policy_file(self.who)]
-        node = controller_of(self.who)
-        target = str(node.get("law", node[TARGET]))
-        found = [Path(self.who)] if self.who.endswith((*YAML, ONNX)) else []
-        if not target.startswith("lcc_rl."):
-            found.append(Path(inspect.getfile(inspect.unwrap(find_target(target, self.who)))))
-        return found
+        return list(compared_files(self.who))
 
 
 def scored(who: str, trust: Sequence[str] = ()) -> Scored:

@@ -24,7 +24,7 @@ from lcc_rl.drivers.genetic import Progress
 from lcc_rl.drivers.observed import Observed
 from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.energy import PaperMotor
-from lcc_rl.errors import Concern, DataError
+from lcc_rl.errors import Concern
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.laws import LAWS
@@ -375,7 +375,7 @@ def compare(
     if not react:
         found = {RECORDED: records, TWINS: drive(observed, drivers, [Reaction()], 1)[0]}
         line = f"{HELD}: too little to tell how true calibrated ones are in energy"
-        if accelerate(records):
+        if accelerate(observed):
             line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
         return Reaction(), _together(found, observed), [line]
     tries = tried(observed, drivers, progress)
@@ -394,18 +394,9 @@ def compare(
     return reaction, _together(found, observed), lines
 
 
-def check_told(observed: Observed) -> None:
-    """Check that a reaction can be chosen by what was recorded.
-
-    Raises:
-        DataError: if no driver accelerates.
-    """
-    if not accelerate(recorded(observed)):
-        raise DataError(f"{HELD}: too little to choose a reaction by; use calibration=local")
-
-
-def accelerate(records: pd.DataFrame) -> bool:
+def accelerate(observed: Observed) -> bool:
     """Whether drivers lose a measurable part of their energy to accelerating."""
+    records = recorded(observed)
     lost, energy = (records[f"{x}_{SMOOTHINGS[0]}s_j"].sum() for x in ("lost", "energy"))
     return bool(lost > LEAST_LOST * energy)
 

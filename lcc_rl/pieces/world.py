@@ -73,11 +73,8 @@ class World:
         Raises:
             ConfigError: if it is no number of steps, or above :data:`MOST_LATE`.
         """
-        require(
-            seconds <= MOST_LATE * self.time_step * (1 + 1e-9),
-            f"{what} must be at most {MOST_LATE * self.time_step:g} s, as every step of it is "
-            f"kept, got {seconds:g} s",
-        )
+        most = MOST_LATE * self.time_step
+        require(seconds < 1.001 * most, f"{what} must be at most {most:g} s, got {seconds:g} s")
         return self.steps(seconds, what)
 
     def sensed(self, role: str, names: Sequence[str]) -> list[str]:
