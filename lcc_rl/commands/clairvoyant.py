@@ -169,9 +169,9 @@ def main(arguments: list[str]) -> int:
     cfg = load("evaluate", ["variant=alcc", *overrides])
     cfg.evaluation.drivers = cfg.evaluation.drivers or DRIVERS
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
+    folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
     prepare_torch(cfg)
-    with claim(options.out):
-        folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
+    with claim(folder):
         inputs = load_inputs(cfg)
         episodes = plan(options, cfg, inputs, folder)
     show_tables(episodes, cfg, inputs)

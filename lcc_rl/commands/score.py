@@ -204,10 +204,10 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     name = who.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
-    folder = Path(options.out or default)
+    mine = {*choices("task"), ERROR}.issuperset  # of a killed one, which is played again
+    folder = own_folder(options.out or default, "--out", mine)
     with claim(folder):
-        # A killed one is played again; what is scored is kept.
-        own_folder(folder, "--out", {*choices("task"), ERROR}.issuperset)
+        own_folder(folder, "--out", mine)  # another one may just have ended
         try:
             return _run(who, name, folder, options, further)
         except Exception as error:
