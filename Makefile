@@ -16,7 +16,7 @@ export OMP_NUM_THREADS ?= 1
 install: $(STAMP)
 
 run: $(STAMP)
-	$(BIN)/python -m lcc_rl.cli.pipeline $(ARGS)
+	$(BIN)/python -m lcc_rl run $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)

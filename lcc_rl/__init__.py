@@ -10,7 +10,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from lcc_rl.runs import interrupts
 from lcc_rl.version import __version__
 
 __all__ = ["__version__", "compare", "export", "learn", "make_env", "results"]
@@ -21,9 +20,6 @@ LAZY = {
     "compare": "lcc_rl.api",
     "export": "lcc_rl.interfaces.export",
 }
-
-if interrupts.is_command():
-    interrupts.end_quietly()
 
 
 def __getattr__(name: str) -> Any:

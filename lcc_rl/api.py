@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -18,7 +18,6 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.evaluation.named import setting_of
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.headline import Shown
-from lcc_rl.results.tables import summary
 
 WIDTH = 80  # characters
 
@@ -57,8 +56,11 @@ class Run:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row per strategy, with energies, savings with intervals, safety."""
-        return summary(self.rows)
+        """Every measure: a row per strategy with energies, savings with intervals and safety.
+
+        Of a task its scores and limits come first. Several sources or cases as below.
+        """
+        return self._together(lambda one: one.table)
 
     @cached_property
     def headline(self) -> pd.DataFrame:
@@ -66,12 +68,17 @@ class Run:
 
         Of several sources of leaders, or cases of a platoon, the rows of each, named in ``of``.
         """
-        tables = {one.of: one.short for one in evaluation.found(self.rows, self.cfg)}
+        return self._together(lambda one: one.short)
+
+    def _together(self, kind: Callable[[evaluation.Found], pd.DataFrame]) -> pd.DataFrame:
+        """Return one table of all sources or cases."""
+        tables = {one.of: kind(one) for one in evaluation.found(self.rows, self.cfg)}
         first, *others = tables.values()
         if not others:
             return first
         together = pd.concat([table.assign(of=of) for of, table in tables.items()])
-        together.attrs["shown"] = (Shown("of", "of"), *first.attrs["shown"])
+        if "shown" in first.attrs:
+            together.attrs["shown"] = (Shown("of", "of"), *first.attrs["shown"])
         return together
 
     @cached_property

@@ -10,6 +10,7 @@ import torch
 from commands import AGENT, HORIZON
 from helpers import slow_but
 
+from lcc_rl.api import Run
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
@@ -94,6 +95,9 @@ def test_pretrained_works_for_all_three(tmp_path, variant) -> None:
     rows = evaluation.run(cfg, tmp_path, quiet=True)
     assert not rows["collided"].any()
     assert set(rows["strategy"]) >= RULES
+    every = Run(tmp_path, rows, cfg).table
+    assert {*every["of"]} == {*rows["case"]}
+    assert every["speed_error_sum_mps"].notna().all()
     reward = rows[rows["case"] == "windows"].groupby("strategy")["reward"].sum()
     if variant == "hcfs":
         assert reward["hcfs"] > 1.1 * max(reward["cacc tuned"], reward["ddpg"])

@@ -23,6 +23,7 @@ from lcc_rl.errors import require
 from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, save, style
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.cells import markdown_row
 from lcc_rl.results.fronts import (
     DISTANCE,
     FLEET,
@@ -92,7 +93,7 @@ def fronts(rows: pd.DataFrame) -> str:
         cells.append(f"{percent(against(part, RULE, saved_at_flow))}; T = {gap:.2f} s")
         cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {flow[best]:,.0f}")
         lines.append(cells)
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+    return "\n".join(map(markdown_row, lines))
 
 
 def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, float, pd.DataFrame]]:

@@ -10,7 +10,6 @@ written again from the kept scores.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
@@ -34,12 +33,13 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.io.settings import read_json
 from lcc_rl.pieces import Controller
 from lcc_rl.results.board import as_markdown
-from lcc_rl.results.cells import signed
+from lcc_rl.results.cells import markdown_row, signed
 from lcc_rl.results.headline import saved
 from lcc_rl.results.names import in_words
-from lcc_rl.results.runs import load_config
+from lcc_rl.results.runs import load_config, reading
 from lcc_rl.results.scores import FLOW, LEAST, SHARE, Task, keeps, limited, scores
 
 BEGIN, END = "<!-- tables: tools/leaderboard.py -->", "<!-- end of tables -->"
@@ -113,7 +113,7 @@ def drawn(task: Task, table: pd.DataFrame) -> str:
             f"{row['decision_ms']:.2f}" if np.isfinite(row["decision_ms"]) else "",
         ]
         lines.append(cells)
-    first, *others = ("| " + " | ".join(cells) + " |" for cells in lines)
+    first, *others = map(markdown_row, lines)
     bounds = ", ".join(bounded(column, bound) for column, bound in task.limits.items())
     words = f"Saved against {in_words(task.against)}. Limits: {bounds or 'no collision'}."
     return "\n".join([words, "", first, "|" + "---|" * len(lines[0]), *others])
@@ -162,8 +162,9 @@ def write_tables(reference: Path, page: Path) -> None:
 
 def write_board(scores: Path, page: Path) -> None:
     """Write the table of all files of ``lcc-rl score`` in a folder into the page."""
-    documents = {path.name: json.loads(path.read_text()) for path in sorted(scores.glob("*.json"))}
-    _write_between(page, [as_markdown(documents)])
+    documents = {path.name: read_json(path) for path in sorted(scores.glob("*.json"))}
+    with reading(scores):
+        _write_between(page, [as_markdown(documents)])
 
 
 def _write_between(page: Path, parts: Sequence[str]) -> None:

@@ -30,7 +30,8 @@ class Scene:
         device: where the networks live.
         world: what the pieces of the environment share.
         observation: what the policy sees, for policies that are rules.
-        max_acceleration: acceleration of action 1 [m/s²], for rules.
+        max_acceleration: acceleration of action 1 [m/s²], for rules; None where the controller of
+            automated vehicles has no such setting.
     """
 
     observation_size: int
@@ -38,7 +39,7 @@ class Scene:
     device: str = "cpu"
     world: World = field(default_factory=World)
     observation: Observation | None = None
-    max_acceleration: float = 3.0
+    max_acceleration: float | None = None
 
 
 class Agent(Settings, ABC):

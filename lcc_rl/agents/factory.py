@@ -38,11 +38,8 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
         raise ConfigError(f"variant {cfg.variant} learns nothing: it has no agent")
     world = world_of(cfg, population=population)
     observation = build(cfg.observation, "observation", Observation, world=world)
-    driver = cfg.scenario.controllers.get(AUTOMATED) or {}
-    # The acceleration of action 1, if actions drive the vehicles.
-    limit = {key: driver[key] for key in ("max_acceleration",) if key in driver}
-    size = observation.event_shape[-1]
-    scene = Scene(size, cfg.seed, device, world, observation, **limit)
+    limit = (cfg.scenario.controllers.get(AUTOMATED) or {}).get("max_acceleration")
+    scene = Scene(observation.event_shape[-1], cfg.seed, device, world, observation, limit)
     agent: Agent = build(cfg.agent, "agent", Agent)
     return agent.start(scene)
 

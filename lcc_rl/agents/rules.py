@@ -144,7 +144,7 @@ def make_policy(
     hidden: Sequence[int],
     seed: int,
     constants: Mapping[str, float] | None,
-    max_acceleration: float,
+    max_acceleration: float | None,
 ) -> TensorDictModule:
     """Build the policy of an agent.
 
@@ -155,14 +155,15 @@ def make_policy(
         hidden: sizes of the ReLU layers of a network.
         seed: seed of its initial weights.
         constants: constants of a rule at the start.
-        max_acceleration: acceleration of action 1 [m/s²].
+        max_acceleration: acceleration of action 1 [m/s²]; None if nobody knows.
 
     Returns:
         A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``
         ``[*batch, 1]``.
 
     Raises:
-        ConfigError: if the kind is unknown, or constants are given where there is no rule.
+        ConfigError: if the kind is unknown, constants are given where there is no rule, or a rule
+            does not know what its actions do.
     """
     size = observation.event_shape[-1]
     if kind == NETWORK:
@@ -173,6 +174,11 @@ def make_policy(
     if name not in RULES:
         known = (NETWORK, *RULES, *(RESIDUAL + rule for rule in RULES))
         raise unknown_name("agent.policy", kind, known)
+    if max_acceleration is None:
+        raise ConfigError(
+            f"agent.policy={kind} needs to know the acceleration of action 1: the controller of "
+            "automated vehicles has no setting max_acceleration [m/s²]"
+        )
     module: nn.Module = RULES[name](observation, constants, max_acceleration)
     if kind != name:
         module = Residual(module, size, hidden, seed)  # type: ignore[arg-type]

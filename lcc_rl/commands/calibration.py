@@ -96,7 +96,7 @@ def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
 
 
 def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:
-    settings = {key: getattr(cfg, key) for key in ("data", "calibration", "seed")}
+    settings = {key: getattr(cfg, key) for key in ("data", "calibration", "seed", "inputs")}
     metadata = {
         "config": json.dumps(settings),
         "config_hash": config_hash(settings),

@@ -44,7 +44,7 @@ from lcc_rl.results.savings import savings
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.runs.states import PROGRESS
+from lcc_rl.runs.states import PROGRESS, claim
 from lcc_rl.settings import Million
 
 DRIVERS = 12
@@ -171,8 +171,9 @@ def main(arguments: list[str]) -> int:
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
     prepare_torch(cfg)
-    inputs = load_inputs(cfg)
-    episodes = plan(options, cfg, inputs, folder)
+    with claim(folder):
+        inputs = load_inputs(cfg)
+        episodes = plan(options, cfg, inputs, folder)
     show_tables(episodes, cfg, inputs)
     if options.regard:
         Console().print(regard(episodes), highlight=False)

@@ -24,7 +24,7 @@ from lcc_rl.commands.checks import (
     check_strategies,
     check_variant,
 )
-from lcc_rl.config import identity
+from lcc_rl.config import identity, with_inputs
 from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
@@ -53,7 +53,7 @@ from lcc_rl.results import headline, scores, string_tables
 from lcc_rl.results.headline import show
 from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
-from lcc_rl.results.runs import EPISODES, STEPS, check_folder, load_config, save_config
+from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
 from lcc_rl.results.savings import SOURCE, by_source
 from lcc_rl.results.scores import Task
 from lcc_rl.results.tables import WIDTH, leader_too_fast, remarks, summary
@@ -97,7 +97,9 @@ def run(
     """
     folder = Path(folder)
     if cfg.resume is not None:
-        folder, cfg = Path(cfg.resume), load_config(cfg.resume, cfg.trust)
+        folder, cfg = Path(cfg.resume), resumed_config(cfg.resume, cfg.trust)
+    else:
+        cfg = with_inputs(cfg)
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
@@ -113,14 +115,10 @@ def complete(cfg: EvaluateConfig, folder: Path) -> None:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
-        named = cfg.compare.values() if isinstance(cfg.compare, Mapping) else cfg.compare
-        made, names = table.stat().st_mtime, (cfg.policy, *named)
-        paths = [Path(run) for who in names if isinstance(who, str) for run in _runs_of(Path(who))]
-        files = [path / POLICY if path.is_dir() else path for path in paths]
-        if all(path.stat().st_mtime <= made for path in files if path.exists()):
-            log.info("%s: finished before", folder.name)
-            return
-    run(cfg, folder, quiet=cfg.evaluation.shards > 1)
+        log.info("%s: finished before", folder.name)
+        return
+    check_folder(cfg, folder, "inputs")  # of other files it is made anew
+    run(cfg, folder, quiet=cfg.evaluation.shards > 1, replace=True)
     forget(folder)
 
 
@@ -452,7 +450,12 @@ def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
             part = rows[rows[SOURCE] == source] if source else rows
             task = task.among(part["strategy"])
             short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
-            yield Found(source, scores.scores(part, task, energy), short, full, "", limits)
+            table = scores.scores(part, task, energy)
+            bounds = {f"limit_{column}": bound for column, bound in task.limits.items()}
+            every = summary(part).set_index("strategy")
+            every = every[every.columns.difference(table.columns, sort=False)]
+            table = table.assign(**bounds).join(every, on="strategy")
+            yield Found(source, table, short, full, "", limits)
         else:
             short = partial(headline.headline, energy=energy, filtered=filtered)
             table = summary(rows, source)

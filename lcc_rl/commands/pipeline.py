@@ -43,7 +43,7 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
-from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, save_config
+from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, resumed_config, save_config
 from lcc_rl.results.savings import RULE
 from lcc_rl.results.tables import remarks, summary
 from lcc_rl.runs.interrupts import INTERRUPTED
@@ -90,7 +90,8 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
             check_folder(cfg, folder)
             command = shlex.join(["lcc-rl", "run", *overrides])
         elif (folder / COMMAND).is_file():
-            cfg = load_config(folder, cfg.trust)
+            read = (folder / TRAJECTORIES).exists()  # then nothing else is
+            cfg = (load_config if read else resumed_config)(folder, cfg.trust)
             trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants or ()}
             final = load_config(folder / PARTS / FINAL, cfg.trust)
             command = read_text(folder / COMMAND)

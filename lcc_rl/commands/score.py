@@ -13,7 +13,6 @@ of every task, but the variant, which is the task's; they change the hash of the
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import logging
 import platform
@@ -32,7 +31,8 @@ from rich.console import Console
 from lcc_rl.commands.checks import check_evaluation, check_installed
 from lcc_rl.commands.evaluation import evaluate_and_write, task_of
 from lcc_rl.config import check_overrides, choices, identity, load, root_key
-from lcc_rl.config.nodes import TARGET, find_target
+from lcc_rl.config.inputs import compared_files
+from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env, load_inputs
@@ -41,9 +41,7 @@ from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, requir
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.named import (
     DIRECT,
-    ONNX,
     RECORDED,
-    YAML,
     controller_of,
     is_policy,
     is_shipped,
@@ -62,7 +60,7 @@ from lcc_rl.results.scores import scores
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import record
+from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
 # Where leaders come from, and human drivers who keep up with them.
 SOURCES: dict[str, tuple[str, ...]] = {
@@ -113,12 +111,7 @@ class Scored(NamedTuple):
         """
         if self.policy is not None:
             return [policy_file(self.who)]
-        node = controller_of(self.who)
-        target = str(node.get("law", node[TARGET]))
-        found = [Path(self.who)] if self.who.endswith((*YAML, ONNX)) else []
-        if not target.startswith("lcc_rl."):
-            found.append(Path(inspect.getfile(inspect.unwrap(find_target(target, self.who)))))
-        return found
+        return list(compared_files(self.who))
 
 
 def scored(who: str, trust: Sequence[str] = ()) -> Scored:
@@ -176,7 +169,8 @@ def play(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[st
     save_config(cfg, folder)
     evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
-    settings = identity(cfg, "evaluation.behind_filter")  # whom nobody is compared with here
+    # Whom nobody is compared with here, and what "data" is the hash of.
+    settings = identity(cfg, "evaluation.behind_filter", "inputs.data", "inputs.leader")
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
     return row_of(scores(rows, task, build_energy(cfg)), task, source, strategy.name, rows) | hashes
 
@@ -210,13 +204,16 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     name = who.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
-    folder = own_folder(options.out or default, "--out", lambda names: False)
-    try:
-        return _run(who, name, folder, options, further)
-    except Exception as error:
-        if folder.is_dir() and any(folder.iterdir()):  # a refused command leaves nothing
-            record(folder, error)
-        raise
+    mine = {*choices("task"), ERROR}.issuperset  # of a killed one, which is played again
+    folder = own_folder(options.out or default, "--out", mine)
+    with claim(folder):
+        own_folder(folder, "--out", mine)  # another one may just have ended
+        try:
+            return _run(who, name, folder, options, further)
+        except Exception as error:
+            if any(path.name != LOCK for path in folder.iterdir()):  # if refused, it leaves nothing
+                record(folder, error)
+            raise
 
 
 def _run(
@@ -241,6 +238,7 @@ def _run(
     document = {"name": name, **about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    forget(folder)
     tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for source in own:

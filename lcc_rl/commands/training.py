@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -13,7 +14,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
 from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
-from lcc_rl.config import identity
+from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
@@ -23,10 +24,10 @@ from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.policies import load_policy, save_policy
-from lcc_rl.results.runs import EPISODES, check_folder, load_config, save_config
+from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
 from lcc_rl.results.string_tables import case_table
 from lcc_rl.results.tables import summary
-from lcc_rl.runs.loggers import Silent
+from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
 
@@ -67,8 +68,8 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
             f"{folder} already holds a training; resume it with resume={folder} or choose another "
             "hydra.run.dir"
         )
-    elif not resume:
-        check_folder(cfg, folder)
+    else:
+        check_folder(with_inputs(cfg), folder, *(NOT_IDENTITY if resume else ()))
     with working(folder):
         return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
 
@@ -78,7 +79,7 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
 
     Where the rows are logged may be said anew: what is stored names no place to write.
     """
-    own: TrainConfig = load_config(folder, cfg.trust)
+    own: TrainConfig = resumed_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
         if made_by(folder / table) not in (None, identity(own)):
             raise ResultsError(
@@ -109,7 +110,10 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
         agent = build_agent(cfg, inputs.population, cfg.device)
         _train(cfg, agent, inputs, folder, resume)
         strategy = Strategy(cfg.variant, deployed(cfg), shared_policy(agent.policy), cfg.seed)
-    return evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+    rows = evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+    if isinstance(logger := build_logger(cfg), RowLogger):
+        logger.log_result(folder, measured(rows))
+    return rows
 
 
 def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
@@ -161,17 +165,20 @@ def complete(cfg: TrainConfig, folder: Path) -> Rows:
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return as_rows(table)
-    if table.exists():
-        check_folder(cfg, folder)
     return run(cfg, folder, quiet=True, resume=True)
+
+
+def measured(rows: Rows) -> dict[str, Any]:
+    """Return the last row of the summary, that of the strategy trained."""
+    # By its rows: a resumed run is not of the variant that the command line composed.
+    vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
+    table = case_table(rows, WINDOWS) if vehicles else summary(rows)
+    return {str(key): value for key, value in table.iloc[-1].items()}
 
 
 def objective(cfg: TrainConfig, rows: Rows) -> float | list[float]:
     """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
-    # By its rows: a resumed run is not of the variant that the command line composed.
-    vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
-    table = case_table(rows, WINDOWS) if vehicles else summary(rows)
-    found = table.iloc[-1].to_dict()
+    found = measured(rows)
     if pd.isna(found.get("min_ttc_s")):
         found["min_ttc_s"] = NEVER  # no gap ever closed; a sweeper needs a number
     values = [float(found[name]) for name in objectives(cfg)]

@@ -14,6 +14,7 @@ from lcc_rl.config.compose import (
     load,
     own_file,
     parsed,
+    with_inputs,
 )
 from lcc_rl.config.words import check_overrides, key_of, root_key
 
@@ -34,4 +35,5 @@ __all__ = [
     "own_file",
     "parsed",
     "root_key",
+    "with_inputs",
 ]

@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
+from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.nodes import (
     TARGET,
     find_target,
@@ -173,6 +174,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
+    if "inputs" in content:
+        raise ConfigError("inputs: a run notes itself which files it reads; remove the setting")
     try:
         tree = parse_config(content, KINDS[entry])
     except ConfigError as error:  # of a class that has no such setting; another choice may
@@ -182,7 +185,13 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
             raise
         raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from None
     check_used(content, overrides, sweep)
-    return tree
+    return with_inputs(tree)
+
+
+def with_inputs(cfg: Any) -> Any:
+    """Note in a configuration which files it reads, as they are now; return it."""
+    cfg.inputs = inputs_of(as_plain(cfg))
+    return cfg
 
 
 def _learns(content: Mapping[str, Any]) -> bool:
@@ -331,4 +340,6 @@ def identity(cfg: Any, *unused: str) -> str:
         for part in path:
             node = node.get(part) or {}
         node.pop(last, None)
+    if not any((content.get("inputs") or {}).values()):
+        content.pop("inputs", None)
     return config_hash(content)

@@ -178,9 +178,19 @@ def _fits(made: Any, needed: type | Sequence[str]) -> bool:
 
 def takes_action(node: Any) -> bool:
     """Whether a controller, or one inside it, carries out the action of a policy."""
+    reads = (getattr(kind, "reads", ()) for kind in _kinds(node))
+    return any(name.endswith(".action") for names in reads for name in names)
+
+
+def takes_population(node: Any) -> bool:
+    """Whether a controller, or one inside it, drives as the drivers of a population."""
+    return any(getattr(kind, "takes_population", False) for kind in _kinds(node))
+
+
+def _kinds(node: Any) -> list[Any]:
+    """Return the classes of a controller and of those inside it."""
     nodes = [node, *(inner for _, _, inner in settings_at(node))]
-    kinds = [find_target(str(one[TARGET]), "controller") for one in nodes if is_node(one)]
-    return any(name.endswith(".action") for kind in kinds for name in getattr(kind, "reads", ()))
+    return [find_target(str(one[TARGET]), "controller") for one in nodes if is_node(one)]
 
 
 def check_numbers(value: Any, where: str) -> None:

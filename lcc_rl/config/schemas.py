@@ -140,6 +140,8 @@ class BaseConfig(Settings):
     data: Node
     figure_formats: list[Format]
     trust: list[str] = dataclasses.field(default_factory=list)
+    # Hashes of the files that it reads, see lcc_rl.config.inputs; a run notes them itself.
+    inputs: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
 
     def settled(self) -> None:
         if "png" not in self.figure_formats:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from lcc_rl.config.nodes import TARGET, is_node, short_name, takes_action
+from lcc_rl.config.nodes import TARGET, is_node, short_name, takes_action, takes_population
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, RING, parse_string
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
 
 NO_AGENT = ("agent=none", "agent=null")
 # Settings of an evaluation whose rows are episodes.
@@ -51,7 +51,10 @@ def _of_traffic(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             for key in ("split",) if "calibration" in content else ("data", "split"):
                 reason = "the leader drives the records of leader=…; use leader=trajectories"
                 yield key, reason
-    if set(string.names) == {AUTOMATED} and not _is_human(scenario["controllers"].get(AUTOMATED)):
+    drivers = [scenario["controllers"].get(AUTOMATED)]
+    if HUMAN in content.get("compare", ()):  # drives the automated vehicles, too
+        drivers.append(scenario["controllers"].get(HUMAN))
+    if set(string.names) == {AUTOMATED} and not any(map(takes_population, drivers)):
         for key in ("drivers", "evaluation.drivers"):
             yield key, f"there is no human driver in scenario.string={scenario['string']}"
     unused = {
@@ -96,7 +99,3 @@ def _of_agent(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _plays_data(leader: Any) -> bool:
     """Whether leaders, or one source of a mixture of them, are those of ``data``."""
     return is_node(leader) and ("source" in leader or any(map(_plays_data, leader.values())))
-
-
-def _is_human(node: Any) -> bool:
-    return is_node(node) and str(node[TARGET]).endswith((".IDM", ".Handover"))

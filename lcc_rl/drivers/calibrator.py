@@ -26,7 +26,7 @@ from lcc_rl.drivers.parameters import (
     at_bound,
     fitted,
 )
-from lcc_rl.drivers.twins import compare
+from lcc_rl.drivers.twins import HELD, accelerate, compare
 from lcc_rl.errors import Concern, DataError, unknown_name
 from lcc_rl.functional.driver_models import DriverConstants
 from lcc_rl.functional.laws import LAWS
@@ -133,6 +133,8 @@ class Calibrator(Settings):
         observed = episodes
         if not isinstance(observed, Observed):
             observed = observe(observed, self.selection)
+        if self.reaction and not accelerate(observed):
+            raise DataError(f"{HELD}: too little to choose a reaction by; use calibration=local")
         parts, twins, report = [], [], list(observed.report)
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()

@@ -77,8 +77,8 @@ def build_env(
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
         actions[ACTION] = (scenario.vehicles.count(AUTOMATED), 1)
-    check_pieces(pieces, scenario.horizon, actions)
     require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
+    check_pieces(pieces, scenario.horizon, actions)
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
     acting = Pieces(*pieces)
     acting.world = world_of(cfg)

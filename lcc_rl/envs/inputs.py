@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
 import torch
 
 from lcc_rl.config import is_sweep
+from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.nodes import CALLED, TARGET, build, short_name
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
-from lcc_rl.data.sources import LoadedEpisodes, find_files
+from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.energy import EnergyModel, Fleet, as_fleet
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
 
@@ -190,25 +189,13 @@ def load_episodes(node: Mapping[str, Any]) -> LoadedEpisodes:
     """
     if not is_sweep():
         return build_source(node).load()
-    key = json.dumps([node, list(_stamps(node))])
+    key = json.dumps([node, inputs_of({"data": node})])
     if key in _loaded:
         return replace(_loaded[key], report=[SHARED, *_loaded[key].report])
     loaded = build_source(node).load()
     _loaded.clear()
     _loaded[key] = loaded
     return loaded
-
-
-def _stamps(value: Any) -> Iterator[tuple[str, int, int]]:
-    """Yield name, time and size of every file that settings name, by a pattern, too."""
-    if isinstance(value, (Mapping, list)):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _stamps(item)
-    elif isinstance(value, str):
-        with suppress(DataError, OSError):
-            for name in find_files(value):
-                stat = Path(name).stat()
-                yield name, stat.st_mtime_ns, stat.st_size
 
 
 def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:

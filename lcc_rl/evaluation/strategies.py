@@ -10,7 +10,7 @@ import json
 import logging
 import re
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +18,9 @@ from typing import Any
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.config import load
+from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import TARGET, short_name
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
@@ -34,10 +34,15 @@ from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.names import FILTERED
+from lcc_rl.results.runs import differing, flatten
 
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
+# Settings by which trainings do not differ: of other runs, and those on which the seed depends.
+OF_NO_TRAINING = tuple(
+    f"{key}." for key in (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
+)
 DATED = re.compile(r"^\d{4}-\d\d-\d\d_(\d\d-\d\d-\d\d)-\d{6}_.*")
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
 RECORDED_START = "lcc_rl.pieces.RecordedStart"
@@ -54,6 +59,7 @@ class Strategy:
         policy: deterministic, writes ``("automated", "action")``; None for a rule.
         seed: training seed; None for a rule.
         source: file or folder that the policy was read from.
+        own: configuration of the policy's training, if it is not ``cfg``.
     """
 
     name: str
@@ -61,6 +67,7 @@ class Strategy:
     policy: Policy | None = None
     seed: int | None = None
     source: str = ""
+    own: StudyConfig | None = None
 
     @property
     def title(self) -> str:
@@ -221,6 +228,7 @@ def studied(
     weights, own_cfg = policy
     cfg = _of_training(cfg, own_cfg)
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
+    strategy = replace(strategy, own=own_cfg)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
 
 
@@ -272,7 +280,7 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
             other.scenario.pieces[name] = node
     check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
-    return replace(strategy, cfg=deployed(other))
+    return replace(strategy, cfg=deployed(other), own=own)
 
 
 def with_weights(
@@ -301,16 +309,13 @@ def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
 
     A variant that several kinds of agents learned gets the agent's name; one whose settings differ
     otherwise, or that has a seed twice, gets the name of the file or folder of its policy; several
-    seeds of one training keep one name, that of the folder that holds them.
+    seeds of one training keep one name, that of the folder that holds them. Where one folder holds
+    several trainings, these get the settings that differ.
     """
     kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
     found = _where_several(strategies, kinds, kinds)
     marks = _trainings(found)
-    groups = [(one.name, mark) for one, mark in zip(found, marks, strict=True)]
-    places = [
-        _place(one, groups.count(group) > 1) for one, group in zip(found, groups, strict=True)
-    ]
-    return _where_several(found, marks, places)
+    return _where_several(found, marks, _labels(found, marks))
 
 
 def _where_several(
@@ -325,15 +330,39 @@ def _where_several(
     ]
 
 
-def _trainings(strategies: Sequence[Strategy]) -> list[Hashable]:
+def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
     """Return what sets policies of a name apart: their settings, and which of one seed they are."""
-    found: list[Hashable] = []
+    found: list[tuple[str, int]] = []
     of_seed: Counter[Hashable] = Counter()
     for one in strategies:
-        of_seed[one.name, one.seed] += 1
-        settings = json.dumps([one.cfg.agent, one.cfg.scenario.filters], sort_keys=True)
-        found.append((settings, of_seed[one.name, one.seed]) if one.policy else None)
+        settings = dict(flatten(as_plain(one.own or one.cfg))) if one.policy else {}
+        kept = {key: x for key, x in settings.items() if not f"{key}.".startswith(OF_NO_TRAINING)}
+        text = json.dumps(kept, sort_keys=True, default=str)
+        of_seed[one.name, text, one.seed] += 1
+        found.append((text, of_seed[one.name, text, one.seed] if one.policy else 0))
     return found
+
+
+def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) -> list[str]:
+    """Return what is added to the name of each policy, the same for the seeds of a training."""
+    groups = [(one.name, mark) for one, mark in zip(strategies, marks, strict=True)]
+    places: dict[tuple[str, tuple[str, int]], str] = {}
+    for one, group in zip(strategies, groups, strict=True):
+        places.setdefault(group, _place(one, groups.count(group) > 1))
+    apart = Counter((name, place) for (name, _), place in places.items())
+    found = []
+    for name, mark in groups:
+        others = {text for other, (text, _) in places if other == name} - {mark[0]}
+        same = apart[name, places[name, mark]] > 1 and others
+        found.append(_difference(mark[0], others) if same else places[name, mark])
+    return found
+
+
+def _difference(text: str, others: Collection[str]) -> str:
+    """Return the settings of a training that are not those of all others, as ``key=value``."""
+    own, *rest = (json.loads(x) for x in (text, *others))
+    keys = sorted({key for other in rest for key in differing(own, other)})
+    return ", ".join(f"{key.rpartition('.')[2]}={own.get(key)}" for key in keys)
 
 
 def _place(strategy: Strategy, of_sweep: bool) -> str:

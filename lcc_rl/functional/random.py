@@ -61,5 +61,5 @@ def between(bounds: tuple[float, float], seed: Tensor, stream: Tensor | int) -> 
 
 def choose(seed: Tensor, count: Tensor | int, stream: Tensor | int = 0) -> Tensor:
     """Draw an index from 0 … count − 1 by counter; int64 of the broadcast shape."""
-    bits = hash_bits(seed + stream * STREAM)
+    bits = hash_bits(seed + (stream * STREAM & MASK))  # as in :func:`uniform`
     return bits * count >> 32

@@ -46,9 +46,9 @@ class Actuation(StepTransform):
         """Return how the role's vehicles obey commands that brake no harder than that [m/s²].
 
         Raises:
-            ConfigError: if the delay is no number of steps.
+            ConfigError: if the delay is no number of steps, or too long.
         """
-        late = world.steps(self.delay, f"scenario.actuators.{role}.delay")
+        late = world.late(self.delay, f"scenario.actuators.{role}.delay")
         braking = min(self.braking or hardest, hardest)
         return Response.of(late, self.lag, braking, world.time_step)
 

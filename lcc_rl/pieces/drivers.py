@@ -21,7 +21,7 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Key, as_key, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
 LEADER_SPEED = ("leader", "speed")
@@ -29,7 +29,6 @@ MOTION = ("self.speed", "self.gap", "self.relative_speed")
 # Draws that all drivers of an episode share.
 SPREAD, TIME_GAP = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
 LONGEST = 1000.0  # time gap up to which an equilibrium gap is written [s]
-MOST_DELAY = 1000  # steps that a driver may be late; each is kept per vehicle
 
 
 class Drivers(Controller):
@@ -53,13 +52,14 @@ class Drivers(Controller):
     time_gap_range: Factors = (1.0, 1.0)
     # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
     # those at the start of the episode. None: the reaction delay of the population.
-    delay: Annotated[int, Field(ge=0, le=MOST_DELAY)] | None = None
+    delay: Annotated[int, Field(ge=0, le=MOST_LATE)] | None = None
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
 
     name = HUMAN
     law: ClassVar[DriverLaw] = IDM_LAW
+    takes_population: ClassVar[bool] = True
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
     desired_speeds: ClassVar[Tensor]
@@ -73,7 +73,8 @@ class Drivers(Controller):
         kept = ["driver", "desired_speed", "desired_time_gap"]
         reaction = self.reaction(world)
         late, strays = self.delay, self.acceleration_noise
-        self.late = round(reaction.delay / world.time_step) if late is None else late
+        what = "the reaction delay of drivers"
+        self.late = world.late(reaction.delay, what) if late is None else late
         self.strays = reaction.noise if strays is None else strays
         self.noise_step = NoiseStep.of(world.time_step)
         self.starts = self.tells_gap and not world.string.ring

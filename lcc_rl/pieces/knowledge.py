@@ -46,7 +46,9 @@ class LeaderPreview(Feature):
         reads, profiles = [("leader", "profile"), ("leader", "start"), SEED, STEP], world.profiles
         self.wire(reads, [("preview", "speed")], (1, len(self.horizons)))
         self.stream = stream_id("preview.noise")
-        steps = [round((horizon - self.delay) / world.time_step) for horizon in self.horizons]
+        where = f"scenario.pieces.{self.name}"
+        late = world.steps(self.delay, f"{where}.delay")
+        steps = [world.steps(ahead, f"{where}.horizons") - late for ahead in self.horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         known = profiles.lengths if profiles.reach is None else profiles.reach
@@ -88,8 +90,10 @@ class ObservationMemory(StepTransform):
             raise ConfigError(
                 f"memory.seconds must be at least a step of {time_step} s, got {min(self.seconds)}"
             )
-        ages = [round(age / time_step) for age in self.seconds]
-        self.stacked, self.depth = self.kind == "stacked", max(ages) + 1
+        self.stacked, self.depth, ages = self.kind == "stacked", 1, [0]
+        if self.stacked:
+            ages = [world.steps(age, "memory.seconds") for age in self.seconds]
+            self.depth = max(ages) + 1
         kept = "history" if self.stacked else "entries"
         known = world.sensed(AUTOMATED, self.sources)
         reached = [f"{NEXT}.{source}" for source in known]

@@ -50,7 +50,7 @@ class Averaging(Controller):
         kept = [(self.name, "speed_history")] if self.averages else []
         known = ["episode.step", *(".".join(key) for key in kept)] if kept else []
         self.drive(world, [*reads, *known], [*kept, *writes])
-        self.samples = max(round(self.window / world.time_step), 1) if kept else 0
+        self.samples = max(world.steps(self.window, "window"), 1) if kept else 0
         self.limits = (-self.max_deceleration, self.max_acceleration)
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
@@ -173,7 +173,7 @@ class Handover(Controller):
             reset_options=[key for inner in both for key in inner.reset_options],
         )
         self.limits = None  # each has its own
-        self.from_step = round(self.from_s / world.time_step)
+        self.from_step = world.steps(self.from_s, "from_s")
 
     def command(self, step: Tensor, *entries: Tensor) -> Any:
         """Return the commands of whoever drives, and what both write besides."""

@@ -73,10 +73,10 @@ class Sensors(StepTransform):
         """Return the bounds of what the role measures.
 
         Raises:
-            ConfigError: if a duration is no number of steps.
+            ConfigError: if a duration is no number of steps, or too long.
         """
         late, longest = (
-            world.steps(getattr(self, name), f"scenario.sensors.{role}.{name}")
+            world.late(getattr(self, name), f"scenario.sensors.{role}.{name}")
             for name in ("delay", "longest_dropout")
         )
         return Sensing(self.gap_error, self.speed_error, self.ahead_error, late, longest)

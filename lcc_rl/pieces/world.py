@@ -11,6 +11,7 @@ from lcc_rl.errors import require
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.settings import Settings, values
 
+MOST_LATE = 1000  # steps that a sensor, an actuator or a driver may be late; each is kept
 # Views that a role with sensors has from them, and the entries of the role that hold them.
 SENSED = {
     "self.gap": "sensed_gap",
@@ -65,6 +66,16 @@ class World:
             f"{what} must be a multiple of the time step, {self.time_step:g} s, got {seconds:g} s",
         )
         return round(count)
+
+    def late(self, seconds: float, what: str) -> int:
+        """Return a delay in steps.
+
+        Raises:
+            ConfigError: if it is no number of steps, or above :data:`MOST_LATE`.
+        """
+        most = MOST_LATE * self.time_step
+        require(seconds < 1.001 * most, f"{what} must be at most {most:g} s, got {seconds:g} s")
+        return self.steps(seconds, what)
 
     def sensed(self, role: str, names: Sequence[str]) -> list[str]:
         """Return names of views of a role, those that its sensors measure as measured."""

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from lcc_rl.errors import require
 from lcc_rl.results import headline
-from lcc_rl.results.cells import signed
+from lcc_rl.results.cells import markdown_row, signed
 from lcc_rl.results.headline import Shown, saved
 from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.names import in_words
@@ -138,16 +138,16 @@ def as_markdown(documents: Mapping[str, Mapping[str, Any]]) -> str:
             for row in sorted(rows, key=lambda x: sources.index(x["source"]))
         ]
         lines = [HEAD, ["---"] * len(HEAD), *lines]
-        text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        text = "\n".join(map(markdown_row, lines))
         parts.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
     return "\n".join(parts)
 
 
 def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
-    """Check that the rows of a task and source share data and settings, and differ in name.
+    """Check that the rows of a task and source share data, settings and limits, not a name.
 
     Raises:
-        ConfigError: naming the file, the row, and what differs.
+        ConfigError: naming the file, the row, and what differs, or contradicts itself.
     """
     first: dict[tuple[str, str], Row] = {}
     files: dict[tuple[str, str, str], str] = {}
@@ -161,12 +161,31 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
                 f"{other} and {file} both score {document['name']} in {place[0]} behind "
                 f"{place[1]}: remove one, or give it another name",
             )
+            check_row(row, f"{file}: {place[0]} behind {place[1]}")
+            same = ({name: x["bound"] for name, x in one["limits"].items()} for one in (row, known))
+            require(len({str(x) for x in same}) == 1, f"{file}: {place[0]}: it has other limits")
             for key in ("data", "settings"):
                 require(
                     row[key] == known[key],
                     f"{file}: {place[0]} behind {place[1]} was measured with other "
                     f"{key} ({row[key][:8]}, not {known[key][:8]})",
                 )
+
+
+def check_row(row: Row, where: str) -> None:
+    """Check that what a row says agrees with its own numbers; ``where`` names it.
+
+    Raises:
+        ConfigError: saying what does not.
+    """
+    value, low, high = (row[key] for key in SHARE)
+    inside = value is None or low is None or low <= value <= high
+    require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
+    wrong = broken(row)
+    require(
+        row["kept"] is (not wrong),
+        f"{where}: kept is {row['kept']}, but limits are not kept: {', '.join(wrong) or 'none'}",
+    )
 
 
 def _sample(row: Row) -> str:

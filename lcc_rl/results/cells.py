@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +53,18 @@ def as_markdown(frame: pd.DataFrame) -> str:
     shown = columns(frame)
     rows = [[column.heading for column in shown], ["---"] * len(shown)]
     rows += map(list, zip(*(column.cells for column in shown), strict=True))
-    return "\n".join("| " + " | ".join(row).replace("|e_v|", "abs e_v") + " |" for row in rows)
+    return "\n".join(markdown_row(row) for row in rows)
+
+
+def markdown_row(cells: Iterable[str]) -> str:
+    """Return a row of a Markdown table, whatever its cells hold.
+
+    Examples:
+        >>> print(markdown_row(["a|b", "1"]))
+        | a\\|b | 1 |
+    """
+    escaped = (" ".join(cell.split()).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"
 
 
 def as_latex(frame: pd.DataFrame) -> str:

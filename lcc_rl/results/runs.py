@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_plain, as_text
 from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
@@ -31,8 +32,13 @@ def save_config(cfg: BaseConfig, folder: Path) -> None:
         temporary.write_text(as_text(cfg))
 
 
-def check_folder(cfg: BaseConfig, folder: Path) -> None:
+def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     """Refuse to write into a folder that holds results, or a stopped run, of other settings.
+
+    Args:
+        cfg: the settings.
+        folder: the folder.
+        *but: settings and sections that may differ.
 
     Raises:
         ResultsError: naming what is there and the settings that differ.
@@ -44,12 +50,30 @@ def check_folder(cfg: BaseConfig, folder: Path) -> None:
     if not kept:
         return
     keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
+    keys = [key for key in keys if not any(f"{key}.".startswith(f"{x}.") for x in but)]
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
         raise ResultsError(
             f"{folder} already holds {kept[0]} of other settings ({names}); choose another "
             "hydra.run.dir, or remove the folder"
         )
+
+
+def resumed_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
+    """Read the configuration of a run that is to be resumed; arguments as below.
+
+    Raises:
+        ResultsError: naming a file that the run reads and that has changed since it began.
+    """
+    cfg = load_config(folder, trust)
+    now = inputs_of(as_plain(cfg))
+    for section, known in cfg.inputs.items():
+        for file in differing(known, now.get(section, {})):
+            raise ResultsError(
+                f"{folder}: {file} ({section}) is not what it was when the run began; put it back, "
+                "or begin a new run"
+            )
+    return cfg
 
 
 def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:

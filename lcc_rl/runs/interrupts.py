@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -34,11 +33,6 @@ def end_quietly() -> None:
         # A shell may have started this process in the background with SIGINT ignored.
         if signal.getsignal(kind) is not signal.SIG_IGN:
             signal.signal(kind, _end)
-
-
-def is_command() -> bool:
-    """Whether ``python -m`` is importing this package."""
-    return sys.argv[:1] == ["-m"] and threading.current_thread() is threading.main_thread()
 
 
 @contextmanager

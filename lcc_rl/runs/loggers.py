@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
+from math import isfinite
+from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import yaml
+
+from lcc_rl.config import NOT_IDENTITY, config_hash
 from lcc_rl.errors import ConfigError, how_to_install
+from lcc_rl.results.runs import CONFIG, flatten, read_settings
 from lcc_rl.settings import Settings
 
-if TYPE_CHECKING:  # loading it looks for the packages of all loggers
-    from torchrl.record.loggers import Logger
-
 Row = Mapping[str, float]
+MARK = "lcc_rl.id"
+NOT_MLFLOW = re.compile(r"[^\w\-. :/]")  # signs that names of its parameters may not have
 
 
 class Silent:
@@ -27,7 +32,11 @@ class Silent:
 
 
 class RowLogger(Settings):
-    """Logs every training row with one of TorchRL's loggers, under the run folder's name."""
+    """Logs settings, training rows and the result of a run by TensorBoard, wandb or MLflow.
+
+    The run has the name of its folder. Its id is a hash of the folder's place and the settings, by
+    which a resumed run is the same one. Measures of the evaluation are named ``result/…``.
+    """
 
     WRITES = ("where",)  # settings that name a place to write
 
@@ -39,51 +48,66 @@ class RowLogger(Settings):
     @contextmanager
     def opened(self, folder: Path) -> Iterator[Callable[[Row], None]]:
         """Yield a function that logs a row at its iteration."""
+        with self._run(folder) as send:
+            yield lambda row: send(_numbers(row), step=int(row["iteration"]))
+
+    def log_result(self, folder: Path, row: Mapping[str, Any]) -> None:
+        """Log the numbers of what an evaluation measured."""
+        with self._run(folder) as send:
+            send({f"result/{name}": value for name, value in _numbers(row).items()})
+
+    @contextmanager
+    def _run(self, folder: Path) -> Iterator[Callable[..., Any]]:
+        """Yield what logs numbers by their names, at a step if it is given one."""
+        where, name = self.where or str(folder / "logs"), folder.resolve().name
+        stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
+        settings = {key: value for key, value in stored.items() if key not in NOT_IDENTITY}
+        run_id = config_hash([str(folder.resolve()), settings])
         try:
-            logger = self._make(folder)
+            if self.kind == "tensorboard":
+                from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+                logger = TensorboardLogger(exp_name=name, log_dir=where)
+                logger.experiment.add_text("settings", f"```\n{yaml.safe_dump(settings)}```")
+                send, close = logger.log_metrics, logger.experiment.close
+            elif self.kind == "wandb":
+                from torchrl.record.loggers.wandb import WandbLogger
+
+                place = {"save_dir": where, "project": self.project, "offline": self.offline}
+                wandb = WandbLogger(exp_name=name, id=run_id, log_env_packages=False, **place)
+                wandb.log_hparams(settings)
+                send, close = wandb.log_metrics, wandb.experiment.finish
+            else:
+                address = self.where or f"sqlite:///{folder.resolve() / 'mlflow.db'}"
+                send, close = _of_mlflow(address, self.project, name, run_id, settings)
         except ImportError as error:
             raise ConfigError(
                 f"logger={self.kind} is not installed: {how_to_install(self.kind)} ({error})"
             ) from error
         try:
-            yield partial(_send, logger)
+            yield send
         finally:
-            _close(logger, self.kind)
-
-    def _make(self, folder: Path) -> Logger:
-        where = self.where or str(folder / "logs")
-        if self.kind == "tensorboard":
-            from torchrl.record.loggers.tensorboard import TensorboardLogger
-
-            return TensorboardLogger(exp_name=folder.name, log_dir=where)
-        if self.kind == "wandb":
-            from torchrl.record.loggers.wandb import WandbLogger
-
-            Path(where).mkdir(parents=True, exist_ok=True)
-            return WandbLogger(
-                exp_name=folder.name,
-                offline=self.offline,
-                save_dir=where,
-                project=self.project,
-                log_env_packages=False,
-            )
-        from torchrl.record.loggers.mlflow import MLFlowLogger
-
-        address = self.where or f"sqlite:///{folder.resolve() / 'mlflow.db'}"
-        return MLFlowLogger(exp_name=self.project, tracking_uri=address)
+            close()
 
 
-def _send(logger: Logger, row: Row) -> None:
-    values: dict[str, Any] = {name: float(value) for name, value in row.items()}
-    logger.log_metrics(values, step=int(row["iteration"]))
+def _of_mlflow(
+    address: str, project: str, name: str, run_id: str, settings: Mapping[str, Any]
+) -> tuple[Callable[..., Any], Callable[[], Any]]:
+    """Start or resume a run of MLflow, which chooses ids itself; return what logs and ends it."""
+    import mlflow
 
-
-def _close(logger: Logger, kind: str) -> None:
-    if kind == "mlflow":
-        import mlflow
-
-        mlflow.end_run()
-    elif kind == "wandb":
-        logger.experiment.finish()
+    mlflow.set_tracking_uri(address)
+    experiment = mlflow.set_experiment(project).experiment_id
+    chosen = f"tags.`{MARK}` = '{run_id}'"
+    for run in mlflow.search_runs([experiment], chosen, output_format="list"):
+        mlflow.start_run(run.info.run_id)
+        break
     else:
-        logger.experiment.close()
+        mlflow.start_run(run_name=name, tags={MARK: run_id})
+        values = {NOT_MLFLOW.sub("_", key)[:250]: str(x)[:500] for key, x in flatten(settings)}
+        mlflow.log_params(values)
+    return mlflow.log_metrics, mlflow.end_run
+
+
+def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
+    return {key: float(x) for key, x in row.items() if isinstance(x, Real) and isfinite(x)}

@@ -106,7 +106,7 @@ def unbroken_output() -> Iterator[None]:
     Raises:
         OSError: at the end, if output could not be written although somebody reads it.
     """
-    own = {}
+    own, end = {}, None
     with ExitStack() as stack:
         _open_closed()
         for name, redirect in (("output", redirect_stdout), ("error", redirect_stderr)):
@@ -116,12 +116,18 @@ def unbroken_output() -> Iterator[None]:
                 stack.enter_context(redirect(cast(Any, unbroken)))
         try:
             yield
+        except SystemExit as stop:  # as a command ends that returns its code
+            if stop.code:
+                raise
+            end = stop
         finally:
             for stream in (sys.stdout, sys.stderr):
                 stream.flush()
     for name, stream in own.items():
         if stream.failure is not None:
             raise OSError(stream.failure.errno, stream.failure.strerror, name)
+    if end is not None:
+        raise end
 
 
 def _open_closed() -> None:

@@ -93,7 +93,7 @@ def _mark(root: DictConfig) -> str:
     settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
     typed = [str(item) for item in root.hydra.overrides.task]
     try:
-        return identity(parsed(settings, root.hydra.job.config_name, typed, True))[:8]
+        return identity(parsed(settings, root.hydra.job.config_name, typed, True), "inputs")[:8]
     except LccError:
         return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8]
 

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config import NOT_IDENTITY, identity, load
+from lcc_rl.config import NOT_IDENTITY, identity, load, with_inputs
 from lcc_rl.config.schemas import StudyConfig, as_plain
 from lcc_rl.errors import Interrupted, require, unknown_name
 from lcc_rl.io.atomic import atomic_path
@@ -107,7 +107,7 @@ def differences(run: Run, wanted: StudyConfig, accept: Sequence[str] = ()) -> li
     return [
         f"{key}: {found.get(key)} → {asked.get(key)}"
         for key in differing(found, asked)
-        if not any(key == item or key.startswith(f"{item}.") for item in ignored)
+        if not any(f"{key}.".removeprefix("inputs.").startswith(f"{x}.") for x in ignored)
     ]
 
 
@@ -127,7 +127,7 @@ def up_to_date(cfg: StudyConfig, folder: Path, policies: Sequence[Path] = ()) ->
         return False
     done = load_config(folder)
     newest = max(((path / "policy.pt").stat().st_mtime for path in policies), default=0.0)
-    return identity(done) == identity(cfg) and table.stat().st_mtime >= newest
+    return identity(done) == identity(with_inputs(cfg)) and table.stat().st_mtime >= newest
 
 
 def run_all(runs: Sequence[Run], jobs: int, accept: Sequence[str] = ()) -> list[Outcome]:

@@ -9,9 +9,11 @@ from helpers import compose, make_agent
 
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.commands import evaluation, training
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants, idm_acceleration
 from lcc_rl.functional.rules import linear_acc
 from lcc_rl.pieces import Observation
+from lcc_rl.pieces.controllers import Controller
 
 SCALES = {"ahead": {"speed": 0.1}, "self": {"speed": 0.1, "relative_speed": 0.5, "gap": 0.1}}
 
@@ -35,6 +37,23 @@ def test_the_rules_are_those_of_the_equations(state) -> None:
     assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
     acc = linear_acc(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
     assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
+
+
+class Scaled(Controller):
+    """An own controller of a policy's actions, whose scale has a name of its own."""
+
+    scale: float = 1.0
+    reads = ("automated.action",)
+
+    def command(self, action: torch.Tensor) -> torch.Tensor:
+        return action * self.scale
+
+
+def test_a_rule_whose_actions_have_an_unknown_scale_is_refused() -> None:
+    cfg = tiny("train", "variant=alcc", "agent=analytic", "agent.policy=idm", agent=False)
+    cfg.scenario.controllers["automated"] = {"_target_": f"{__name__}.Scaled", "scale": 2.0}
+    with pytest.raises(ConfigError, match="needs to know the acceleration of action 1"):
+        make_agent(cfg)
 
 
 @pytest.mark.parametrize("kind", ["idm", "acc"])

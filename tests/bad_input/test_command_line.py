@@ -233,12 +233,16 @@ def test_the_second_process_in_a_folder_touches_nothing(tmp_path, entry, monkeyp
 
 # -- output that goes nowhere --------------------------------------------------------------------
 
+FULL = "lcc_rl: error: .*No space left on device: 'standard output'\n"
 OUTPUTS = [
     ("status run | true", 0, ""),
     ("-h | true", 0, ""),
     ("--version >&-", 0, ""),
     ("status run >&- 2>&- <&-", 0, ""),
-    ("--version >/dev/full", 2, "lcc_rl: error: .*No space left on device: 'standard output'\n"),
+    ("--version >/dev/full", 2, FULL),
+    ("status run >/dev/full", 2, FULL),
+    ("table run >/dev/full", 2, FULL),
+    ("table run --all --format csv >/dev/full", 2, FULL),
     ("trian 2>/dev/full", 2, ""),
 ]
 

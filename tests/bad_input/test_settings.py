@@ -69,6 +69,10 @@ WRONG = {
     f"training.environments={HUGE} training.episodes={HUGE}": "training.environments=.* needs",
     f"agent.buffer_size={HUGE}": "agent.buffer_size=.* needs about .* PiB",
     "scenario.string='automated human*100000000'": "10000 vehicles",
+    "+faults=sensors scenario.sensors.automated.delay=1e9": "sensors.automated.delay must be at mo",
+    "+faults=sensors scenario.sensors.automated.longest_dropout=200": "dropout must be at most 100",
+    "+faults=actuation scenario.actuators.automated.delay=1e9": "delay must be at most 100 s",
+    "drivers.reaction_delay=0.25 drivers=i80_energy": "delay of drivers must be a multiple",
     f"data.platoons={HUGE}": r"platoons × vehicles = \d+.* needs about",
 }
 # Options without effect on the variant, and why.
@@ -79,6 +83,8 @@ IGNORED = {
     "variant=idm training.episodes=20": "variant idm learns nothing",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
+    "variant=idm scenario.string=automated controller@scenario.controllers.automated=acc "
+    "drivers=highway": "no human driver in scenario.string=automated",
     "sweep=mine": "names the folder of a sweep, -m",
     "evaluation.full_length=true": "unused with evaluation.rows=episodes",
 }
@@ -106,6 +112,12 @@ def test_a_bad_setting_is_one_line_before_the_data_are_read(tmp_path, typed) -> 
 def test_options_without_effect_are_refused(typed) -> None:
     with pytest.raises(ConfigError, match=rf"has no effect: .*({IGNORED[typed]})"):
         load("train", typed.split())
+
+
+@pytest.mark.parametrize("controller", ["calibrated", "ovm", "fvdm", "gipps", "human", "handover"])
+def test_drivers_have_an_effect_on_whatever_drives_as_they_do(controller) -> None:
+    words = ("variant=idm", "scenario.string=automated", f"controller@{AUTO}={controller}")
+    assert load("train", [*words, "drivers=highway"]).drivers != load("train", words).drivers
 
 
 @pytest.mark.parametrize(

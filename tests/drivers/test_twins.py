@@ -30,6 +30,7 @@ from lcc_rl.drivers.twins import (
     recorded,
     tried,
 )
+from lcc_rl.errors import DataError
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import acceleration_loss
 
@@ -162,3 +163,14 @@ def test_the_search_for_a_reaction_reports_its_progress(monkeypatch) -> None:
     seen = []
     tried(observe(episodes), known, lambda *state: seen.append(state))
     assert seen == [(13, 26, "reactions tried"), (26, 26, "reactions tried")]
+
+
+def test_drivers_that_hold_their_speeds_tell_nothing() -> None:
+    time = np.arange(300) * STEP
+    motion = {"leader_speed_mps": 15.0, "follower_speed_mps": 15.0, "gap_m": 20.0}
+    episodes = pd.DataFrame({"episode": 0, "time_s": time}).assign(**motion)
+    with pytest.raises(DataError, match=r"hold their speeds: too little .* use calibration=local"):
+        Calibrator(modes=["local"], reaction=True)(episodes)
+    report = "\n".join(Calibrator(modes=["local"])(episodes).report)
+    assert "hold their speeds: too little to tell" in report
+    assert "inf" not in report

@@ -8,12 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import content
 from pages import ROOT
 
 import lcc_rl
 from lcc_rl.commands.score import about, main, scored
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.results import board
+from lcc_rl.runs.states import Busy, claim
 
 SMALL = ("scenario.horizon=60", "evaluation.profiles=3")
 ON = ("--task", "i80-follow", "--on", "everyday", "evaluation.drivers=2", *SMALL)
@@ -95,18 +97,49 @@ def test_mistakes_are_named(words, message, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+LIMITS = {"share_ttc_unsafe": {"bound": 0.01, "value": 0.005}}
+ROW = {"task": "t", "source": "s", "data": "1", "settings": "2", "kept": True, "collisions": 0}
+ROW |= {"saving": 0.02, "saving_low": 0.01, "saving_high": 0.03, "limits": LIMITS}
+BROKEN = {"share_ttc_unsafe": {"bound": 0.01, "value": 0.02}}
+WIDER = {"share_ttc_unsafe": {"bound": 0.5, "value": 0.02}}
+
+
 @pytest.mark.parametrize(
-    ("name", "data", "words"),
+    ("name", "edited", "words"),
     [
-        ("b", "3", r"b\.json: t behind s .* other data"),
-        ("a", "1", r"a\.json and b\.json both score a"),
+        ("b", {"data": "3"}, r"b\.json: t behind s .* other data"),
+        ("a", {}, r"a\.json and b\.json both score a"),
+        (
+            "b",
+            {"saving": 0.5},
+            r"b\.json: t behind s: the saving 0\.5 is not within .* 0\.01 … 0\.03",
+        ),
+        ("b", {"limits": BROKEN}, r"b\.json: t behind s: kept is True, but .* not kept: TTC < 4 s"),
+        ("b", {"kept": False}, r"kept is False, but limits are not kept: none"),
+        ("b", {"collisions": 3}, r"kept is True, but .* 3 coll\."),
+        ("b", {"limits": WIDER}, r"b\.json: t: it has other limits"),
     ],
 )
-def test_a_table_of_scores_refuses_other_windows_and_a_name_twice(name, data, words) -> None:
-    row = {"task": "t", "source": "s", "data": "1", "settings": "2"}
-    other = {"name": name, "results": [{**row, "data": data}]}
+def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself(
+    name, edited, words
+) -> None:
+    other = {"name": name, "results": [{**ROW, **edited}]}
     with pytest.raises(ConfigError, match=words):
-        board.check_alike({"a.json": {"name": "a", "results": [row]}, "b.json": other})
+        board.check_alike({"a.json": {"name": "a", "results": [ROW]}, "b.json": other})
+
+
+def test_a_killed_score_is_played_again_and_a_finished_or_running_one_is_left_alone(
+    tmp_path,
+) -> None:
+    folder = tmp_path / "a"
+    (folder / "i80-follow" / "everyday").mkdir(parents=True)
+    with claim(folder), pytest.raises(Busy):
+        scores(folder, "idm_acc", *ON)
+    scores(folder, "idm_acc", *ON)
+    before = content(folder)
+    with pytest.raises(ResultsError, match=r"already holds .* choose another --out"):
+        scores(folder, "acc", *ON)
+    assert content(folder) == before
 
 
 def test_a_score_has_the_name_given_and_a_failed_one_says_why_in_its_folder(tmp_path) -> None:

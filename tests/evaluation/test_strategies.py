@@ -72,6 +72,24 @@ def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
     assert [one.name for one in named] == ["alcc a", "alcc 14-26-58"]
 
 
+def test_rows_are_told_apart_by_whatever_differs_but_the_seed() -> None:
+    policy = TensorDictModule(torch.nn.Linear(1, 1), ["a"], ["b"])
+    weight, cfg = "reward.terms.safety.weight", compose("alcc")
+
+    def run(seed: int, source: str, *words: str) -> Strategy:
+        return Strategy("alcc", cfg, policy, seed, source, compose("alcc", f"seed={seed}", *words))
+
+    own = [run(0, "w0", f"{weight}=0.0"), run(1, "w1", f"{weight}=5.0", "training.episodes=48")]
+    assert [one.name for one in named_apart(own)] == ["alcc w0", "alcc w1"]
+    swept = [run(s, f"sweep/{w}{s}", f"{weight}={w}") for w in (0.0, 5.0) for s in (0, 1)]
+    names = [one.name for one in named_apart(swept)]
+    assert names == ["alcc weight=0.0"] * 2 + ["alcc weight=5.0"] * 2
+    # The seeds of a training share a row, whatever folders hold them and however they were drawn.
+    seeds = [run(s, f"day{s}/run", f"evaluation.drivers={s + 2}", "table=all") for s in (0, 1)]
+    assert [one.name for one in named_apart(seeds)] == ["alcc", "alcc"]
+    assert [x.name for x in named_apart([*seeds, own[0]])] == ["alcc day0", "alcc day0", "alcc w0"]
+
+
 def test_policies_of_one_training_are_named_by_their_files_and_one_file_is_refused() -> None:
     policy = TensorDictModule(torch.nn.Linear(1, 1), ["a"], ["b"])
     shipped = Strategy("alcc", compose("alcc"), policy, 0, "pretrained/i24-mixed")

@@ -52,6 +52,14 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     table_again([str(tmp_path), "--format", "csv"])
     again = pd.read_csv(StringIO(capsys.readouterr().out))
     np.testing.assert_allclose(again["score"], run.headline["score"])
+    table_again([str(tmp_path), "--all", "--format", "csv"])
+    every = pd.read_csv(StringIO(capsys.readouterr().out))
+    np.testing.assert_allclose(every["score"], run.headline["score"])
+    limits = task_of(cfg).limits
+    assert {*limits, *(f"limit_{x}" for x in limits), "total_path_energy_kj"} <= set(every)
+    halves = [rows.assign(source=source) for source in ("a", "b")]
+    pooled = Run(tmp_path, pd.concat(halves, ignore_index=True), cfg)
+    assert pooled.table["of"].tolist() == ["a"] * len(every) + ["b"] * len(every)
     table_again([str(tmp_path), "--format", "latex"])
     latex = capsys.readouterr().out
     against = task_of(cfg).against

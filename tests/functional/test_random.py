@@ -3,7 +3,7 @@
 import torch
 from scipy import stats
 
-from lcc_rl.functional.random import normal, uniform
+from lcc_rl.functional.random import choose, normal, uniform
 
 SEEDS = torch.arange(200_000) * 7919 % 2**31
 
@@ -32,3 +32,9 @@ def test_normal_draws_are_finite_at_both_ends(monkeypatch) -> None:
     drawn = normal(torch.zeros(2, dtype=torch.int64), 0)
     assert drawn.isfinite().all()
     assert drawn.abs().min() > 5.0
+
+
+def test_an_index_is_drawn_of_any_stream() -> None:
+    seeds = torch.arange(4)
+    for stream in (0, 2**32 - 1):  # times its factor the latter leaves 64 bits
+        assert torch.equal(choose(seeds, 5, stream), choose(seeds, 5, torch.tensor(stream)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,6 +13,7 @@ from rich.table import Table
 from lcc_rl.energy import CirclesFuel, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measure
+from lcc_rl.results.cells import as_latex, as_markdown
 from lcc_rl.results.headline import show
 from lcc_rl.results.scores import Task, headline, in_full, scores
 from lcc_rl.results.string_tables import case_table
@@ -238,3 +241,11 @@ def test_a_share_is_limited_in_the_mean_and_a_column_may_be_the_score() -> None:
         found = scores(rows, task, MOTOR)
         assert found["kept"].tolist() == [True, kept]
         assert found["score"].tolist() == pytest.approx([0.5, 0.1])
+
+
+def test_signs_of_a_name_stay_in_its_cell() -> None:
+    table = pd.DataFrame({"driven by": ["a|b_c & 5 %\n#"], "energy_kj": [1.0]})
+    head, rule, row = as_markdown(table).splitlines()
+    assert [len(re.split(r"(?<!\\)\|", line)) for line in (head, rule, row)] == [4, 4, 4]
+    assert r"a\|b_c & 5 % #" in row
+    assert r"a|b\_c \& 5 \%" in as_latex(table)

@@ -31,7 +31,33 @@ from lcc_rl.runs.interrupts import SIGNALS, interruptible, stop_signal
 # SIGINT is heard again below; nohup ignores SIGHUP, for its children, too.
 SENT = [x for x in SIGNALS if x == signal.SIGINT or signal.getsignal(x) != signal.SIG_IGN]
 LONGER = ("training.episodes=240", "variant=alcc")
-IMPORTS = "import sys; sys.argv = ['-m']; import lcc_rl; print('on', flush=True); input()"
+# A command whose import of the console takes until something is typed.
+IMPORTS = """
+import runpy, sys
+class Slow:
+    def find_spec(self, name, path, target=None):
+        if name == "lcc_rl.cli.console":
+            print("on", flush=True), input()
+sys.meta_path.insert(0, Slow())
+runpy.run_module("lcc_rl", run_name="__main__", alter_sys=True)
+"""
+# A program of the user's own, which starts a process.
+MINE = """
+import signal
+import lcc_rl
+
+def handlers(_=None):
+    return [signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM)]
+"""
+PROGRAM = """
+import multiprocessing, signal
+from mine import handlers
+
+if __name__ == "__main__":
+    assert handlers() == [signal.default_int_handler, signal.SIG_DFL], handlers()
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.map(handlers, [0]) == [handlers()]
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -50,6 +76,13 @@ def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
         child.send_signal(kind)
         _, errors = child.communicate(timeout=60)
     assert (child.returncode, errors) == (130, "lcc_rl: interrupted\n")
+
+
+def test_a_program_that_imports_the_package_keeps_its_handlers(tmp_path) -> None:
+    (tmp_path / "mine").mkdir()
+    for name, text in (("__init__", MINE), ("__main__", PROGRAM)):
+        (tmp_path / "mine" / f"{name}.py").write_text(text)
+    subprocess.run([sys.executable, "-m", "mine"], cwd=tmp_path, check=True, timeout=60)
 
 
 @pytest.mark.parametrize("kind", SENT)

@@ -1,0 +1,91 @@
+"""Files that a run reads, by their content: a part of what the run is."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import lru_cache
+from glob import glob
+from os.path import expanduser
+from pathlib import Path
+from typing import Any
+
+from lcc_rl.config.nodes import TARGET, find_target, is_node, settings_at
+from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.io.settings import parse_yaml, read_text
+
+Inputs = dict[str, dict[str, str]]
+NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
+NAMES = ("compare", "policy")  # sections that name policies, controllers and classes
+FILTERED, OURS = "_filtered", "lcc_rl."
+
+
+def inputs_of(content: Mapping[str, Any]) -> Inputs:
+    """Return hashes of the files that a configuration names, as they are now.
+
+    These are what ``path`` of any node names, a file, several, a folder or a pattern; policies and
+    controllers that are compared; and of classes of the user's own their module and each setting
+    that is a file. What comes with the package has its version.
+
+    Args:
+        content: a configuration as plain containers.
+
+    Returns:
+        By section of the configuration, the first part of a setting's key, the hash of each file
+        by its path as given, of a module by its name.
+    """
+    found: Inputs = {}
+    for key, holder, value in settings_at(content):
+        section, last = key.partition(".")[0], key.rpartition(".")[2]
+        named = section in NAMES and (holder is content or holder is content[section])
+        for name in value if isinstance(value, list) else [value]:
+            if section in NOT_READ or not isinstance(name, str):
+                continue
+            with suppress(OSError, ValueError, ResultsError):  # its reader says so
+                for path in filter(Path.is_file, _files(last, named, holder, name)):
+                    stat = path.stat()
+                    digest = _digest(str(path), stat.st_size, stat.st_mtime_ns)
+                    label = path.name if path.suffix == ".py" else str(path)
+                    found.setdefault(section, {})[label] = digest
+    return found
+
+
+def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
+    """Yield the files that a setting names."""
+    path = Path(expanduser(name))
+    if last in (TARGET, "law"):
+        yield from _module(name)
+    elif named:
+        yield from compared_files(name)
+    elif last == "path" or (is_node(holder) and not str(holder[TARGET]).startswith(OURS)):
+        found = [path] if path.exists() else map(Path, sorted(glob(str(path), recursive=True)))
+        yield from sorted(path.iterdir()) if path.is_dir() else found
+
+
+def compared_files(name: str) -> Iterator[Path]:
+    """Yield a policy's file, those of a folder of runs, or what a controller is made of."""
+    path = Path(name.removesuffix(FILTERED))
+    if path.is_dir():
+        yield from sorted(path.rglob("policy.pt"))
+    elif not path.exists():
+        yield from _module(str(path))
+    else:
+        yield path
+        if path.suffix in (".yaml", ".yml"):
+            for key, holder, value in settings_at(parse_yaml(read_text(path), str(path))):
+                yield from _files(key.rpartition(".")[2], False, holder, str(value))
+
+
+def _module(target: str) -> Iterator[Path]:
+    """Yield the module of a class or function of the user's own; a notebook's has no file."""
+    if "." in target and "/" not in target and not target.startswith(OURS):
+        with suppress(ConfigError, TypeError):
+            yield Path(inspect.getfile(inspect.unwrap(find_target(target, TARGET))))
+
+
+@lru_cache(maxsize=4096)  # once in a process for each file
+def _digest(path: str, size: int, modified: int) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

@@ -1,0 +1,103 @@
+"""What the files hold that a run reads is a part of what the run is."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from commands import NO_AGENT, run_command
+
+from lcc_rl.commands.evaluation import made_by
+from lcc_rl.config import identity, load
+from lcc_rl.drivers.tables import load_drivers
+from lcc_rl.io.files import write_parquet
+
+OWN = "from lcc_rl.pieces import RewardTerm\nclass Term(RewardTerm):\n    table: str = ''\n"
+TERM = "+reward.terms.own={_target_: own_term.Term, table: t.txt}"
+# What is typed after the command, and the file that it reads.
+READ = {
+    "data=episodes data.path=pairs.csv": "pairs.csv",
+    "data=episodes data.path=[pairs.csv,more.csv]": "more.csv",
+    "data=ngsim 'data.path=days/*.csv'": "days/two.csv",
+    "drivers=calibrated drivers.path=drivers.parquet": "drivers.parquet",
+    "leader=record leader.path=cycle.csv": "cycle.csv",
+    "leader=drives leader.path=trips": "trips/one.csv",
+    "policy=run": "run/policy.pt",
+    "policy=kept.pt": "kept.pt",
+    "compare=[sweep]": "sweep/seed=1/policy.pt",
+    "compare={own: run_filtered}": "run/policy.pt",
+    "compare=[own.yaml]": "own.yaml",
+    "compare=[program.onnx]": "program.onnx",
+    "compare=[own_term.Term]": "own_term.py",
+    TERM: "t.txt",
+    f"{TERM} ": "own_term.py",
+}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch) -> Path:
+    """A folder in which commands run, and in which Python finds modules."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_term", raising=False)
+    (tmp_path / "own_term.py").write_text(OWN)
+    return tmp_path
+
+
+@pytest.mark.parametrize("typed", READ)
+def test_a_configuration_has_another_identity_once_a_file_holds_something_else(
+    place, typed
+) -> None:
+    words = [typed.strip()] if "{" in typed else typed.replace("'", "").split()
+    file = place / READ[typed]
+    before = identity(load("evaluate", words)) if file.suffix != ".py" else None
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("a") as text:
+        text.write("# one\n")
+    first = identity(load("evaluate", words))
+    assert first != before
+    os.utime(file, (1, 1))
+    assert identity(load("evaluate", words)) == first
+    with file.open("a") as text:
+        text.write("# two\n")
+    assert identity(load("evaluate", words)) != first
+
+
+def test_a_run_without_own_files_has_none(place) -> None:
+    (place / "alcc").write_text("not read")
+    cfg = load("evaluate", ["variant=alcc", "compare=[idm,pretrained/alcc]", "policy=pretrained"])
+    assert cfg.inputs == {}
+
+
+def drivers(place: Path, factor: float) -> None:
+    table = load_drivers()
+    write_parquet(table.assign(time_gap_s=factor * table["time_gap_s"]), place / "d.parquet")
+
+
+@pytest.mark.parametrize(("entry", "anew"), [("train", False), ("evaluate", True)])
+def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew) -> None:
+    drivers(place, 1.0)
+    words = [*NO_AGENT, "variant=idm", "drivers=calibrated", "drivers.path=d.parquet"]
+    words += ["evaluation.drivers=2"] + ["evaluation.baselines=[]"] * (entry == "evaluate")
+    sweep = (f"lcc_rl.cli.{entry}", "-m", *words, "seed=0", "sweep=s")
+    run_command(*sweep, cwd=place, check=True)
+    (settings,) = (place / "outputs" / entry / "s").glob("*/config.yaml")
+    run, first = settings.parent, made_by(settings.parent / "episodes.parquet")
+    assert "finished before" in run_command(*sweep, cwd=place, check=True).stdout
+    drivers(place, 1.1)
+    done = run_command(f"lcc_rl.cli.{entry}", f"resume='{run}'", cwd=place)
+    assert done.returncode == 2
+    assert "d.parquet (drivers) is not what it was when the run began" in done.stderr
+    done = run_command(*sweep, cwd=place)
+    assert "finished before" not in done.stdout
+    assert [settings] == list(run.parent.glob("*/config.yaml"))
+    assert (made_by(run / "episodes.parquet") != first) == anew == (done.returncode == 0)
+    if not anew:
+        assert "of other settings (inputs.drivers.d.parquet)" in done.stderr + done.stdout
+
+
+def test_what_a_run_reads_is_no_setting() -> None:
+    with pytest.raises(Exception, match="inputs: a run notes itself which files it reads"):
+        load("train", ["inputs={}"])
