@@ -100,8 +100,9 @@ def load_episodes(
         units: their units by key; SI for those that are not named.
 
     Returns:
-        The columns ``SCHEMA``, samples 0.1 s apart, and ``row``, the one in the file, from 0; and
-        lines on what was read. Holes divide an episode. Speeds and gaps may be negative.
+        The columns ``SCHEMA``, samples 0.1 s apart, ``row`` in the file, from 0, and ``label``, the
+        file's name of the episode; and lines on what was read. Holes divide an episode. Speeds and
+        gaps may be negative.
 
     Raises:
         DataError: naming file, row and column, if a cell is missing or no number, or rows
@@ -151,8 +152,8 @@ def _table(
         if names.get(name) is None:
             notes.append(words)
     table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
-    table, more = _even(table.assign(row=places), file, codes)
-    table = table[[*COLUMNS, "row"]].astype({**SCHEMA, "recording": str})
+    table, more = _even(table.assign(row=places, label=labels), file, codes)
+    table = table[[*COLUMNS, "row", "label"]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED)

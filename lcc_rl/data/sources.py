@@ -12,10 +12,11 @@ from typing import Literal
 import pandas as pd
 
 import lcc_rl.assets
+from lcc_rl.data.agreement import Place
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, pair_place
+from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
 from lcc_rl.data.tables import SI, Column, Names, check_map
 from lcc_rl.data.text import TEXT_TAKES, file_size
 from lcc_rl.data.trajectories import Trajectories
@@ -108,7 +109,8 @@ class EpisodesSource(Settings):
 
         def place(number: int, column: str) -> str:
             row = episodes.iloc[number]
-            where = f"recording {row['recording']}, data row {row['row'] + 1}"
+            label = row["label"] and f"episode {row['label']}, "
+            where = f"{label}recording {row['recording']}, data row {row['row'] + 1}"
             return f"{where}, column {names.get(column, column)!r}"
 
         return place
@@ -177,21 +179,7 @@ def _plausible(
 ) -> LoadedEpisodes:
     thresholds = limits or Plausible()
     kept, said = thresholds.select(episodes, source, place(episodes), remedy=remedy, units=units)
-    return LoadedEpisodes(kept, [*lines, *said, medians(kept)])
-
-
-def medians(episodes: pd.DataFrame) -> str:
-    """Return the line by which a user sees whether units are right.
-
-    Args:
-        episodes: the table in SI.
-    """
-    speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
-    behind = (gap / speed)[speed > 1.0].median()
-    return (
-        f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, "
-        f"time gap {behind:.2g} s above 1 m/s"
-    )
+    return LoadedEpisodes(kept, [*lines, *said])
 
 
 def shipped() -> list[str]:

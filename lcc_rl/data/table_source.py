@@ -10,8 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.data.agreement import LEAST_WAY, Place
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import LEAST_WAY, SMOOTHING, Place, Plausible, without_blank
+from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
@@ -45,6 +46,7 @@ MEASURED = ("time", "speed", "position")  # a row in which one is blank is left 
 UNEVEN = 0.1  # of a step, by which a time may be off the common grid
 LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
+JUMP = 10.0  # m between samples, more than driven: positions begin anew
 EXACT, ALONE = "exact duplicate (vehicle, time)", "stretch without a sample on the time grid"
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -275,6 +277,7 @@ def _check_way(
         return
     driven = (rows.speed + rows.speed.shift()) / 2 * rows.time.diff()
     ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(pd.Series(first), 0.0)
+    jumps = (ways.way - ways.driven).abs() > JUMP
     each = ways.groupby(np.cumsum(~together)).sum()
     far = each.max(axis=1) >= LEAST_WAY
     off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
@@ -289,11 +292,21 @@ def _check_way(
         found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
     ):
         if max(way, driven) >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
-            backward = "; positions must grow in the direction of travel" if way < 0 else ""
+            hint = "check data.units and data.columns of time, speed and position"
+            smooth = ways[~jumps].sum()
+            low, high = (share * smooth.driven for share in AGREE)
+            most = jumps.any() and smooth.driven > ways.driven.sum() / 2
+            if most and low <= smooth.way <= high:
+                at = _place(rows, int(np.argmax(jumps)), names, report)
+                hint = (
+                    f"positions jump {int(jumps.sum()):,} times, the first at {at}: do they begin "
+                    "anew by lane or link? Give positions along the road, or leader and gap instead"
+                )
+            elif way < 0:
+                hint = f"positions must grow in the direction of travel; {hint}"
             raise DataError(
                 f"{report.source}: by {whose} positions {who} {way:.4g} m, by {whose} speeds "
-                f"{driven:.4g} m{backward}; check data.units and data.columns of time, speed and "
-                "position"
+                f"{driven:.4g} m; {hint}"
             )
 
 
