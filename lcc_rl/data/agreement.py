@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from math import exp, log
+from math import exp, inf, log
 from typing import Any
 
 import numpy as np
@@ -44,9 +44,9 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         A row for each pair and a last one of all, which has no lag: row (the pair's first), seconds
-        (compared), leader, follower, slope (of the change of gaps over the relative way), fit
-        (share of the variance explained), motion (relative way, root mean square [m]), late [s],
-        signal (that is late), own, ahead (ways of the cars [m]) and grown (change of the gap [m]).
+        (compared), leader, follower, slope (of the gap over the relative way), fit (share of the
+        variance explained), motion (root mean square of the relative way [m]), late [s], signal
+        (that is late), ahead, own, grown (ways of leader and follower, growth of the gap [m]).
     """
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
     pair = episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy()
@@ -54,43 +54,46 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     width, every, reach = (round(seconds / FRAME) for seconds in (WINDOW, EVERY, REACH))
     whole = width + 2 * reach
     rows = np.flatnonzero(number[whole:] == number[:-whole])[::every] + reach
-    series = [episodes[name].to_numpy(np.float64) for name in SIGNALS.values()]
-    series[1:] = [np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in series[1:]]
+    gap, *speeds = (episodes[name].to_numpy(np.float64) for name in SIGNALS.values())
+    series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
 
     def total(values: Floats) -> Floats:
         sums = np.bincount(pair[rows], values, pairs)
         return np.append(sums, sums.sum())
 
-    def fit(late: Floats) -> list[Floats]:
+    def fit(late: Floats) -> tuple[Floats, Floats, Floats]:
+        """Coefficients and slope, what they leave unexplained, and sums of products."""
         shifted = [rows + k for k in late.astype(int)]
-        gap, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
-        terms = ahead, -own, np.ones(len(rows)), gap
-        sums = np.moveaxis(np.array([[total(x * y) for x in terms] for y in terms]), -1, 0)
-        found = np.linalg.solve(sums[:, :3, :3] + RIDGE, sums[:, :3, 3:])
-        rest = sums[:, 3, 3] - (found * sums[:, :3, 3:]).sum(axis=(1, 2))
-        motion = total((ahead - own) ** 2)
-        slope = total(gap * (ahead - own)) / motion
-        ways = (total(way) * EVERY / WINDOW for way in (own, ahead, gap))
-        rest /= sums[:, 3, 3] - sums[:, 2, 3] ** 2 / count
-        rest = np.nan_to_num(rest, nan=9.0)
-        return [*found[:, :2, 0].T, slope, rest, np.sqrt(motion / count), *ways]
+        grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
+        terms = ahead, -own, np.ones(len(rows)), grown
+        sums = np.array([[total(x * y) for x in terms] for y in terms])
+        known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
+        found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
+        rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
+        rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
+        found[2] = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
+        return found, np.maximum(np.nan_to_num(rest, nan=9.0), FLOOR), sums
 
-    count = total(np.ones(len(rows)))
     shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
     lags = np.stack([np.zeros(3), *shifts])
     with np.errstate(all="ignore"):  # of pairs without a change
-        fits = np.array([fit(late) for late in lags])
-    rest = np.maximum(fits[:, 3], FLOOR)
+        sums = fit(lags[0])[2]
+        found, rest = (np.array(x) for x in zip(*(fit(late)[:2] for late in lags), strict=True))
     best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
     best[-1] = 0
-    names = ["leader", "follower", "slope", "rest", "motion", "own", "ahead", "grown"]
-    found = pd.DataFrame(fits[best, :, np.arange(pairs + 1)], columns=names)
-    return found.assign(
-        fit=1 - found["rest"],
+    each, count = np.arange(pairs + 1), sums[2, 2]
+    ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY / WINDOW
+    names = ["leader", "follower", "slope"]
+    return pd.DataFrame(found[best, :, each], columns=names).assign(
         row=np.append(np.unique(pair, return_index=True)[1], 0),
         seconds=EVERY * count,
+        fit=1 - rest[best, each],
+        motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
         late=FRAME * lags[best].sum(axis=1),
         signal=np.array([*SIGNALS])[np.abs(lags[best]).argmax(axis=1)],
+        ahead=ahead,
+        own=own,
+        grown=grown,
     )
 
 
@@ -98,11 +101,11 @@ def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, 
     """Yield what may be wrong with a pair.
 
     Args:
-        units: units that the gap and the speeds were read in, by their keys in ``data.units``.
+        units: units that gap and speeds were read in, by their keys in ``data.units``.
 
     Yields:
-        Whether it doubts a unit that nobody declared, the signal at fault, a question to the user,
-        and the coefficients of leader and follower (:func:`agreement`).
+        Whether it doubts SI, the signal at fault, a question to the user, and the coefficients of
+        leader and follower in :func:`agreement`.
     """
     yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
     for signal, subject, quantity, keys, leader, follower in (
@@ -113,14 +116,12 @@ def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, 
     ):
         named = [key for key in keys if key in units][: 1 if signal == "gap" else None]
         declared = units.get([*named, quantity][0], SI[quantity])
-        if len({units[key] for key in named}) > 1:
-            continue
         for unit, size in (UNITS["length"] if signal == "gap" else SPEEDS).items():
-            factor, default = size / UNITS[quantity][declared], declared == SI[quantity]
-            option = " ".join(f"data.units.{key}={unit}" for key in named)
-            words = f"{subject} in {unit}{option and f' ({option})'}?"
-            if factor != 1.0:
-                yield default, signal, words, factor**leader, factor**follower
+            factor = size / UNITS[quantity][declared]
+            if factor != 1.0 and len({units[key] for key in named}) < 2:
+                option = " ".join(f"data.units.{key}={unit}" for key in named)
+                words = f"{subject} in {unit}{option and f' ({option})'}?"
+                yield declared == SI[quantity], signal, words, factor**leader, factor**follower
 
 
 def check_pairs(
@@ -139,17 +140,15 @@ def check_pairs(
         max_mismatch, max_lag: see :class:`lcc_rl.data.plausible.Plausible`.
 
     Returns:
-        A line on lags, that of medians, and whether any pair agrees.
+        Lines on lags, on gaps that fit nothing and on medians; and whether any pair agrees.
 
     Raises:
-        DataError: naming the pair and what fits, if one is exchanged, in another unit or late, or
-            if none agrees.
+        DataError: naming the pair and what fits, if one is not as its speeds say, or none is.
     """
     found = agreement(episodes)
     pairs, every = found.iloc[:-1], found.iloc[-1]
-    moves = found["motion"] >= LEAST_MOTION
+    moves, span = found["motion"] >= LEAST_MOTION, (1 / max_mismatch, max_mismatch)
     told = moves[:-1] & (pairs["seconds"] >= LEAST_S) & (pairs["fit"] >= LEAST_FIT)
-    span = 1 / max_mismatch, max_mismatch
     right = told & pairs["leader"].between(*span) & pairs["follower"].between(*span)
 
     def said(cases: list[tuple[int, str, str]]) -> Iterator[str]:
@@ -158,21 +157,25 @@ def check_pairs(
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
             yield f"{place(row, SIGNALS[signal])}: {words}{count}"
 
-    late = pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].sort_values("late")
-    unclear = pairs.assign(told=told)[~right].to_dict("records")
-    wrong = [fit for pair in unclear for fit in _mistaken(pair, units, max_mismatch)]
-    for line in (*said(wrong), *said(_late(late[late["late"].abs() > max_lag]))):
+    wrong = [
+        fit
+        for pair in pairs.assign(told=told)[~right].to_dict("records")
+        for fit in _mistaken(pair, units, max_mismatch)
+    ]
+    late, too_late = [], []
+    for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
+        lag = f"{abs(pair['late']):.1f} s {'late' if pair['late'] > 0 else 'early'}"
+        late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
+        too_late += late[-1:] * (abs(pair["late"]) > max_lag)
+    for line in (*said(wrong), *said(too_late)):
         raise DataError(line)
-    if (
-        every["seconds"] >= LEAST_ALL_S
-        and moves.iloc[-1]
-        and not (right.any() or span[0] <= every["slope"] <= span[1])
-    ):
-        raise DataError(
-            f"gaps change by {every['slope']:.2f} m where the speeds of leader and follower say "
-            "1 m, and no unit fits: are they gaps to the leader, and do speeds need smoothing?"
-        )
-    lines = [Concern(line) for line in said(_late(late))]
+    odd = pairs[told & ~pairs["slope"].between(*span)].to_dict("records")
+    words = "the gap changes by {:.2f} m where both speeds say 1 m, and no unit fits"
+    strange = [(pair["row"], "gap", words.format(pair["slope"])) for pair in odd]
+    enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
+    if enough and not (right.any() or span[0] <= every["slope"] <= span[1]):
+        raise DataError(f"{words.format(every['slope'])}: are speeds to be smoothed?")
+    lines = [Concern(line) for line in (*said(late), *said(strange))]
     return [*lines, medians(episodes, pairs[told], len(pairs))], bool(right.any())
 
 
@@ -189,8 +192,8 @@ def _mistaken(
     ways = (max(way, 1.0) for way in (ahead, ahead - pair["grown"]))
     apart = min((log(max(own, 1.0) / way) for way in ways), key=abs)
     words = (
-        f"the gap changes by {a:.2f} m where the leader drives 1 m, and by {-b:.2f} m where the "
-        "follower does (expected: 1 and -1)"
+        f"where the leader drives 1 m, the gap changes by {a:.2f} m, where the follower does, by "
+        f"{-b:.2f} m"
     )
     if not pair["told"]:
         words = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
@@ -201,7 +204,7 @@ def _mistaken(
         ratios = [a / leader, b / follower]
         if not pair["told"]:
             ratios = [exp(apart) * follower / leader] if leader != follower else [0.0]
-        off = max(abs(log(ratio)) for ratio in ratios) if min(ratios) > 0 else np.inf
+        off = max(abs(log(ratio)) for ratio in ratios) if min(ratios) > 0 else inf
         near.append((off, default, signal, question))
     least = min(near)[0]
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
@@ -209,35 +212,21 @@ def _mistaken(
     return [(pair["row"], near[0][2], f"{words}; {questions}")] if least < log(NEAR) else []
 
 
-def _late(pairs: pd.DataFrame) -> list[tuple[int, str, str]]:
-    """Row, signal and words on the signal of each pair that is late."""
-    found = []
-    for pair in pairs.to_dict("records"):
-        what = "gap" if pair["signal"] == "gap" else f"{pair['signal']}'s speed"
-        lag = f"{abs(pair['late']):.1f} s {'late' if pair['late'] > 0 else 'early'}"
-        found.append((pair["row"], pair["signal"], f"the {what} is {lag}; are clocks apart?"))
-    return found
-
-
 def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int) -> str:
-    """Return the line by which a user sees whether units are right.
+    """Return the line by which a user sees whether units and clocks are right.
 
-    Args:
-        episodes: the table in SI.
-        told: rows of :func:`agreement` of pairs from which something can be told.
-        pairs: how many there are.
+    ``told`` are the rows of :func:`agreement` that tell something, of so many ``pairs``.
     """
     speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
     behind = (gap / speed)[speed > 1.0].median()
+    slope, late = told["slope"].median(), told["late"].median()
+    known = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(told):,} pair(s)"
+    few = f"too little to tell slope and lag of {pairs - len(told):,}"
+    said = [known] * (len(told) > 0) + [few] * (len(told) < pairs)
     line = (
         f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
-        f"{behind:.2g} s above 1 m/s; "
+        f"{behind:.2g} s above 1 m/s; {', '.join(said)}"
     )
-    if len(told):
-        slope, late = told["slope"].median(), told["late"].median()
-        line += f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s, of {len(told):,} pair(s)"
-    if len(told) < pairs:
-        line += f"{', ' * bool(len(told))}too little to tell slope and lag of {pairs - len(told):,}"
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
     if len(stand) < LEAST_STANDING or stand.median() < FAR:
         return line

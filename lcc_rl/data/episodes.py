@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lcc_rl.data.plausible import without_blank
 from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, whole_numbers
 from lcc_rl.data.text import stem
-from lcc_rl.data.trajectories import FRAME, HOLE, divided, step_of, stretches
+from lcc_rl.data.trajectories import FRAME, divided, is_hole, resampled, step_of, stretches
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet
 
@@ -186,12 +186,7 @@ def _even(
         raise file.fault(0, "episode" if "episode" in file.names else "time", ONE_ROW)
     steps = np.diff(table["time_s"], prepend=0.0)
     step = step_of(steps[same], str(file.path))
-    short = same & (steps <= step / 2 + 1e-9)
-    if short.any():
-        at = int(np.argmax(short))
-        words = f"is {steps[at]:g} s after the sample before it; expected steps of about {step:g} s"
-        raise file.fault(int(table["row"].iloc[at]), "time", words)
-    hole = same & (steps > HOLE * step)
+    hole = is_hole(np.where(same, steps, 0.0), step)
     alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
     count = table["episode"].nunique()
     if hole.any() or alone.any():
@@ -205,7 +200,7 @@ def _even(
     if off <= REGULAR * FRAME:
         return table, notes
     parts = [_resampled(part) for _, part in table.groupby("episode", sort=False)]
-    notes.append(f"samples {step:g} s apart were interpolated to {FRAME:g} s")
+    notes.append(resampled(inner, step))
     kept = [part for part in parts if len(part) > 1]
     if not kept:
         raise DataError(f"{file.path}: no episode lasts {FRAME:g} s; is the time in another unit?")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from glob import glob, has_magic
+from glob import escape, glob, has_magic
 from os.path import expanduser
 from pathlib import Path
 from typing import Literal
@@ -190,7 +190,7 @@ def shipped() -> list[str]:
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
-    The name of a shipped recording is that file.
+    The name of a shipped recording is that file. A folder stands for its files.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
@@ -199,6 +199,8 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
         found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
+        if Path(name).is_dir():
+            name = str(Path(escape(name)) / "*")
         if has_magic(name) and not Path(name).exists():
             found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())
             if not found:

@@ -18,11 +18,13 @@ from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
     FRAME,
-    HOLE,
+    UNEVEN,
     ReadReport,
     Trajectories,
     find_leaders,
+    is_hole,
     listed,
+    resampled,
     step_of,
     stretches,
 )
@@ -43,7 +45,6 @@ FIELDS = (
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
 NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
 MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
-UNEVEN = 0.1  # of a step, by which a time may be off the common grid
 LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
 JUMP = 10.0  # m between samples, more than driven: positions begin anew
@@ -193,6 +194,8 @@ def _vehicles(
     ahead = np.full(len(vehicle), "") if leader is None else leader
     numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
     if numbers is None or numbers.min() <= 0 or leaders is None:
+        if numbers is not None and leaders is not None:  # "0.0" of a column with blanks is "0"
+            vehicle, ahead = numbers.astype(str), np.where(ahead == "", "", leaders.astype(str))
         names, codes = np.unique(vehicle, return_inverse=True)
         report.names = dict(enumerate(names.tolist(), 1))
         shown = listed(names.tolist())
@@ -229,14 +232,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     if not together.any():
         raise DataError(f"{files}: no vehicle has two samples; expected trajectories")
     step = step_of(steps[together], report.source)
-    short = together & (steps < step / 2)
-    if short.any():
-        row = int(np.argmax(short))
-        raise DataError(
-            f"{_place(rows, row, names, report)} is {steps[row]:g} s after the sample before it of "
-            f"vehicle {_name(rows, row, report)}; expected steps of about {step:g} s"
-        )
-    first = ~together | (steps > HOLE * step)
+    first = ~together | is_hole(np.where(together, steps, 0.0), step)
     _check_way(rows, together, first, names, report)
     report.vehicles, report.segments = int((~together).sum()), int(first.sum())
     origin = rows.groupby("recording").time.min().reindex(range(len(names))).to_numpy()
@@ -250,7 +246,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     frame, segment = np.rint(frames).astype(np.int64), np.cumsum(first) - 1
     if abs(step - FRAME) > UNEVEN * FRAME or np.abs(frames - frame).max() > UNEVEN:
         rows, frame, segment = _interpolated(rows, frames, segment, report)
-        report.notes.append(f"samples {step:g} s apart were interpolated to {FRAME:g} s")
+        report.notes.append(resampled(steps[~first], step))
     report.rows_kept = len(rows)
     counts = np.bincount(rows.recording, minlength=len(names))
     report.recordings = dict(zip(names, map(int, counts), strict=True))

@@ -106,7 +106,7 @@ def test_consistent_gaps_have_the_slope_one_and_no_lag_also_with_a_biased_speedo
     assert (found["fit"] > 0.99 - bias / 10).all()
     assert (found["late"] == 0.0).all()
     if not bias:
-        assert judged(wavy())[-1].endswith("speeds 1.00, lag 0.0 s, of 3 pair(s)")
+        assert judged(wavy())[-1].endswith("speeds 1.00, lag 0.0 s of 3 pair(s)")
     short = judged(wavy(12.0))
     assert short[-1].endswith("1 m/s; too little to tell slope and lag of 3")
 
@@ -114,27 +114,27 @@ def test_consistent_gaps_have_the_slope_one_and_no_lag_also_with_a_biased_speedo
 BOTH, LEADER, FOLLOWER = [*SPEEDS], SPEEDS[:1], SPEEDS[1:]
 # Columns, their factor, units of the file, and what is said of the pair.
 MISTAKES = [
-    (BOTH, 3.6, {}, r"by 0\.28 m where .* by -0\.28 m .*; are both speeds in km/h\?"),
-    (BOTH, 2.23694, {}, r"by 0\.45 m .*; are both speeds in mph\?"),
-    (BOTH, 1.94384, {}, r"by 0\.51 m .*; are both speeds in kn\?"),
-    (BOTH, 3.28084, {}, r"by 0\.30 m .*; are both speeds in ft/s\?"),
-    (["gap_m"], 3.28084, {}, r"by 3\.28 m .*; is the gap in ft\?"),
-    (["gap_m"], 100.0, {}, r"by 100\.00 m .*; is the gap in cm\?"),
+    (BOTH, 3.6, {}, r"by 0\.28 m, where .* by -0\.28 m; are both speeds in km/h\?"),
+    (BOTH, 2.23694, {}, r"by 0\.45 m, .*; are both speeds in mph\?"),
+    (BOTH, 1.94384, {}, r"by 0\.51 m, .*; are both speeds in kn\?"),
+    (BOTH, 3.28084, {}, r"by 0\.30 m, .*; are both speeds in ft/s\?"),
+    (["gap_m"], 3.28084, {}, r"by 3\.28 m, .*; is the gap in ft\?"),
+    (["gap_m"], 100.0, {}, r"by 100\.00 m, .*; is the gap in cm\?"),
     (["gap_m"], 3.28084, {"gap": "m"}, r"; is the gap in ft \(data\.units\.gap=ft\)\?"),
     (["gap_m"], 0.3048, {"gap": "ft"}, r"is the gap in m \(.*\)\? or are both speeds in ft/s\?"),
     (BOTH, 1 / 3.6, {"speed": "km/h"}, r"are both speeds in m/s \(data\.units\.speed=m/s\)\?"),
-    (["gap_m"], -1.0, {}, r"by -1\.00 m where .* by 1\.00 m .*; are leader and follower exchanged"),
+    (["gap_m"], -1.0, {}, r"by -1\.00 m, where .* by 1\.00 m; are leader and follower exchanged"),
     (
         LEADER,
         2.23694,
         {},
-        r"leader_speed_mps: .* by 0\.45 m .* by -1\.00 m .*leader's speed in mph",
+        r"leader_speed_mps: .* by 0\.45 m, .* by -1\.00 m; is the leader's speed in mph",
     ),
     (
         FOLLOWER,
         3.6,
         {},
-        r"follower_speed_mps: .* by 1\.00 m .* by -0\.28 m .*follower's speed in km",
+        r"follower_speed_mps: .* by 1\.00 m, .* by -0\.28 m; is the follower's speed in km",
     ),
     (
         LEADER,
@@ -167,9 +167,9 @@ def later(table: pd.DataFrame, signal: str, seconds: float) -> pd.DataFrame:
 @pytest.mark.parametrize(
     ("signal", "words"),
     [
-        ("leader_speed_mps", "the leader's speed is"),
-        ("follower_speed_mps", "the follower's speed is"),
-        ("gap_m", "the gap is"),
+        ("leader_speed_mps", "leader"),
+        ("follower_speed_mps", "follower"),
+        ("gap_m", "gap"),
     ],
 )
 @pytest.mark.parametrize("seconds", [-2.0, -0.5, 0.2, 0.5, 1.0, 1.5])
@@ -205,7 +205,7 @@ def test_a_faulty_sensor_fits_no_unit_and_is_refused_only_where_all_are() -> Non
     noise = 20 + 5 * np.cumsum(rng.normal(size=len(table))) / 10
     one = table.assign(gap_m=table["gap_m"].where(table["episode"] > 0, noise))
     assert judged(one)[-1].endswith("of 2 pair(s), too little to tell slope and lag of 1")
-    with pytest.raises(DataError, match=r"f\.csv: gaps change by -?0\.\d\d m .* no unit fits"):
+    with pytest.raises(DataError, match=r"f\.csv: the gap changes by -?0\.\d\d m .* no unit fits"):
         judged(table.assign(gap_m=noise))
 
 

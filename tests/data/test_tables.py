@@ -212,7 +212,7 @@ def test_a_unit_declared_for_si_is_named(tmp_path, units, first) -> None:
     frame["v"] *= 3.0 / 3.6  # m/s, fast enough to tell
     frame["gap"] *= 3.0 * FOOT
     path = written(tmp_path, frame)
-    with pytest.raises(DataError, match=rf"expected: 1 and -1\); .*{first} 2 of 2 pairs"):
+    with pytest.raises(DataError, match=rf"where the leader drives 1 m, .*{first} 2 of 2 pairs"):
         TableSource(path=path, columns=BY_GAP, units=units).load()
     with pytest.raises(
         DataError, match=r"0\.0001 s apart; .* is the time in s \(data\.units\.time="
