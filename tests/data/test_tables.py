@@ -251,17 +251,6 @@ def test_one_vehicle_in_another_unit_is_named(tmp_path, columns, factors, car, w
         source.load()
 
 
-@pytest.mark.parametrize("step", [0.1, 1.0])
-def test_positions_that_begin_anew_are_no_other_unit(tmp_path, step) -> None:
-    frame = long_table(rows=400, step=step)
-    frame["x"] %= 150.0  # a link, or a ring
-    source = TableSource(path=written(tmp_path, frame), columns={**BY_GAP, "position": "x"})
-    with pytest.raises(
-        DataError, match=r"positions jump \d+ times, the first at .*data row \d+: do they begin"
-    ):
-        source.load()
-
-
 def test_one_pair_in_another_unit_is_named_as_the_file_calls_it(tmp_path) -> None:
     table = pairs(episodes=3, rows=120).rename(columns={"follower_speed_mps": "v"})
     table[["v", "leader_speed_mps"]] *= 3.6
