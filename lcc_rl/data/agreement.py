@@ -57,16 +57,13 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     gap, *speeds = (episodes[name].to_numpy(np.float64) for name in SIGNALS.values())
     series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
 
-    def total(values: Floats) -> Floats:
-        sums = np.bincount(pair[rows], values, pairs)
-        return np.append(sums, sums.sum())
-
-    def fit(late: Floats) -> tuple[Floats, Floats, Floats]:
+    def fit(late: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
         """Coefficients and slope, what they leave unexplained, and sums of products."""
-        shifted = [rows + k for k in late.astype(int)]
+        shifted, at = [rows + k for k in late.astype(int)], pair[rows]
         grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
         terms = ahead, -own, np.ones(len(rows)), grown
-        sums = np.array([[total(x * y) for x in terms] for y in terms])
+        sums = np.array([[np.bincount(at, x * y, pairs) for x in terms] for y in terms])
+        sums = np.append(sums, sums.sum(axis=-1, keepdims=True), axis=-1)  # of all
         known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
         found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
         rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
@@ -77,8 +74,10 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
     lags = np.stack([np.zeros(3), *shifts])
     with np.errstate(all="ignore"):  # of pairs without a change
-        sums = fit(lags[0])[2]
-        found, rest = (np.array(x) for x in zip(*(fit(late)[:2] for late in lags), strict=True))
+        *first, sums = fit(lags[0], rows)
+        unclear = rows[(first[1] > GAIN * FLOOR)[pair[rows]]]  # no lag could gain enough elsewhere
+        fits = [first, *(fit(late, unclear)[:2] for late in shifts if len(unclear))]
+    found, rest = (np.array(x) for x in zip(*fits, strict=True))
     best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
     best[-1] = 0
     each, count = np.arange(pairs + 1), sums[2, 2]

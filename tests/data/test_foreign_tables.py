@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from table_text import BY_GAP, long_table
+from page_files import highd
+from table_text import BY_GAP, LENGTH, long_table
 
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.table_source import TableSource
@@ -138,3 +141,61 @@ def test_a_drive_is_described_and_of_many_the_fastest(tmp_path) -> None:
     assert [line[:5] for line in lines] == ["trip6", "trip5", "trip4", "trip3", "trip2"]
     assert re.fullmatch(r"trip6: 40 s, speed 1\d\.\d m/s, at most 21 m/s", lines[0])
     assert "… and 2 slower records" in report
+
+
+def test_highd_by_its_two_conversions(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    highd(tmp_path / "01_tracks.csv")
+    page = (Path(__file__).parents[2] / "docs" / "data.md").read_text(encoding="utf-8")
+    exec(re.search(r"```python\n(import numpy as np\n.*?)```", page, flags=re.DOTALL)[1], {})
+    columns = {"vehicle": "id", "time": "frame", "speed": "speed", "position": "front"}
+    columns |= {"lane": "laneId", "leader": "precedingId", "length": "width"}
+    settings = {"path": "highd.csv", "units": {"time": "frames/25"}}
+    found = TableSource(**settings, columns=columns).load().episodes
+    assert found["follower_id"].unique().tolist() == [12, 13, 14, 22, 23, 24]
+    widths = pd.read_csv("highd.csv").groupby("id")["width"].first()
+    first = found.groupby("follower_id").first()
+    # The fronts are 20 m and a length of 5 m apart; here cars are 4 to 6 m long.
+    expected = 20.0 + LENGTH - widths[first["leader_id"]].to_numpy()
+    np.testing.assert_allclose(first["gap_m"], expected, atol=1e-3)
+    right = pd.read_csv("highd.csv").query("laneId == 4")
+    right.assign(speed=right["speed"]).to_csv("right.csv", index=False)
+    corner = TableSource(
+        **settings | {"path": "right.csv"}, columns=columns | {"position": "x"}
+    ).load()
+    off = corner.episodes.groupby("follower_id").first()["gap_m"] - first["gap_m"].loc[22:]
+    lengths = widths[first["leader_id"].loc[22:]].to_numpy()
+    np.testing.assert_allclose(off, widths[off.index] - lengths, atol=1e-3)
+    assert corner.report[-1].endswith("slope of gaps over speeds 1.00, lag 0.0 s of 3 pair(s)")
+
+
+def test_a_table_that_sumo_writes_is_read_at_once(tmp_path) -> None:
+    pytest.importorskip("sumo")
+    nodes = "".join(
+        f'<node id="{name}" x="{x}" y="0"/>' for name, x in (("a", 0), ("b", 900), ("c", 1800))
+    )
+    edges = "".join(
+        f'<edge id="{first}{last}" from="{first}" to="{last}" numLanes="1" speed="{speed}"/>'
+        for first, last, speed in (("a", "b", 25), ("b", "c", 12))
+    )
+    routes = (
+        '<vType id="car" carFollowModel="IDM" length="4.5"/><route id="r" edges="ab bc"/>'
+        '<flow id="f" type="car" route="r" begin="0" end="30" number="6" departSpeed="max"/>'
+    )
+    for name, text in (("nodes", nodes), ("edges", edges), ("routes", routes)):
+        (tmp_path / f"{name}.xml").write_text(f"<{name}>{text}</{name}>")
+    for words in (
+        "netconvert -n nodes.xml -e edges.xml -o net.xml",
+        "sumo -n net.xml -r routes.xml --end 80 --step-length 0.1 --fcd-output fcd.csv "
+        "--fcd-output.max-leader-distance 150",
+    ):
+        command = [shutil.which(words.split()[0]), *words.split()[1:]]
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    columns = {"vehicle": "vehicle_id", "time": "timestep_time", "speed": "vehicle_speed"}
+    columns |= {"leader": "vehicle_leaderID", "gap": "vehicle_leaderGap"}
+    path = str(tmp_path / "fcd.csv")
+    loaded = TableSource(path=path, columns=columns).load()
+    assert loaded.episodes["episode"].nunique() >= 3
+    assert "slope of gaps over speeds 1.0" in loaded.report[-1]
+    with pytest.raises(DataError, match=r"positions jump .* do they begin anew by lane or link"):
+        TableSource(path=path, columns=columns | {"position": "vehicle_pos"}).load()
