@@ -73,6 +73,45 @@ def table(path: Path) -> None:
     frame.assign(v=3.6 * frame["v"]).to_csv(path, sep=";", index=False)
 
 
+def fcd(path: Path) -> None:
+    """Vehicles as SUMO writes them."""
+    names = {"id": "vehicle_id", "t": "timestep_time", "v": "vehicle_speed"}
+    names |= {"ahead": "vehicle_leaderID", "gap": "vehicle_leaderGap"}
+    frame = long_table(cars=4, rows=600).rename(columns=names)
+    frame["vehicle_leaderID"] = frame["vehicle_leaderID"].map("f.{}".format)
+    frame.assign(vehicle_id=frame["vehicle_id"].map("f.{}".format)).to_csv(
+        path, sep=";", index=False
+    )
+
+
+def highd(path: Path) -> None:
+    """Both directions of a road as highD has them: upper left corners of boxes, 25 Hz."""
+    parts = []
+    for direction, sign in ((1, -1), (2, 1)):
+        frame = long_table(cars=4, rows=1500, step=0.04)
+        width = 4.0 + frame["id"] % 3
+        corner = -frame["x"] if sign < 0 else frame["x"] - width
+        part = {"frame": (frame["t"] / 0.04).round().astype(int), "x": corner, "width": width}
+        part |= {"id": frame["id"] + 10 * direction, "xVelocity": sign * frame["v"]}
+        ahead = (frame["ahead"] + 10 * direction).where(frame["ahead"] > 0, 0)
+        parts.append(pd.DataFrame({**part, "precedingId": ahead, "laneId": 2 * direction}))
+    tracks = pd.concat(parts, ignore_index=True)
+    tracks.to_csv(path, index=False)
+    meta = pd.DataFrame({"id": tracks["id"].unique()})
+    meta["drivingDirection"] = meta["id"] // 10
+    meta.to_csv(path.with_name("01_tracksMeta.csv"), index=False)
+
+
+def trips(path: Path) -> None:
+    """A folder of twelve drives, each in a file."""
+    path.mkdir()
+    record(path / "long.csv")
+    frame = pd.read_csv(path / "long.csv")
+    for number in range(12):
+        frame.assign(v=frame["v"] / 3.6).to_csv(path / f"trip{number}.csv", index=False)
+    (path / "long.csv").unlink()
+
+
 def openacc(path: Path) -> None:
     """Three native files of OpenACC."""
     for number in range(3):
@@ -124,6 +163,9 @@ FILES: dict[str, Callable[[Path], None]] = {
     "other.parquet": drives,
     "i24_leaders.parquet": drives,
     "record.csv": record,
+    "fcd.csv": fcd,
+    "01_tracks.csv": highd,
+    "my_trips": trips,
     "drivers.parquet": drivers,
 }
 # What stands where a page leaves a path out, by the setting or the group that it belongs to.

@@ -16,7 +16,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.plausible import Place, pair_place
+from lcc_rl.data.agreement import Place
+from lcc_rl.data.plausible import pair_place
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import LARGEST, ConfigError, DataError
 from lcc_rl.settings import NonNegative, Number, Settings

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lcc_rl.data.plausible import without_blank
 from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, whole_numbers
 from lcc_rl.data.text import stem
-from lcc_rl.data.trajectories import FRAME, HOLE, divided, step_of, stretches
+from lcc_rl.data.trajectories import FRAME, divided, is_hole, resampled, step_of, stretches
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet
 
@@ -100,8 +100,9 @@ def load_episodes(
         units: their units by key; SI for those that are not named.
 
     Returns:
-        The columns ``SCHEMA``, samples 0.1 s apart, and ``row``, the one in the file, from 0; and
-        lines on what was read. Holes divide an episode. Speeds and gaps may be negative.
+        The columns ``SCHEMA``, samples 0.1 s apart, ``row`` in the file, from 0, and ``label``, the
+        file's name of the episode; and lines on what was read. Holes divide an episode. Speeds and
+        gaps may be negative.
 
     Raises:
         DataError: naming file, row and column, if a cell is missing or no number, or rows
@@ -151,8 +152,8 @@ def _table(
         if names.get(name) is None:
             notes.append(words)
     table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
-    table, more = _even(table.assign(row=places), file, codes)
-    table = table[[*COLUMNS, "row"]].astype({**SCHEMA, "recording": str})
+    table, more = _even(table.assign(row=places, label=labels), file, codes)
+    table = table[[*COLUMNS, "row", "label"]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED)
@@ -185,12 +186,7 @@ def _even(
         raise file.fault(0, "episode" if "episode" in file.names else "time", ONE_ROW)
     steps = np.diff(table["time_s"], prepend=0.0)
     step = step_of(steps[same], str(file.path))
-    short = same & (steps <= step / 2 + 1e-9)
-    if short.any():
-        at = int(np.argmax(short))
-        words = f"is {steps[at]:g} s after the sample before it; expected steps of about {step:g} s"
-        raise file.fault(int(table["row"].iloc[at]), "time", words)
-    hole = same & (steps > HOLE * step)
+    hole = is_hole(np.where(same, steps, 0.0), step)
     alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
     count = table["episode"].nunique()
     if hole.any() or alone.any():
@@ -204,7 +200,7 @@ def _even(
     if off <= REGULAR * FRAME:
         return table, notes
     parts = [_resampled(part) for _, part in table.groupby("episode", sort=False)]
-    notes.append(f"samples {step:g} s apart were interpolated to {FRAME:g} s")
+    notes.append(resampled(inner, step))
     kept = [part for part in parts if len(part) > 1]
     if not kept:
         raise DataError(f"{file.path}: no episode lasts {FRAME:g} s; is the time in another unit?")

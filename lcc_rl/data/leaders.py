@@ -18,13 +18,14 @@ from lcc_rl.data.profiles import (
     EvaluationShare,
     Profiles,
     at_step,
+    described,
     from_records,
     join,
     leader_profiles,
     nothing,
     resample,
 )
-from lcc_rl.data.sources import NgsimSource
+from lcc_rl.data.sources import NgsimSource, find_files
 from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
@@ -165,9 +166,7 @@ class RecordLeaders(Settings):
                 raise ConfigError(f"leader.{group} names no record")
         windows = varying(join(parts["held_out"]).windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
-            f"{group}: {part.names[0]}, {int(part.lengths[0]) * time_step:g} s"
-            for group, profiles in parts.items()
-            for part in profiles
+            f"{group}: {line}" for group, x in parts.items() for line in described(join(x))
         ]
         leaders = Leaders(join(parts["training"]), windows, report=tuple(report))
         if followers is None:
@@ -231,7 +230,8 @@ class TrajectoryLeaders(Settings):
         profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
         windows = varying(held_out.windows(horizon), self.least_variation)
-        report = (*loaded.report, *apart(training, held_out, loaded.vehicles))
+        lines = described(profiles), apart(training, held_out, loaded.vehicles)
+        report = (*loaded.report, *lines[0], *lines[1])
         return Leaders(training, windows, report=report)
 
 
@@ -268,8 +268,8 @@ class DriveLeaders(Settings):
     every file. The end of a single record is held out.
     """
 
-    # A .csv or .parquet file, of drives also several or a pattern. A native OpenACC file is the
-    # drive of its first car, named after the file.
+    # A .csv or .parquet file, of drives also several, a pattern or a folder. A file without the
+    # column of drives is one, named after the file; a native OpenACC file that of its first car.
     path: str | Sequence[str]
     # What its columns are called: ``drive``, the name of the record, null for a table that holds
     # one record; ``time``, even in a record; ``speed``.
@@ -301,6 +301,11 @@ class DriveLeaders(Settings):
         profiles, report = read_drives(
             self.path, self.columns, time_step, self.plausible, self.units
         )
+        drives = {*profiles.recordings}
+        each = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
+        if each and self.together and len({*map(self._family, drives)}) == 1:
+            report.append(f"each file is a trip: leader.together={self.together} is in all names")
+            self.together = None
         divide = self._by_time if single else self._by_name
         training, held_out = nothing(time_step), profiles
         if self.evaluation_share < 1:
@@ -314,7 +319,7 @@ class DriveLeaders(Settings):
         by = "at the end" if single else f"by name (a hash, {self.evaluation_share:.2g} each)"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
-        return Leaders(training, windows, report=(*report, line))
+        return Leaders(training, windows, report=(*report, *described(profiles), line))
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; once more for tuning."""

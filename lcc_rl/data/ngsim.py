@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Column, checked, lacking
-from lcc_rl.data.text import cells_of, is_text, parse_text, reading, single_spaces, unended
+from lcc_rl.data.text import cells_of, check_text, parse_text, reading, single_spaces, unended
 from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
 from lcc_rl.errors import Concern, DataError
 
@@ -165,8 +165,7 @@ class _Block:
 
     def __init__(self, path: str, lines: bytes, first_line: int, layout: _Layout) -> None:
         self.path, self.lines, self.first_line = path, lines, first_line
-        if not is_text(lines):
-            raise DataError(f"{path}: a line from {first_line} on is not text; expected UTF-8")
+        check_text(lines, f"{path}: a line from {first_line} on")
         names = {str(place): name for name, place in layout.places.items()}
         table = parse_text(lines, layout.width, layout.separator, [*names], path, first_line)
         self.table = table.rename_columns([names[place] for place in table.column_names])
@@ -257,8 +256,7 @@ def _line_chunks(name: str) -> Iterator[bytes]:
 def _detect(name: str, lines: bytes) -> tuple[_Layout, bytes]:
     """Detect the layout from the first line; returns it and the lines that hold rows."""
     first, _, rest = lines.partition(b"\n")
-    if not is_text(first):
-        raise DataError(f"{name}: is not UTF-8 text; expected an NGSIM table, plain or .gz")
+    check_text(first, f"{name}:")
     separator = "," if b"," in first else " "
     cells = cells_of(single_spaces(first) if separator == " " else first, separator)
     if cells and re.match(r"\s*-?[0-9.,]+([eE][+-]?[0-9]+)?\s*$", cells[0]):

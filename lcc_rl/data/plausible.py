@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from math import log
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -11,24 +10,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.tables import SI, SPEEDS, UNITS, TableFile
+from lcc_rl.data.agreement import OF_PAIRS, Place, check_pairs
+from lcc_rl.data.tables import TableFile
 from lcc_rl.data.trajectories import divided, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
 SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
-WINDOW = 5.0  # over which changes are compared: noise of single samples averages out [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
-# Fewer windows, of all records or of one, or smaller changes [m], say nothing.
-LEAST_WINDOWS, LEAST_OF_ONE, LEAST_CHANGE = 20, 10, 0.5
-NEAR = 1.15  # factor by which gap_rate may be off 1 in the right units: noise of speeds lowers it
-STANDING = 0.5  # both cars stand below it [m/s]
-LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
-ROLES = ("follower", "leader")
-OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 Mask = NDArray[np.bool_]
-Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
 # Column, words with a place for the number found, these numbers, the threshold's name and which
 # samples are outside of it; both are ``[rows]``.
 Fault = tuple[str, str, NDArray[np.float64], str, Mask]
@@ -37,9 +28,8 @@ Fault = tuple[str, str, NDArray[np.float64], str, Mask]
 class Plausible(Settings):
     """Thresholds of recorded motion; records are cut where a sample is outside of one.
 
-    The data are refused where more than ``max_share`` of the samples would be left out, where gaps
-    change by a factor of more than ``max_mismatch``, either way, of what the speeds say
-    (:func:`gap_rate`), or where a car drives by that factor farther than its leader.
+    The data are refused where more than ``max_share`` of the samples would be left out, or where
+    gap and speeds of a pair contradict each other (:func:`lcc_rl.data.agreement.check_pairs`).
     """
 
     max_speed: Positive = 70.0  # beyond it, a column is rather in km/h or ft/s [m/s]
@@ -52,13 +42,12 @@ class Plausible(Settings):
     max_gap: Positive = 500.0
     max_step: Positive = 10.0  # time between consecutive samples [s]
     max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1  # of the samples
+    # Factor by which the change of a gap may differ from what the speeds say.
     max_mismatch: Annotated[float, Field(ge=1.0, le=LARGEST)] = 1.5
+    max_lag: NonNegative = 1.0  # of a gap or a speed behind the others [s]
     # Share of the time with a change of speed above 4 m/s in a second; of recorded traffic it is
     # 0.0001 or less, of the same speeds in km/h about 0.06.
     max_hard: Annotated[float, Field(ge=0.0, le=1.0)] = 0.005
-    # Median gap of a follower that stands behind a leader that stands [m]; of recorded traffic it
-    # is 3 to 8, of the same in feet without data.units 10 to 26.
-    max_standing_gap: Positive = 15.0
 
     def select(
         self,
@@ -78,7 +67,7 @@ class Plausible(Settings):
             place: describes a row to the user, by its number and the column at fault.
             setting: where the configuration has these thresholds.
             remedy: what else a user may do about accelerations.
-            units: see :func:`fitting`.
+            units: see :func:`lcc_rl.data.agreement.mistakes`.
 
         Returns:
             What is left, numbered by :func:`lcc_rl.data.trajectories.divided`, its speeds at least
@@ -110,12 +99,19 @@ class Plausible(Settings):
             lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
 
-        def first_of(episode: int, column: str) -> str:
-            return place(int(kept["row"][kept["episode"] == episode].iloc[0]), column)
+        def in_table(row: int, column: str) -> str:
+            return place(int(kept["row"].iloc[row]), column)
 
-        self._check_each(kept, source, first_of, setting, units or {})
-        more_lines += self._check_units(kept, source, setting, units or {})
-        return kept.drop(columns="row"), [*lines, *more_lines]
+        agree, last = False, list[str]()
+        if set(kept.columns) >= OF_PAIRS:
+            limits = {"max_mismatch": self.max_mismatch, "max_lag": self.max_lag}
+            try:
+                last, agree = check_pairs(kept, in_table, units or {}, **limits)
+            except DataError as error:
+                shown = ", ".join(f"{setting}.{name}={limits[name]:g}" for name in limits)
+                raise DataError(f"{source}: {error} ({shown})") from error
+        more_lines += self._check_hard(kept, source, setting, agree)
+        return kept.drop(columns=["row", "label"], errors="ignore"), [*lines, *more_lines, *last]
 
     def _outside(
         self,
@@ -144,69 +140,16 @@ class Plausible(Settings):
             wrong |= new
         return wrong, lines, advice
 
-    def _check_each(
-        self,
-        kept: pd.DataFrame,
-        source: str,
-        place: Place,
-        setting: str,
-        units: Mapping[str, str],
-    ) -> None:
-        """Check that no car is in other units than the others: it hides in means over all.
-
-        ``place`` describes the first sample of an episode, by the episode's number.
-        """
-        if not set(kept.columns) >= OF_PAIRS:
-            return
-        limit = f"{setting}.max_mismatch={self.max_mismatch:g}"
-        declared = next((units[key] for key in units if key.endswith("speed")), SI["speed"])
-        ways = farther(kept)
-        if (ways["factor"] > self.max_mismatch).any():
-            worst = int(np.argmax(ways["factor"]))
-            own, ahead, factor = ways.iloc[worst]
-            follower, leader = (place(ways.index[worst], f"{role}_speed_mps") for role in ROLES)
-            raise DataError(
-                f"{source}: {follower}: by its speed, this vehicle drives {own:.4g} m, its leader "
-                f"({leader}) {ahead:.4g} m, {limit}; is one of these speeds in "
-                f"{_nearest(factor, declared)}?"
-            )
-        rates = gap_rates(kept)
-        off = (rates > self.max_mismatch) | (rates < 1 / self.max_mismatch)
-        gap = {key: unit for key, unit in units.items() if key == "gap"}
-        for number, rate in zip(rates.index[off], rates[off], strict=True):
-            # Gaps of a faulty sensor fit no unit; where all are off, the check of all says so.
-            if (advice := fitting(rate, gap)) and not off.all():
-                raise DataError(
-                    f"{source}: {place(number, 'gap_m')} changes by {rate:.2f} m where the speeds "
-                    f"of leader and follower say 1 m, {limit}; for this vehicle alone, {advice}"
-                )
-
-    def _check_units(
-        self, kept: pd.DataFrame, source: str, setting: str, units: Mapping[str, str]
-    ) -> list[str]:
+    def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, agree: bool) -> list[str]:
+        """Check that speeds change as cars' do; ``agree``: the gaps change as they say."""
         hard = hard_share(kept)
         if hard is not None and hard > self.max_hard:
+            hint = "are they in km/h, mph or ft/s, or do they need smoothing?"
+            if agree:
+                hint = "gaps agree: are both in another unit (feet), or are such starts real?"
             raise DataError(
                 f"{source}: speeds change by more than {HARD:g} m/s within a second for "
-                f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; are they "
-                "in km/h, mph or ft/s, or do they need smoothing?"
-            )
-        rate = gap_rate(kept)
-        if rate is not None and not 1 / self.max_mismatch <= rate <= self.max_mismatch:
-            advice = fitting(rate, units) or (
-                "are speeds in km/h, mph or ft/s, gaps in feet, times not in s, or leader and "
-                "follower exchanged?"
-            )
-            raise DataError(
-                f"{source}: gaps change by {rate:.2f} m where the speeds of leader and follower "
-                f"say 1 m, {setting}.max_mismatch={self.max_mismatch:g}; {advice}"
-            )
-        stand = standing_gap(kept)
-        if stand is not None and stand > self.max_standing_gap:
-            raise DataError(
-                f"{source}: cars stand {stand:.3g} m behind a car that stands (median), "
-                f"{setting}.max_standing_gap={self.max_standing_gap:g}; are gaps, and speeds, in "
-                "feet (data.units)?"
+                f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; {hint}"
             )
         few = f"too few samples to tell whether speeds are in m/s: fewer than {LEAST_SAMPLES}"
         return [f"{few} a second apart"] if hard is None else []
@@ -287,14 +230,6 @@ def hard_share(table: pd.DataFrame) -> float | None:
     return float(max(shares, default=0.0))
 
 
-def standing_gap(table: pd.DataFrame) -> float | None:
-    """Return the median gap while leader and follower stand [m]; None with too few samples."""
-    if not set(table.columns) >= OF_PAIRS:
-        return None
-    stand = table[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING
-    return float(table["gap_m"][stand].median()) if stand.sum() >= LEAST_SAMPLES else None
-
-
 def usual_step(table: pd.DataFrame) -> float:
     """Return the median time between samples of a record [s]; 0 if none has two."""
     step = table["time_s"].diff()[table["episode"].diff() == 0].median()
@@ -323,112 +258,3 @@ def pair_place(episodes: pd.DataFrame) -> Place:
         return f"{where}, {entry['time_s']:g} s, column {column!r}"
 
     return place
-
-
-def gap_rate(episodes: pd.DataFrame) -> float | None:
-    """Return by how much gaps change where the speeds say 1.
-
-    The slope of a least-squares fit of changes of the gap over windows of 5 s on the integral of
-    the relative speed, both without their mean over the episode, which a calibration error of
-    speedometers may be.
-
-    Args:
-        episodes: rows of an episode lie together, in order of time: episode, time_s, gap_m,
-            follower_speed_mps, leader_speed_mps.
-
-    Returns:
-        The slope, 1 for consistent data; None where a column is missing or too little changes.
-    """
-    if not set(episodes.columns) >= OF_PAIRS or episodes.empty:
-        return None
-    slope = _slopes(_changes(episodes).assign(episode=0), LEAST_WINDOWS)
-    return None if slope.empty else float(slope.iloc[0])
-
-
-def gap_rates(episodes: pd.DataFrame) -> pd.Series:
-    """Return :func:`gap_rate` of each episode in which enough changes, by its number."""
-    return _slopes(_changes(episodes), LEAST_OF_ONE)
-
-
-def _slopes(changes: pd.DataFrame, least: int) -> pd.Series:
-    products = changes.assign(both=changes["said"] * changes["seen"], said=changes["said"] ** 2)
-    sums = products.groupby("episode")[["both", "said"]].sum()
-    count = products.groupby("episode").size()
-    enough = (count >= least) & (sums["said"] >= count * LEAST_CHANGE**2)
-    return (sums["both"] / sums["said"])[enough]
-
-
-def _changes(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Change of the gap in windows of 5 s as seen, and as the speeds say; see :func:`gap_rate`."""
-    episode = episodes["episode"].to_numpy()
-    first = np.append(True, episode[1:] != episode[:-1])
-    time, gap = (episodes[name].to_numpy(np.float64) for name in ("time_s", "gap_m"))
-    way = np.cumsum(_steps(episodes, "leader") - _steps(episodes, "follower"))
-    number = np.cumsum(first) - 1
-    window = np.floor((time - time[first][number]) / WINDOW)
-    marks = np.flatnonzero(first | (np.diff(window, prepend=0.0) != 0))
-    same = np.diff(number[marks]) == 0
-    found = {"said": np.diff(way[marks])[same], "seen": np.diff(gap[marks])[same]}
-    changes = pd.DataFrame(found).assign(episode=episode[marks][1:][same])
-    return changes - changes.groupby("episode").transform("mean").assign(episode=0)
-
-
-def _steps(episodes: pd.DataFrame, role: str) -> NDArray[np.float64]:
-    """Way from the sample before, by the speed of leader or follower; 0 as an episode begins."""
-    speed = episodes[f"{role}_speed_mps"].astype(np.float64)
-    way = (speed + speed.shift()) / 2 * episodes["time_s"].diff()
-    return way.where(episodes["episode"].diff() == 0, 0.0).to_numpy()
-
-
-def farther(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Return how much farther one car of a pair drives than the other, by their speeds.
-
-    The way of the leader may be less by what the gap grows. Whichever is nearer to the follower's
-    counts, since a gap may jump to another car.
-
-    Args:
-        episodes: see :func:`gap_rate`.
-
-    Returns:
-        By episodes of at least 50 m: the ways of follower and leader, own and ahead [m], and the
-        factor, at least 1.
-    """
-    own, ahead = (_steps(episodes, role) for role in ROLES)
-    ways = pd.DataFrame({"own": own, "ahead": ahead}).groupby(episodes["episode"].to_numpy()).sum()
-    gap = episodes.groupby("episode")["gap_m"]
-    others = ways["ahead"], ways["ahead"] - (gap.last() - gap.first())
-    factors = [np.exp(np.abs(np.log(ways["own"].clip(1.0) / way.clip(1.0)))) for way in others]
-    ways["factor"] = np.minimum(*factors)
-    return ways[ways[["own", "ahead"]].max(axis=1) >= LEAST_WAY]
-
-
-def _nearest(factor: float, declared: str) -> str:
-    """Return the unit of speeds that is larger or smaller than another by a factor, if one is."""
-    sizes = {**SPEEDS, declared: UNITS["speed"][declared]}
-    off = {unit: abs(log(size / sizes[declared])) for unit, size in sizes.items()}
-    near = min(off, key=lambda unit: abs(off[unit] - log(factor)))
-    return near if abs(off[near] - log(factor)) < log(NEAR) else f"another unit than {declared}"
-
-
-def fitting(rate: float, units: Mapping[str, str]) -> str:
-    """Return in words which other units bring :func:`gap_rate` near 1; empty where none does.
-
-    A unit that the user declared is doubted before SI, the default; then the nearest comes first.
-
-    Args:
-        rate: as measured.
-        units: units that the gap and the speeds were read in, by their keys in ``data.units``.
-    """
-    found = []
-    for quantity, end, sense in (("length", "gap", 1), ("speed", "speed", -1)):
-        keys = [key for key in units if key.endswith(end)]
-        if len({units[key] for key in keys}) != 1:
-            continue
-        declared = units[keys[0]]
-        for size, unit in {size: unit for unit, size in reversed(UNITS[quantity].items())}.items():
-            there = rate * (size / UNITS[quantity][declared]) ** sense
-            if 1 / NEAR < there < NEAR:
-                option = " ".join(f"data.units.{key}={unit}" for key in keys)
-                words = f"with {option} it would be {there:.2f} m"
-                found.append((declared == SI[quantity], abs(log(there)), words))
-    return ", ".join(words for *_, words in sorted(found))

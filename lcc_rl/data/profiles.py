@@ -16,6 +16,7 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 
 EvaluationShare = Annotated[float, Field(gt=0.0, le=1.0)]
+MANY = 5  # records, each of which has a line
 NONE_LEFT = "no speed profile left: at least one leader's record is needed"
 
 
@@ -204,6 +205,18 @@ def join(parts: Sequence[Profiles]) -> Profiles:
         reach=None if all(part.reach is None for part in parts) else torch.cat(known),
         followers=torch.cat(behind) if len(behind) == len(parts) else None,
     )
+
+
+def described(profiles: Profiles) -> list[str]:
+    """Return duration, mean and greatest speed of each record in lines; of many, of the fastest."""
+    lines = []
+    for index, name in enumerate(profiles.names):
+        x = profiles.record(index)
+        seconds, most = (len(x) - 1) * profiles.time_step, float(x.max())
+        line = f"{name}: {seconds:,.0f} s, speed {float(x.mean()):.3g} m/s, at most {most:.3g} m/s"
+        lines.append((-most, line))
+    more = [f"… and {len(lines) - MANY:,} slower records"] if len(lines) > MANY else []
+    return [line for _, line in (sorted(lines)[:MANY] if more else lines)] + more
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:

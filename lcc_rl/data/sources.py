@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from glob import glob, has_magic
+from glob import escape, glob, has_magic
 from os.path import expanduser
 from pathlib import Path
 from typing import Literal
@@ -12,10 +12,11 @@ from typing import Literal
 import pandas as pd
 
 import lcc_rl.assets
+from lcc_rl.data.agreement import Place
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Place, Plausible, pair_place
+from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
 from lcc_rl.data.tables import SI, Column, Names, check_map
 from lcc_rl.data.text import TEXT_TAKES, file_size
 from lcc_rl.data.trajectories import Trajectories
@@ -108,7 +109,8 @@ class EpisodesSource(Settings):
 
         def place(number: int, column: str) -> str:
             row = episodes.iloc[number]
-            where = f"recording {row['recording']}, data row {row['row'] + 1}"
+            label = row["label"] and f"episode {row['label']}, "
+            where = f"{label}recording {row['recording']}, data row {row['row'] + 1}"
             return f"{where}, column {names.get(column, column)!r}"
 
         return place
@@ -177,21 +179,7 @@ def _plausible(
 ) -> LoadedEpisodes:
     thresholds = limits or Plausible()
     kept, said = thresholds.select(episodes, source, place(episodes), remedy=remedy, units=units)
-    return LoadedEpisodes(kept, [*lines, *said, medians(kept)])
-
-
-def medians(episodes: pd.DataFrame) -> str:
-    """Return the line by which a user sees whether units are right.
-
-    Args:
-        episodes: the table in SI.
-    """
-    speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
-    behind = (gap / speed)[speed > 1.0].median()
-    return (
-        f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, "
-        f"time gap {behind:.2g} s above 1 m/s"
-    )
+    return LoadedEpisodes(kept, [*lines, *said])
 
 
 def shipped() -> list[str]:
@@ -202,7 +190,7 @@ def shipped() -> list[str]:
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
-    The name of a shipped recording is that file.
+    The name of a shipped recording is that file. A folder stands for its files.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
@@ -211,6 +199,8 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
         found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
+        if Path(name).is_dir():
+            name = str(Path(escape(name)) / "*")
         if has_magic(name) and not Path(name).exists():
             found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())
             if not found:

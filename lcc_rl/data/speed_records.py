@@ -16,7 +16,7 @@ from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import find_files
 from lcc_rl.data.tables import Column, TableFile
 from lcc_rl.data.text import stem
-from lcc_rl.data.trajectories import HOLE, divided
+from lcc_rl.data.trajectories import divided, is_hole
 from lcc_rl.errors import DataError
 
 CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
@@ -73,7 +73,9 @@ def read_drives(
     plausible: Plausible | None = None,
     units: Mapping[str, str] | None = None,
 ) -> tuple[Profiles, list[str]]:
-    """Read the speed records of a table.
+    """Read the speed records of tables.
+
+    A table without the column ``drive`` is one drive, unless another name is asked for.
 
     Args:
         path, columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
@@ -120,7 +122,7 @@ def _read(
     ):
         if wrong.any():
             raise table.fault(int(samples["row"][wrong].min()), "time", words)
-    samples, said = _divided(samples, (divide & (step > HOLE * usual)).to_numpy(), table)
+    samples, said = _divided(samples, divide & is_hole(step.to_numpy(), usual.to_numpy()), table)
 
     def place(number: int, column: str) -> str:
         own = {TIME: table.names["time"], SPEED: table.names["speed"]}[column]
@@ -148,6 +150,8 @@ def _samples(
         fields = FIELDS if columns["drive"] is None else NATIVE
         native = {TIME: "Time", SPEED: "Speed1"}
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
+    elif columns["drive"] == COLUMNS["drive"] and columns["drive"] not in table.header:
+        columns = {**columns, "drive": None}  # each file is one
     read = table.read(fields, columns, units, "leader.columns")
     samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"]})
     samples["drive"] = samples["name"] = read.get("drive", stem(table.path))

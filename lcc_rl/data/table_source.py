@@ -10,18 +10,21 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.data.agreement import LEAST_WAY, Place
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import LEAST_WAY, SMOOTHING, Place, Plausible, without_blank
+from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
     FRAME,
-    HOLE,
+    UNEVEN,
     ReadReport,
     Trajectories,
     find_leaders,
+    is_hole,
     listed,
+    resampled,
     step_of,
     stretches,
 )
@@ -42,9 +45,9 @@ FIELDS = (
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
 NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
 MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
-UNEVEN = 0.1  # of a step, by which a time may be off the common grid
 LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
+JUMP = 10.0  # m between samples, more than driven: positions begin anew
 EXACT, ALONE = "exact duplicate (vehicle, time)", "stretch without a sample on the time grid"
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -191,6 +194,8 @@ def _vehicles(
     ahead = np.full(len(vehicle), "") if leader is None else leader
     numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
     if numbers is None or numbers.min() <= 0 or leaders is None:
+        if numbers is not None and leaders is not None:  # "0.0" of a column with blanks is "0"
+            vehicle, ahead = numbers.astype(str), np.where(ahead == "", "", leaders.astype(str))
         names, codes = np.unique(vehicle, return_inverse=True)
         report.names = dict(enumerate(names.tolist(), 1))
         shown = listed(names.tolist())
@@ -227,14 +232,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     if not together.any():
         raise DataError(f"{files}: no vehicle has two samples; expected trajectories")
     step = step_of(steps[together], report.source)
-    short = together & (steps < step / 2)
-    if short.any():
-        row = int(np.argmax(short))
-        raise DataError(
-            f"{_place(rows, row, names, report)} is {steps[row]:g} s after the sample before it of "
-            f"vehicle {_name(rows, row, report)}; expected steps of about {step:g} s"
-        )
-    first = ~together | (steps > HOLE * step)
+    first = ~together | is_hole(np.where(together, steps, 0.0), step)
     _check_way(rows, together, first, names, report)
     report.vehicles, report.segments = int((~together).sum()), int(first.sum())
     origin = rows.groupby("recording").time.min().reindex(range(len(names))).to_numpy()
@@ -248,7 +246,7 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     frame, segment = np.rint(frames).astype(np.int64), np.cumsum(first) - 1
     if abs(step - FRAME) > UNEVEN * FRAME or np.abs(frames - frame).max() > UNEVEN:
         rows, frame, segment = _interpolated(rows, frames, segment, report)
-        report.notes.append(f"samples {step:g} s apart were interpolated to {FRAME:g} s")
+        report.notes.append(resampled(steps[~first], step))
     report.rows_kept = len(rows)
     counts = np.bincount(rows.recording, minlength=len(names))
     report.recordings = dict(zip(names, map(int, counts), strict=True))
@@ -275,6 +273,7 @@ def _check_way(
         return
     driven = (rows.speed + rows.speed.shift()) / 2 * rows.time.diff()
     ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(pd.Series(first), 0.0)
+    jumps = (ways.way - ways.driven).abs() > JUMP
     each = ways.groupby(np.cumsum(~together)).sum()
     far = each.max(axis=1) >= LEAST_WAY
     off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
@@ -289,11 +288,21 @@ def _check_way(
         found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
     ):
         if max(way, driven) >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
-            backward = "; positions must grow in the direction of travel" if way < 0 else ""
+            hint = "check data.units and data.columns of time, speed and position"
+            smooth = ways[~jumps].sum()
+            low, high = (share * smooth.driven for share in AGREE)
+            most = jumps.any() and smooth.driven > ways.driven.sum() / 2
+            if most and low <= smooth.way <= high:
+                at = _place(rows, int(np.argmax(jumps)), names, report)
+                hint = (
+                    f"positions jump {int(jumps.sum()):,} times, the first at {at}: do they begin "
+                    "anew by lane or link? Give positions along the road, or leader and gap instead"
+                )
+            elif way < 0:
+                hint = f"positions must grow in the direction of travel; {hint}"
             raise DataError(
                 f"{report.source}: by {whose} positions {who} {way:.4g} m, by {whose} speeds "
-                f"{driven:.4g} m{backward}; check data.units and data.columns of time, speed and "
-                "position"
+                f"{driven:.4g} m; {hint}"
             )
 
 

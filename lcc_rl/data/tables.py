@@ -6,6 +6,7 @@ them: numbers are finite, in SI and within the range of their quantity.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -23,9 +24,9 @@ from numpy.typing import NDArray
 from lcc_rl.data.text import (
     SEPARATORS,
     TEXT_TAKES,
+    as_utf8,
     cells_of,
     file_size,
-    is_text,
     parse_text,
     preamble,
     reading,
@@ -45,14 +46,26 @@ LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
 THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
+ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; before the frames a second
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
 # Units by quantity, and their size; the first is the SI unit.
 UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, ISO: 1.0},
     "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
 }
 SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
+# What names of columns call units other than SI; "min" is also the least.
+NAMED = {
+    "time": {"ms": "ms|msecs?|milliseconds?", "us": "us|µs|microseconds?", "ns": "ns|nanoseconds?"},
+    "speed": {
+        "km/h": "km ?/?h|kmph|kph",
+        "mph": "mph|mi/h",
+        "ft/s": "ft/s|fps",
+        "kn": "kn|kts?|knots?",
+    },
+    "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
+}
 Cells = Any  # a pyarrow array, chunked or not
 Names = Mapping[str, str | None]
 Fault = Callable[[int, str], DataError]  # the error for a row and words
@@ -112,8 +125,27 @@ def check_map(columns: Iterable[Column], names: Names, units: Mapping[str, str],
     for key, unit in units.items():
         if key not in measured:
             raise unknown_name(f"key of {at}.units", str(key), measured)
-        if unit not in measured[key]:
-            raise unknown_name(f"unit in {at}.units.{key}:", str(unit), measured[key])
+        more = {"frames/<rate>": 1.0} if known[key].quantity == "time" else {}
+        if unit_size(known[key].quantity, str(unit)) is None:
+            raise unknown_name(f"unit in {at}.units.{key}:", str(unit), {**measured[key], **more})
+
+
+def unit_size(quantity: str, unit: str) -> float | None:
+    """Return the size of a unit in SI, also of ``frames/25``; None if it is unknown."""
+    if quantity == "time" and unit.startswith(FRAMES):
+        with suppress(ValueError):
+            rate = float(unit.removeprefix(FRAMES))
+            return 1 / rate if 0.0 < rate < LARGEST else None
+    return UNITS[quantity].get(unit)
+
+
+def named_unit(name: str, quantity: str) -> str | None:
+    """Return the unit that the name of a column says, unless it is SI: ``mph`` of ``v (mph)``."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
+    for unit, spelled in NAMED.get(quantity, {}).items():
+        if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", words):
+            return unit
+    return None
 
 
 class TableFile:
@@ -178,13 +210,20 @@ class TableFile:
         read = {}
         for column in columns:
             if column.key in self.names:
-                unit = (units or {}).get(column.key)
-                scale = UNITS[column.quantity][unit] if unit else 1.0
+                unit = (units or {}).get(column.key, SI.get(column.quantity, ""))
+                scale = (unit and unit_size(column.quantity, unit)) or 1.0
 
                 def fault(row: int, words: str, key: str = column.key) -> DataError:
                     return self.fault(row, key, words)
 
                 name = self.names[column.key]
+                said = named_unit(name, column.quantity)
+                if option and said and UNITS[column.quantity][said] != scale:
+                    where = f"{option.removesuffix('columns')}units.{column.key}={said}"
+                    raise DataError(
+                        f"{self.path}: the name of column {name!r} says {said}, and it is read in "
+                        f"{unit}; set {where}, or give the column another name"
+                    )
                 read[column.key] = checked(cells[name], column, fault, scale, self.comma)
         return read
 
@@ -202,9 +241,8 @@ class TableFile:
     def _open_text(self) -> None:
         require_memory({f"reading {self.path}": TEXT_TAKES * file_size(self.path)})
         with reading(self.path) as file:
-            content = file.read().removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
-        if not is_text(content):
-            raise DataError(f"{self.path}: is not text; expected a table in UTF-8")
+            content, self.notes = as_utf8(file.read(), str(self.path))
+        content = content.removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
         self.preamble, content = preamble(content)
         self.separator = separator_of(content)
         if self.separator == " ":
@@ -213,6 +251,9 @@ class TableFile:
         self.header = [name.strip() for name in cells_of(first, self.separator)]
         if not self.header:
             raise DataError(f"{self.path}: not a readable table: empty, or names no columns")
+        cells = cells_of(self.rows.partition(b"\n")[0], self.separator)
+        if len(cells) == len(self.header) + 1 and not cells[-1].strip():
+            self.header.append("")  # rows end in a separator
         if self.separator != ",":
             words = f"columns are separated by {SEPARATORS[self.separator]}"
             self.notes.append(f"{self.path}: {words}")
@@ -235,6 +276,8 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
     near = get_close_matches(missing[0].lower(), folded, n=1)
     hint = f" (is it {folded[near[0]]!r}?)" if near else ""
     how = f"; name the columns by {option}={{…}}" if option else ""
+    if all(re.fullmatch(NUMBER, name) for name in header if name):
+        how = ": is the header missing? The first line must name the columns"
     shown = ", ".join(header)[:400]
     return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{how}")
 
@@ -267,7 +310,7 @@ def checked(
         if not column.blank and (found == "").any():
             raise fault(int(np.argmax(found == "")), "is blank")
         return found
-    values = numbers_of(cells, fault, comma)
+    values = numbers_of(_seconds(cells) if column.quantity == "time" else cells, fault, comma)
     if scale != 1.0:
         values = values * scale
     least, most = (values.min(), values.max()) if len(values) else (column.least, column.most)
@@ -288,6 +331,17 @@ def checked(
 def _shown(cell: pa.Scalar) -> str:
     value = cell.as_py()
     return "nothing" if value is None else repr(value)[:40]
+
+
+def _seconds(cells: Cells) -> Cells:
+    """Dates and times of ISO 8601 as seconds since 1970; other cells as they are."""
+    if not (pa.types.is_string(cells.type) or pa.types.is_timestamp(cells.type)):
+        return cells
+    for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):
+        with suppress(pa.ArrowInvalid):
+            count = pc.cast(pc.cast(cells, kind), pa.int64())
+            return pc.multiply(pc.cast(count, pa.float64(), safe=False), 1e-9)
+    return cells
 
 
 def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.float64]:

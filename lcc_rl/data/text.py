@@ -22,6 +22,16 @@ BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
 TEXT_TAKES = 3  # bytes of memory that reading a byte of text takes
+UTF16 = b"\xff\xfe", b"\xfe\xff"
+# What files are that are no table in UTF-8, by their first bytes, and the remedy.
+OTHERS = {
+    b"PK\x03\x04": " but a spreadsheet (xlsx, ods) or zip archive; save the table as CSV",
+    b"\xd0\xcf\x11\xe0": " but an Excel workbook (xls); save the table as CSV",
+    b"MATLAB": " but a MATLAB file (mat); save the table with writetable(…, 'x.csv')",
+    b"\x89HDF": " but an HDF5 or MATLAB file (mat); save the table as CSV",
+    b"PAR1": " but a parquet file; name it .parquet",
+    **dict.fromkeys(UTF16, " but in UTF-16; save it in UTF-8"),
+}
 
 
 @contextmanager
@@ -78,6 +88,24 @@ def is_text(content: bytes) -> bool:
         return False
 
 
+def check_text(content: bytes, place: str) -> None:
+    """Raise a DataError that says what bytes are, and the remedy, if they are not UTF-8 text."""
+    if not is_text(content):
+        kinds = (kind for start, kind in OTHERS.items() if content.startswith(start))
+        raise DataError(f"{place} is not UTF-8 text{next(kinds, '; expected a table')}")
+
+
+def as_utf8(content: bytes, source: str) -> tuple[bytes, list[str]]:
+    """Return the text of a file as UTF-8, and a line if it was UTF-16 or else Latin-1."""
+    code = "UTF-16" if content.startswith(UTF16) else "Latin-1"
+    other = content.startswith((b"\0", *OTHERS)) and code == "Latin-1"
+    with suppress(UnicodeDecodeError):
+        if not (other or is_text(content)) and "\0" not in (text := content.decode(code)):
+            return text.encode(), [f"{source}: is not UTF-8 and was read as {code}"]
+    check_text(content, f"{source}:")
+    return content, []
+
+
 def single_spaces(lines: bytes) -> bytes:
     """Return lines with one space between columns and none around the row."""
     lines = re.sub(rb" {2,}", b" ", lines.replace(b"\t", b" "))
@@ -119,7 +147,8 @@ def separator_of(content: bytes) -> str:
                 break
             lines = single_spaces(first), single_spaces(second)
         counts = [len(cells_of(line, separator)) for line in lines]
-        if counts[0] > most and (counts[0] == counts[1] or not second.strip()):
+        blank = second.rstrip(b"\r").endswith(separator.encode())  # a last cell without a name
+        if counts[0] > most and (counts[0] in (counts[1], counts[1] - blank) or not second.strip()):
             best, most = separator, counts[0]
     return best
 

@@ -13,7 +13,9 @@ from lcc_rl.errors import DataError
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
-HOLE = 1.5  # of the usual step; a longer one is a missing sample
+HOLE = 1.75  # of the usual step; a longer one is a missing sample
+HOLE_S, MANY = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
+UNEVEN = 0.1  # of a step, by which a regular one may be off
 SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
 
 
@@ -132,6 +134,19 @@ def step_of(steps: NDArray[np.float64], source: str) -> float:
             f"{LONGEST:g} s; is the time in {unit} (data.units.time={unit})?"
         )
     return step
+
+
+def is_hole(steps: NDArray[np.float64], usual: NDArray | float) -> NDArray[np.bool_]:
+    """Return which steps [s] are holes, which divide a record; irregular sampling has few."""
+    long = steps > HOLE * usual
+    return long & (steps > HOLE_S) if long.mean() > MANY else long
+
+
+def resampled(steps: NDArray[np.float64], step: float) -> str:
+    """Return the line on samples, usually ``step`` apart, that are interpolated."""
+    odd = int((np.abs(steps - step) > UNEVEN * step).sum())
+    irregular = f", {odd:,} of them irregular," * bool(odd)
+    return f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s"
 
 
 class Places:

@@ -10,12 +10,13 @@ import pytest
 from ngsim_text import csv_text, native_text, pair
 from table_text import pairs
 
+from lcc_rl.data.agreement import agreement
 from lcc_rl.data.episodes import validate_episodes, write_episodes
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import Plausible, farther, gap_rate, hard_share
+from lcc_rl.data.plausible import Plausible, hard_share
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 
 # Column, value in row 95 (episode 3), what is said of it.
 FLAWS = [
@@ -67,35 +68,157 @@ def wavy(seconds: float = 60.0) -> pd.DataFrame:
 SPEEDS = ["leader_speed_mps", "follower_speed_mps"]
 
 
-def test_consistent_gaps_have_the_rate_one_also_with_a_biased_speedometer() -> None:
-    assert gap_rate(wavy()) == pytest.approx(1.0, abs=1e-6)
-    assert gap_rate(wavy().assign(leader_speed_mps=lambda x: x["leader_speed_mps"] + 1.5)) == (
-        pytest.approx(1.0, abs=1e-6)
-    )
-    assert gap_rate(wavy(12.0)) is None  # too little to tell
+def irregular(seconds: float = 60.0) -> pd.DataFrame:
+    """Three episodes whose speeds vary irregularly, from which lags can be told."""
+    time, parts = np.arange(0.0, seconds, 0.1), []
+    for episode in range(3):
+        waves = [(0.9, 0.31, 1.0), (0.7, 0.83, 2.0), (0.4, 1.7, 0.3 + episode)]
+        leader = 15 + sum(size * np.sin(rate * time + phase) for size, rate, phase in waves)
+        follower = 15 + sum(
+            0.8 * size * np.sin(rate * (time - 0.9) + phase - 0.2) for size, rate, phase in waves
+        )
+        relative = leader - follower
+        way = np.append(0.0, np.cumsum((relative[1:] + relative[:-1]) * 0.05))
+        part = {"time_s": 100.0 * episode + time, "gap_m": 25.0 + way, "episode": episode}
+        parts.append(pd.DataFrame(part | {SPEEDS[0]: leader, SPEEDS[1]: follower}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def judged(table: pd.DataFrame, units: dict[str, str] | None = None, **settings) -> list[str]:
+    """Lines on a table of pairs in which rows are numbered."""
+    settings = {
+        "max_speed": 200.0,
+        "max_acceleration": 99.0,
+        "min_gap": -1e4,
+        "max_gap": 1e4,
+    } | settings
+    return Plausible(**settings).select(
+        table, "f.csv", lambda row, x: f"row {row}, {x}", units=units
+    )[1]
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+def test_consistent_gaps_have_the_slope_one_and_no_lag_also_with_a_biased_speedometer(bias) -> None:
+    table = wavy().assign(leader_speed_mps=lambda x: x["leader_speed_mps"] + bias)
+    found = agreement(table)
+    assert found["row"].tolist() == [0, 600, 1200, 0]
+    np.testing.assert_allclose(found[["leader", "follower"]], 1.0, atol=1e-3 + bias / 10)
+    assert (found["fit"] > 0.99 - bias / 10).all()
+    assert (found["late"] == 0.0).all()
+    if not bias:
+        assert judged(wavy())[-1].endswith("speeds 1.00, lag 0.0 s of 3 pair(s)")
+    short = judged(wavy(12.0))
+    assert short[-1].endswith("1 m/s; too little to tell slope and lag of 3")
+
+
+BOTH, LEADER, FOLLOWER = [*SPEEDS], SPEEDS[:1], SPEEDS[1:]
+# Columns, their factor, units of the file, and what is said of the pair.
+MISTAKES = [
+    (BOTH, 3.6, {}, r"by 0\.28 m, where .* by -0\.28 m; are both speeds in km/h\?"),
+    (BOTH, 2.23694, {}, r"by 0\.45 m, .*; are both speeds in mph\?"),
+    (BOTH, 1.94384, {}, r"by 0\.51 m, .*; are both speeds in kn\?"),
+    (BOTH, 3.28084, {}, r"by 0\.30 m, .*; are both speeds in ft/s\?"),
+    (["gap_m"], 3.28084, {}, r"by 3\.28 m, .*; is the gap in ft\?"),
+    (["gap_m"], 100.0, {}, r"by 100\.00 m, .*; is the gap in cm\?"),
+    (["gap_m"], 3.28084, {"gap": "m"}, r"; is the gap in ft \(data\.units\.gap=ft\)\?"),
+    (["gap_m"], 0.3048, {"gap": "ft"}, r"is the gap in m \(.*\)\? or are both speeds in ft/s\?"),
+    (BOTH, 1 / 3.6, {"speed": "km/h"}, r"are both speeds in m/s \(data\.units\.speed=m/s\)\?"),
+    (["gap_m"], -1.0, {}, r"by -1\.00 m, where .* by 1\.00 m; are leader and follower exchanged"),
+    (
+        LEADER,
+        2.23694,
+        {},
+        r"leader_speed_mps: .* by 0\.45 m, .* by -1\.00 m; is the leader's speed in mph",
+    ),
+    (
+        FOLLOWER,
+        3.6,
+        {},
+        r"follower_speed_mps: .* by 1\.00 m, .* by -0\.28 m; is the follower's speed in km",
+    ),
+    (
+        LEADER,
+        1 / 3.6,
+        {"leader_speed": "km/h", "follower_speed": "m/s"},
+        r"is the leader's speed in m/s \(data\.units\.leader_speed=m/s\)\?",
+    ),
+]
+
+
+@pytest.mark.parametrize("pairs", [1, 3])
+@pytest.mark.parametrize(("columns", "factor", "units", "words"), MISTAKES)
+def test_a_pair_in_another_unit_or_exchanged_is_named(columns, factor, units, words, pairs) -> None:
+    table = wavy()
+    wrong = table["episode"] >= 3 - pairs
+    table.loc[wrong, columns] *= factor
+    with pytest.raises(DataError, match=rf"f\.csv: row \d+, .*{words}") as caught:
+        judged(table, units)
+    count, first = f"; {pairs} of 3 pairs", 1200 if pairs == 1 else 600  # the one in the middle
+    assert count in str(caught.value)
+    assert f"row {first}, " in str(caught.value)
+
+
+def later(table: pd.DataFrame, signal: str, seconds: float) -> pd.DataFrame:
+    """The table with a signal that is late."""
+    moved = table.groupby("episode")[signal].shift(round(10 * seconds))
+    return table.assign(**{signal: moved.fillna(table[signal])})
 
 
 @pytest.mark.parametrize(
-    ("columns", "factor", "said"),
-    [(SPEEDS, 3.6, 0.28), (SPEEDS, 2.23694, 0.45), (["gap_m"], 3.28084, 3.28), (["gap_m"], -1, -1)],
+    ("signal", "words"),
+    [
+        ("leader_speed_mps", "leader"),
+        ("follower_speed_mps", "follower"),
+        ("gap_m", "gap"),
+    ],
 )
-def test_gaps_in_other_units_than_the_speeds_are_refused(columns, factor, said) -> None:
-    table = wavy()
-    table[columns] *= factor
-    with pytest.raises(DataError, match=rf"f\.csv: gaps change by {said:.2f} m where"):
-        Plausible(max_speed=100.0, min_gap=-1e3).select(
-            table, "f.csv", lambda row, column: f"row {row}"
-        )
+@pytest.mark.parametrize("seconds", [-2.0, -0.5, 0.2, 0.5, 1.0, 1.5])
+def test_a_signal_that_is_late_is_named_or_reported(signal: str, words: str, seconds) -> None:
+    table, good = irregular(), judged(irregular())
+    assert not any(isinstance(line, Concern) for line in good)
+    late = later(table, signal, seconds)
+    said = (
+        f"{signal}: {words} {abs(seconds)} s {'late' if seconds > 0 else 'early'}; are clocks apart"
+    )
+    if abs(seconds) > 1:
+        with pytest.raises(DataError, match=rf"f\.csv: row \d+, {said}.*3 of 3 pairs"):
+            judged(late)
+        judged(late, max_lag=3.0)
+        return
+    loud = [line for line in judged(late) if isinstance(line, Concern)]
+    assert [said in line for line in loud] == [True] * (abs(seconds) >= 0.3)
 
 
 def test_a_gap_that_jumps_to_another_car_is_no_other_unit() -> None:
     table = wavy(20.0)  # of about 300 m
     jump = table.assign(gap_m=table["gap_m"] + 150.0 * (table.index >= 100) * (table.index < 200))
-    Plausible().select(jump, "f.csv", lambda row, column: f"row {row}")
+    judged(jump)
     table.loc[:199, "follower_speed_mps"] /= 2.23694
-    assert farther(table)["factor"].round(1).tolist() == [2.2, 1.0, 1.0]
-    with pytest.raises(DataError, match=r"f\.csv: row 0: by its speed, .* in mph\?"):
-        Plausible().select(table, "f.csv", lambda row, column: f"row {row}")
+    with pytest.raises(
+        DataError, match=r"row 0, .* drives 83.* m, the leader 17.* is the leader.s speed in mph\?"
+    ):
+        judged(table)
+
+
+def test_a_faulty_sensor_fits_no_unit_and_is_refused_only_where_all_are() -> None:
+    table, rng = irregular(), np.random.default_rng(0)
+    noise = 20 + 5 * np.cumsum(rng.normal(size=len(table))) / 10
+    one = table.assign(gap_m=table["gap_m"].where(table["episode"] > 0, noise))
+    assert judged(one)[-1].endswith("of 2 pair(s), too little to tell slope and lag of 1")
+    with pytest.raises(DataError, match=r"f\.csv: the gap changes by -?0\.\d\d m .* no unit fits"):
+        judged(table.assign(gap_m=noise))
+
+
+def test_a_start_from_standing_is_not_said_to_be_in_another_unit() -> None:
+    time = np.arange(0.0, 40.0, 0.1)
+    leader, follower = (np.clip(6.0 * ((time % 20) - late), 0.0, 25.0) for late in (0.0, 1.0))
+    gap = 5.0 + np.append(
+        0.0, np.cumsum(np.diff(leader, prepend=0)[1:] * 0 + (leader - follower)[1:] * 0.1)
+    )
+    table = pd.DataFrame({"episode": 0, "time_s": time, "gap_m": gap})
+    table = table.assign(leader_speed_mps=leader, follower_speed_mps=follower)
+    with pytest.raises(DataError, match=r"max_hard=0\.005; gaps agree: .* such starts"):
+        judged(table, max_acceleration=999.0)
 
 
 def test_speeds_and_gaps_in_other_units_that_agree_are_refused(shared_data: Path) -> None:
@@ -103,19 +226,25 @@ def test_speeds_and_gaps_in_other_units_that_agree_are_refused(shared_data: Path
     assert hard_share(table) < 0.0005
     table[SPEEDS] *= 3.6
     table["gap_m"] /= 0.3048
-    with pytest.raises(DataError, match=r"more than 4 m/s within a second for 5.* in km/h, mph"):
+    with pytest.raises(
+        DataError, match=r"more than 4 m/s within a second for 5.* are both in another unit"
+    ):
         Plausible().select(table, "f.csv", lambda row, column: f"row {row}")
     Plausible(max_hard=0.1).select(table, "f.csv", lambda row, column: f"row {row}")
 
 
-def test_forgotten_feet_are_found_where_cars_stand_or_brake(shared_data: Path) -> None:
+def test_forgotten_feet_are_refused_where_cars_brake_and_said_where_they_stand(shared_data) -> None:
     table = EpisodesSource(path=str(shared_data / "i80_pairs.parquet")).load().episodes
+    feet = table.assign(**{name: table[name] / 0.3048 for name in [*SPEEDS, "gap_m"]})
+    with pytest.raises(
+        DataError, match=r"more than 4 m/s within .* are both in another unit \(feet\)"
+    ):
+        judged(feet)
     queue = wavy().assign(gap_m=6.0, **dict.fromkeys(SPEEDS, 0.0))
-    for metres, words in ((table, "more than 4 m/s within"), (queue, r"cars stand 19\.7 m behind")):
-        Plausible().select(metres, "f.csv", lambda row, column: f"row {row}")
-        feet = metres.assign(**{name: metres[name] / 0.3048 for name in [*SPEEDS, "gap_m"]})
-        with pytest.raises(DataError, match=words):
-            Plausible().select(feet, "f.csv", lambda row, column: f"row {row}")
+    assert not isinstance(judged(queue)[-1], Concern)
+    last = judged(queue.assign(gap_m=6.0 / 0.3048))[-1]
+    assert isinstance(last, Concern)
+    assert "cars stand 19.7 m apart: are all columns in feet?" in last
 
 
 @pytest.mark.parametrize("spell", [csv_text, native_text])

@@ -1,0 +1,232 @@
+"""Agreement of gaps with speeds: slope and lag of each pair, and the mistake that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from math import exp, inf, log
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from lcc_rl.data.tables import SI, SPEEDS, UNITS
+from lcc_rl.data.trajectories import FRAME
+from lcc_rl.errors import Concern, DataError
+
+OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
+SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
+WINDOW, EVERY, REACH = 2.0, 1.0, 3.0  # changes compared, time between them, longest lag [s]
+# Of changes [s], share explained, relative motion in a window [m]: less is too little to tell.
+LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 15.0, 0.9, 0.15, 100.0
+GAIN, FLOOR = 6.0, 2e-4  # a lag leaves so much less unexplained; what exact data leave
+RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: of a bias of speeds, which steady traffic leaves open
+LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
+NEAR, ALIKE = 1.25, 1.05  # a mistake is so near to the coefficients, or as near as another one
+LOUD = 0.3  # lag that is reported [s]
+STANDING, LEAST_STANDING, FAR = 0.5, 300, 15.0  # speed [m/s], samples; gap that may be in feet [m]
+Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
+Floats = NDArray[np.float64]
+
+
+def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Return how the gap of each pair depends on its speeds.
+
+    Least squares fit the change of the gap in 2 s by ``leader`` times the way of the leader less
+    ``follower`` times the way of the follower, and a constant for biased speeds: 1 and 1 for
+    consistent data, −1 and −1 where the cars are exchanged, other sizes for other units. One of the
+    three signals may be late by up to 3 s: the lag that explains most, if it leaves less than a
+    sixth of the rest without lag.
+
+    Args:
+        episodes: rows of an episode lie together, 0.1 s apart: columns ``OF_PAIRS`` and, where
+            known, recording, follower_id and leader_id, which make a pair.
+
+    Returns:
+        A row for each pair and a last one of all, which has no lag: row (the pair's first), seconds
+        (compared), leader, follower, slope (of the gap over the relative way), fit (share of the
+        variance explained), motion (root mean square of the relative way [m]), late [s], signal
+        (that is late), ahead, own, grown (ways of leader and follower, growth of the gap [m]).
+    """
+    keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
+    pair = episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy()
+    number, pairs = episodes["episode"].to_numpy(), int(pair.max(initial=-1)) + 1
+    width, every, reach = (round(seconds / FRAME) for seconds in (WINDOW, EVERY, REACH))
+    whole = width + 2 * reach
+    rows = np.flatnonzero(number[whole:] == number[:-whole])[::every] + reach
+    gap, *speeds = (episodes[name].to_numpy(np.float64) for name in SIGNALS.values())
+    series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
+
+    def fit(late: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+        """Coefficients and slope, what they leave unexplained, and sums of products."""
+        shifted, at = [rows + k for k in late.astype(int)], pair[rows]
+        grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
+        terms = ahead, -own, np.ones(len(rows)), grown
+        sums = np.array([[np.bincount(at, x * y, pairs) for x in terms] for y in terms])
+        sums = np.append(sums, sums.sum(axis=-1, keepdims=True), axis=-1)  # of all
+        known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
+        found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
+        rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
+        rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
+        found[2] = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
+        return found, np.maximum(np.nan_to_num(rest, nan=9.0), FLOOR), sums
+
+    shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
+    lags = np.stack([np.zeros(3), *shifts])
+    with np.errstate(all="ignore"):  # of pairs without a change
+        *first, sums = fit(lags[0], rows)
+        unclear = rows[(first[1] > GAIN * FLOOR)[pair[rows]]]  # no lag could gain enough elsewhere
+        fits = [first, *(fit(late, unclear)[:2] for late in shifts if len(unclear))]
+    found, rest = (np.array(x) for x in zip(*fits, strict=True))
+    best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
+    best[-1] = 0
+    each, count = np.arange(pairs + 1), sums[2, 2]
+    ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY / WINDOW
+    names = ["leader", "follower", "slope"]
+    return pd.DataFrame(found[best, :, each], columns=names).assign(
+        row=np.append(np.unique(pair, return_index=True)[1], 0),
+        seconds=EVERY * count,
+        fit=1 - rest[best, each],
+        motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
+        late=FRAME * lags[best].sum(axis=1),
+        signal=np.array([*SIGNALS])[np.abs(lags[best]).argmax(axis=1)],
+        ahead=ahead,
+        own=own,
+        grown=grown,
+    )
+
+
+def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, float]]:
+    """Yield what may be wrong with a pair.
+
+    Args:
+        units: units that gap and speeds were read in, by their keys in ``data.units``.
+
+    Yields:
+        Whether it doubts SI, the signal at fault, a question to the user, and the coefficients of
+        leader and follower in :func:`agreement`.
+    """
+    yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
+    for signal, subject, quantity, keys, leader, follower in (
+        ("gap", "is the gap", "length", ("gap", "position"), -1, -1),
+        ("follower", "are both speeds", "speed", ("speed", "follower_speed", "leader_speed"), 1, 1),
+        ("leader", "is the leader's speed", "speed", ("leader_speed",), 1, 0),
+        ("follower", "is the follower's speed", "speed", ("follower_speed",), 0, 1),
+    ):
+        named = [key for key in keys if key in units][: 1 if signal == "gap" else None]
+        declared = units.get([*named, quantity][0], SI[quantity])
+        for unit, size in (UNITS["length"] if signal == "gap" else SPEEDS).items():
+            factor = size / UNITS[quantity][declared]
+            if factor != 1.0 and len({units[key] for key in named}) < 2:
+                option = " ".join(f"data.units.{key}={unit}" for key in named)
+                words = f"{subject} in {unit}{option and f' ({option})'}?"
+                yield declared == SI[quantity], signal, words, factor**leader, factor**follower
+
+
+def check_pairs(
+    episodes: pd.DataFrame,
+    place: Place,
+    units: Mapping[str, str],
+    max_mismatch: float,
+    max_lag: float,
+) -> tuple[list[str], bool]:
+    """Check that the gaps of each pair agree with its speeds.
+
+    Args:
+        episodes: see :func:`agreement`.
+        place: describes the sample of a row.
+        units: see :func:`mistakes`.
+        max_mismatch, max_lag: see :class:`lcc_rl.data.plausible.Plausible`.
+
+    Returns:
+        Lines on lags, on gaps that fit nothing and on medians; and whether any pair agrees.
+
+    Raises:
+        DataError: naming the pair and what fits, if one is not as its speeds say, or none is.
+    """
+    found = agreement(episodes)
+    pairs, every = found.iloc[:-1], found.iloc[-1]
+    moves, span = found["motion"] >= LEAST_MOTION, (1 / max_mismatch, max_mismatch)
+    told = moves[:-1] & (pairs["seconds"] >= LEAST_S) & (pairs["fit"] >= LEAST_FIT)
+    right = told & pairs["leader"].between(*span) & pairs["follower"].between(*span)
+
+    def said(cases: list[tuple[int, str, str]]) -> Iterator[str]:
+        """A line on the case in the middle of several, if there is one."""
+        for row, signal, words in cases[len(cases) // 2 :][:1]:
+            count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
+            yield f"{place(row, SIGNALS[signal])}: {words}{count}"
+
+    wrong = [
+        fit
+        for pair in pairs.assign(told=told)[~right].to_dict("records")
+        for fit in _mistaken(pair, units, max_mismatch)
+    ]
+    late, too_late = [], []
+    for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
+        lag = f"{abs(pair['late']):.1f} s {'late' if pair['late'] > 0 else 'early'}"
+        late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
+        too_late += late[-1:] * (abs(pair["late"]) > max_lag)
+    for line in (*said(wrong), *said(too_late)):
+        raise DataError(line)
+    odd = pairs[told & ~pairs["slope"].between(*span)].to_dict("records")
+    words = "the gap changes by {:.2f} m where both speeds say 1 m, and no unit fits"
+    strange = [(pair["row"], "gap", words.format(pair["slope"])) for pair in odd]
+    enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
+    if enough and not (right.any() or span[0] <= every["slope"] <= span[1]):
+        raise DataError(f"{words.format(every['slope'])}: are speeds to be smoothed?")
+    lines = [Concern(line) for line in (*said(late), *said(strange))]
+    return [*lines, medians(episodes, pairs[told], len(pairs))], bool(right.any())
+
+
+def _mistaken(
+    pair: Mapping[Any, Any], units: Mapping[str, str], max_mismatch: float
+) -> list[tuple[int, str, str]]:
+    """Row, signal and words on the mistakes nearest to a pair; nothing if none is near.
+
+    Where the gap tells too little, the ways of both cars do. That of the leader may be less by what
+    the gap grows: whichever is nearer to the follower's counts, since a gap may jump to another
+    car.
+    """
+    own, ahead, a, b = (pair[name] for name in ("own", "ahead", "leader", "follower"))
+    ways = (max(way, 1.0) for way in (ahead, ahead - pair["grown"]))
+    apart = min((log(max(own, 1.0) / way) for way in ways), key=abs)
+    words = (
+        f"where the leader drives 1 m, the gap changes by {a:.2f} m, where the follower does, by "
+        f"{-b:.2f} m"
+    )
+    if not pair["told"]:
+        words = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
+        if max(own, ahead) < LEAST_WAY or abs(apart) < log(max_mismatch):
+            return []
+    near = []
+    for default, signal, question, leader, follower in mistakes(units):
+        ratios = [a / leader, b / follower]
+        if not pair["told"]:
+            ratios = [exp(apart) * follower / leader] if leader != follower else [0.0]
+        off = max(abs(log(ratio)) for ratio in ratios) if min(ratios) > 0 else inf
+        near.append((off, default, signal, question))
+    least = min(near)[0]
+    near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
+    questions = " or ".join(x[3] for x in near)
+    return [(pair["row"], near[0][2], f"{words}; {questions}")] if least < log(NEAR) else []
+
+
+def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int) -> str:
+    """Return the line by which a user sees whether units and clocks are right.
+
+    ``told`` are the rows of :func:`agreement` that tell something, of so many ``pairs``.
+    """
+    speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
+    behind = (gap / speed)[speed > 1.0].median()
+    slope, late = told["slope"].median(), told["late"].median()
+    known = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(told):,} pair(s)"
+    few = f"too little to tell slope and lag of {pairs - len(told):,}"
+    said = [known] * (len(told) > 0) + [few] * (len(told) < pairs)
+    line = (
+        f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
+        f"{behind:.2g} s above 1 m/s; {', '.join(said)}"
+    )
+    stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
+    if len(stand) < LEAST_STANDING or stand.median() < FAR:
+        return line
+    return Concern(f"{line}; cars stand {stand.median():.3g} m apart: are all columns in feet?")
