@@ -6,26 +6,22 @@ import logging
 from copy import deepcopy
 from pathlib import Path
 
-import pandas as pd
 import torch
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
-from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
+from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.config import identity
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.evaluation.cases import WINDOWS, check_cases
+from lcc_rl.evaluation.cases import check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
-from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import EPISODES, check_folder, load_config, save_config
-from lcc_rl.results.string_tables import case_table
-from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
@@ -164,15 +160,3 @@ def complete(cfg: TrainConfig, folder: Path) -> Rows:
     if table.exists():
         check_folder(cfg, folder)
     return run(cfg, folder, quiet=True, resume=True)
-
-
-def objective(cfg: TrainConfig, rows: Rows) -> float | list[float]:
-    """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
-    # By its rows: a resumed run is not of the variant that the command line composed.
-    vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
-    table = case_table(rows, WINDOWS) if vehicles else summary(rows)
-    found = table.iloc[-1].to_dict()
-    if pd.isna(found.get("min_ttc_s")):
-        found["min_ttc_s"] = NEVER  # no gap ever closed; a sweeper needs a number
-    values = [float(found[name]) for name in objectives(cfg)]
-    return values[0] if isinstance(cfg.objective, str) else values

@@ -22,8 +22,8 @@ from tensordict import TensorDict
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.inputs import load_inputs
 from lcc_rl.envs.inputs import load_episodes as load_source
+from lcc_rl.envs.inputs import load_inputs
 from lcc_rl.results.policies import load_policy
 
 pytestmark = pytest.mark.slow
@@ -114,7 +114,11 @@ def test_actions_of_shipped_policies(name: str) -> None:
     seen = torch.linspace(-1.0, 1.5, 32 * size).reshape(32, size)[torch.arange(31, -1, -1)]
     with torch.no_grad():
         action = agent.policy(TensorDict({"observation": seen}, [32]))["action"]
-    pinned = json.loads(PINS.read_text(encoding="utf-8")).get(f"policy.{name}") if PINS.exists() else None
+    pinned = (
+        json.loads(PINS.read_text(encoding="utf-8")).get(f"policy.{name}")
+        if PINS.exists()
+        else None
+    )
     if RECORD:
         check(f"policy.{name}", action.flatten().tolist())
     else:
