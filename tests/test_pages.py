@@ -33,11 +33,9 @@ NOT_RUN = {
     "export": "of the shell",
     "ls": "of the shell",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
-    "python tools/sumo_ring.py": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
     "lcc-rl animate": "tests/results/test_motion.py runs it",
     "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
     "lcc-rl score": "tests/evaluation/test_score.py runs it",
-    "lcc-rl maps": "tests/results/test_figures.py runs it",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
     "python tools/kill_test.py": "takes an hour",
 }
@@ -71,7 +69,6 @@ ENOUGH = {
 }
 ENTRIES = {"run": "pipeline"}  # entry points that are not called as their command
 SHELL = {"source", "export", "ls"}
-ALWAYS = {"tools/sumo_ring.py": ("task=ring-22",)}  # settings that a tool gives itself
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 NEEDS = {"interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime")}  # extras of a page
@@ -247,7 +244,7 @@ def options_exist(source: Path, words: Sequence[str]) -> None:
     flags = {flag.replace("--no-", "--") for flag in given}
     assert all(f'"{flag}"' in text for flag in flags - {"--help"}), words
     typed = [word for word in words if re.match(r"[+~]?[\w./@]+=", word)]
-    once("train", (*ALWAYS.get(words[0], ()), *typed))
+    once("train", tuple(typed))
 
 
 @cache

@@ -65,7 +65,6 @@ REFUSED = {
     "fetch --banana": "unrecognized arguments: --banana",
     "animate nowhere --start nan": "--start: must be a finite number",
     "animate nowhere": "nowhere: not a run folder",
-    "maps nowhere": "nowhere: not a run folder",
     "clairvoyant --iterations 0": "--iterations: must be greater than or equal to 1",
     "export pretrained/alcc policy.banana": "'.banana'; valid: .html, .onnx",
     "status nowhere": "nowhere: no such folder",
@@ -122,7 +121,6 @@ def test_nothing_that_is_there_is_written_over(run, tmp_path, words) -> None:
         ("benchmarks.command", ["env", "--device", "banana"], "--device: must match"),
         ("benchmarks.command", ["reed"], "Did you mean 'read'"),
         ("benchmarks.command", ["calibrate", "--episodes", "nowhere.parquet"], "nowhere"),
-        ("export_drivers", ["run/d.parquet", "run/d.parquet"], "is already there"),
     ],
 )
 def test_so_do_the_tools(run, tmp_path, monkeypatch, module, words, expected) -> None:
