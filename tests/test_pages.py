@@ -32,6 +32,7 @@ NOT_RUN = {
     "source": "of the shell",
     "export": "of the shell",
     "ls": "of the shell",
+    "curl": "downloads",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
     "lcc-rl animate": "tests/results/test_motion.py runs it",
     "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
@@ -58,6 +59,8 @@ ENOUGH = {
     "--iterations 200": "--iterations 2",
     '["experiment=limits"]': repr([LENGTH, *TRAINING, *WINDOWS, *DATA]),
     '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
+    'learn("alcc", words,': f'learn("alcc", [*words, *{list(SMALL)}],',
+    "n_trials=40": "n_trials=2",
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
@@ -68,12 +71,16 @@ ENOUGH = {
     "(0, 2999, 5999)": "(0, 9, 19)",
 }
 ENTRIES = {"run": "pipeline"}  # entry points that are not called as their command
-SHELL = {"source", "export", "ls"}
+SHELL = {"source", "export", "ls", "curl"}
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-NEEDS = {"interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime")}  # extras of a page
+# Extras of a page.
+NEEDS = {
+    "interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime"),
+    "sweeps.md": ("optuna",),
+}
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
-LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
+LAUNCH = ("hydra/launcher=",)  # of extras that need not be installed
 CHOICES = set((ROOT / "conf").rglob("*.yaml"))
 
 
@@ -146,7 +153,7 @@ class Reader:
             module = console.COMMANDS[rest[0]][0].replace(".", "/")
             options_exist(ROOT / f"{module}.py", rest)
         else:
-            assert program in SHELL or rest[0] == "-h"
+            assert program in SHELL or rest[0] == "-h", program
 
     def end(self, page: Path) -> None:
         """Check the commands and choices inside the text."""
@@ -174,7 +181,7 @@ class Runner(Reader):
 
     def command(self, words: list[str], error: str | None) -> None:
         """Run one command; one whose error the page shows ends with it."""
-        if shlex.join(words).startswith(tuple(NOT_RUN)) or "hydra/sweeper=" in " ".join(words):
+        if shlex.join(words).startswith(tuple(NOT_RUN)):
             return
         words = [word for word in words if not word.startswith(LAUNCH)]
         for group, (key, path) in LEFT_OUT.items():

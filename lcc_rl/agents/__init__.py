@@ -4,6 +4,5 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.ddpg import DDPG
 from lcc_rl.agents.sac import SAC
 from lcc_rl.agents.td3 import TD3
-from lcc_rl.agents.tuned import Tuned
 
-__all__ = ["DDPG", "SAC", "TD3", "Analytic", "Tuned"]
+__all__ = ["DDPG", "SAC", "TD3", "Analytic"]

@@ -10,7 +10,6 @@ from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.agents.replay import Trainer
-from lcc_rl.agents.tuned import SearchLoop, Tuned
 from lcc_rl.config import identity
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import StudyConfig
@@ -57,8 +56,7 @@ def make_trainer(
     """
     own = after_humans(cfg, cfg.agent.get("humans_first", 0.0))
     env = build_env(own, profiles, population, cfg.training.environments, 0, cfg.device)
-    loops: dict[type, Any] = {Analytic: GradientTrainer, Tuned: SearchLoop}
-    loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
+    loop: Any = GradientTrainer if isinstance(agent, Analytic) else Trainer
     trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
     return trained
 

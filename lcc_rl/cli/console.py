@@ -25,7 +25,6 @@ TOOLS = {
     "score": ("lcc_rl.commands.score", "any policy on every task and source that it fits"),
     "animate": ("lcc_rl.commands.animate", "episodes as a moving picture: page, SVG, GIF, MP4"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study, to one page"),
-    "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
     "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
 }

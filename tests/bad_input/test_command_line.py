@@ -60,9 +60,7 @@ REFUSED = {
     f"train hydra.run.dir={'x' * 5000}": "too long",
     "train variant=idm sweep=mine": "sweep=mine has no effect.* -m",
     # flags
-    "fetch --retries -1": "--retries: must be greater than or equal to 0, got '-1'",
-    "fetch --page-rows many": "--page-rows: must be a valid integer",
-    "fetch --banana": "unrecognized arguments: --banana",
+    "status --banana": "unrecognized arguments: --banana",
     "animate nowhere --start nan": "--start: must be a finite number",
     "animate nowhere": "nowhere: not a run folder",
     "clairvoyant --iterations 0": "--iterations: must be greater than or equal to 1",
@@ -77,7 +75,7 @@ REFUSED = {
 # Commands that write what they are told to, and never over what is there: {file}, {run}.
 NAMED = (
     *("clairvoyant --out {run}", "clairvoyant --out {file}", "animate {run} --out {file}"),
-    *("export pretrained/alcc {file}", "fetch --output {file}", "fetch --output /dev/null"),
+    "export pretrained/alcc {file}",
     "reproduce alcc --recipe smoke --seeds 1 --out {run}",
 )
 

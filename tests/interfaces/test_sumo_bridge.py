@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from benchmarks import sumo
 from torch import Tensor
 
+from benchmarks import sumo
 from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records
 from lcc_rl.drivers.population import bootstrap
