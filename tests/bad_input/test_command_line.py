@@ -116,7 +116,6 @@ def test_nothing_that_is_there_is_written_over(run, tmp_path, words) -> None:
     [
         ("benchmarks.command", ["env", "--out", "run/episodes.parquet"], "is already there"),
         ("benchmarks.command", ["env", "--threads", "100000"], "--threads: must be less"),
-        ("benchmarks.command", ["env", "--device", "banana"], "--device: must match"),
         ("benchmarks.command", ["reed"], "Did you mean 'read'"),
         ("benchmarks.command", ["calibrate", "--episodes", "nowhere.parquet"], "nowhere"),
     ],

@@ -37,7 +37,7 @@ def collect(options: Namespace) -> list[Row]:
     """
     check_resets(options)
     batch, steps = (16, 10) if options.quick else (1024, 60)
-    policy = DDPG().start(Scene(7, device=options.device)).policy
+    policy = DDPG().start(Scene(7)).policy
     runs: dict[str, Run] = {}
     against: dict[str, list[str]] = {}
     for ending in endings(options):

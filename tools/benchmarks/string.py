@@ -41,7 +41,7 @@ def batch(options: Namespace) -> list[Row]:
     """Return the rows of many strings side by side."""
     count, steps = (4, 10) if options.quick else (1024, 30)
     env = alcc(options, count, True, SIZE - 1)
-    start, zero = env.reset(), torch.zeros(count, 1, 1, device=options.device)
+    start, zero = env.reset(), torch.zeros(count, 1, 1)
     plain, loops = PlainLoop(env), NumbaString(PlainLoop(env), start.cpu())
     runs: dict[str, Run] = {NUMBA: partial(loops.play, steps)}
     against: dict[str, list[str]] = {}

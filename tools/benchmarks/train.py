@@ -78,7 +78,7 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path, updates: f
     env = alcc(options, WIDTH)
     env.base_env.horizon = steps // WIDTH  # episodes of one segment
     agent = DDPG(batch_size=batch, updates_per_transition=updates)
-    agent = agent.start(Scene(7, device=options.device))
+    agent = agent.start(Scene(7))
     trained = Trainer(agent, env, cfg.training, 0, folder, "benchmark")
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
     trained.buffer.extend(transitions(played))
