@@ -31,8 +31,8 @@ from lcc_rl.results.means import TRAINED, Means
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.savings import DRIVE, SOURCE
 from lcc_rl.results.scores import LEAST, scores
-from lcc_rl.studies.alcc.report import CURVES, MAIN
-from lcc_rl.studies.alcc.study import DRIVERS
+from lcc_rl.studies.alcc.results import CURVES
+from lcc_rl.studies.alcc.study import DRIVERS, EVALUATION
 from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED, MEASURES, RUN, STABLE, per_run, rounded
 
@@ -143,12 +143,12 @@ def means(evaluations: Sequence[Path], target: Path) -> None:
 def alcc(studies: Sequence[Path], target: Path) -> None:
     """Keep what the page of an ALCC study shows of its main part."""
     study = _only(studies)
-    means([study / MAIN], target / MAIN)
-    steps = read_parquet(study / MAIN / STEPS)
+    means([study / EVALUATION], target / EVALUATION)
+    steps = read_parquet(study / EVALUATION / STEPS)
     steps = steps[steps["strategy"] == "alcc"]
     keys = ["training_seed", "profile", "driver_id"]
     first = (steps[keys] == steps[keys].iloc[0]).all(axis=1)
-    write_parquet(steps[first], target / MAIN / STEPS)
+    write_parquet(steps[first], target / EVALUATION / STEPS)
     curves = results.load(study / "train", "training")
     shown = [x for x in curves if x in CURVE or str(x).startswith("reward_")]
     curves = curves[shown]

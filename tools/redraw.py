@@ -1,6 +1,6 @@
 """Draw tables and figures of the documentation again from outputs/reference: python tools/redraw.py
 
-The tables of docs/{alcc,hcfs,tasks}.md, docs/reports, and of docs/figures: fleets.png,
+The tables of docs/{alcc,hcfs,tasks}.md, and of docs/figures: alcc_*, hcfs_*, fleets.png,
 fleets_ring.png, limits.png, measured.png, record.png, ring.png and twins.png. The commands that
 the pages name draw the other figures.
 """
@@ -12,6 +12,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import fleets
@@ -31,12 +32,17 @@ from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.studies.reproduce import REPORTS
+from lcc_rl.studies.alcc.results import narrow
+from lcc_rl.studies.reproduce import RESULTS
 
 REFERENCE, FIGURES = Path("outputs/reference"), Path("docs/figures")
 MEASURED = measured_energy.KEPT.name
 RING = "tasks/ring_steps.parquet"
-STUDIES = ("alcc", "hcfs")  # whose rows are kept
+# Figures of the studies whose rows are kept, on their pages.
+SHOWN_OF = {
+    "alcc": ("learning_curve", "improvement"),
+    "hcfs": ("case_1_velocities", "case_1_switching_hcfs"),
+}
 SHOWN = {
     "human": "all cars: human drivers",
     "pi_saturation": "one car: PI with saturation",
@@ -123,11 +129,17 @@ def redraw(reference: Path, figures: Path, page: Path) -> list[Path]:
 
 
 def redraw_study(name: str, reference: Path, docs: Path) -> list[Path]:
-    """Write the tables of a study's page, and the page of its figures; return the files."""
-    page, report = docs / f"{name}.md", docs / "reports" / f"{name}.html"
-    report.parent.mkdir(exist_ok=True)
-    shutil.copyfile(REPORTS[name](reference / name, (), page), report)
-    return [page, report]
+    """Write the tables of a study's page, and the figures that it shows; return the files."""
+    page, made = docs / f"{name}.md", []
+    with TemporaryDirectory() as place:
+        kept = shutil.copytree(reference / name, Path(place) / name)
+        found = RESULTS[name](kept)
+        found.tables |= narrow(found.tables) if name == "alcc" else {}
+        found.fill(page)
+        for figure in SHOWN_OF[name]:
+            made.append(docs / "figures" / f"{name}_{figure}.png")
+            shutil.copyfile(kept / "figures" / f"{figure}.png", made[-1])
+    return [page, *made]
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -141,7 +153,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.ring is not None:
         keep_ring(options.ring, options.reference / RING)
     print(*redraw(options.reference, options.figures, Path(options.page)), sep="\n")
-    for name in STUDIES:
+    for name in SHOWN_OF:
         print(*redraw_study(name, options.reference, Path(options.page).parent), sep="\n")
     return 0
 

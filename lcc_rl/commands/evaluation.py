@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,17 +108,22 @@ def made_by(table: Path) -> str | None:
     return parquet_metadata(table).get(IDENTITY) if table.exists() else None
 
 
+def is_current(table: Path, cfg: StudyConfig, policies: Iterable[Path] = ()) -> bool:
+    """Whether a table is that of a configuration, and not older than its policies."""
+    if made_by(table) != identity(cfg):
+        return False
+    made, files = table.stat().st_mtime, [x / POLICY if x.is_dir() else x for x in policies]
+    return all(file.stat().st_mtime <= made for file in files if file.exists())
+
+
 def complete(cfg: EvaluateConfig, folder: Path) -> None:
     """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
-    table = folder / EPISODES
-    if made_by(table) == identity(cfg):
-        named = cfg.compare.values() if isinstance(cfg.compare, Mapping) else cfg.compare
-        made, names = table.stat().st_mtime, (cfg.policy, *named)
-        paths = [Path(run) for who in names if isinstance(who, str) for run in _runs_of(Path(who))]
-        files = [path / POLICY if path.is_dir() else path for path in paths]
-        if all(path.stat().st_mtime <= made for path in files if path.exists()):
-            log.info("%s: finished before", folder.name)
-            return
+    named = cfg.compare.values() if isinstance(cfg.compare, Mapping) else cfg.compare
+    names = [who for who in (cfg.policy, *named) if isinstance(who, str)]
+    policies = [Path(run) for who in names for run in _runs_of(Path(who))]
+    if is_current(folder / EPISODES, cfg, policies):
+        log.info("%s: finished before", folder.name)
+        return
     run(cfg, folder, quiet=cfg.evaluation.shards > 1)
     forget(folder)
 

@@ -15,7 +15,7 @@ from lcc_rl.config.compose import (
     own_file,
     parsed,
 )
-from lcc_rl.config.words import check_overrides, key_of, root_key
+from lcc_rl.config.words import check_overrides, key_of, quoted, root_key
 
 __all__ = [
     "HYDRA_ERRORS",
@@ -33,5 +33,6 @@ __all__ = [
     "load",
     "own_file",
     "parsed",
+    "quoted",
     "root_key",
 ]

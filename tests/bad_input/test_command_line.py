@@ -68,9 +68,7 @@ REFUSED = {
     "status nowhere": "nowhere: no such folder",
     "reproduce alcc --recipe smok": "smok",
     "reproduce alcc --recipe smoke --jobs 1000000000": "jobs must lie from 1 to",
-    "reproduce hcfs --recipe smoke --accept nonsense": "setting in accept 'nonsense'",
     "reproduce alcc --recipe smoke hydra.run.dir=x": "hydra.run.dir=x has no effect",
-    "reproduce report nowhere": "no evaluation/episodes.parquet",
 }
 # Commands that write what they are told to, and never over what is there: {file}, {run}.
 NAMED = (

@@ -34,10 +34,10 @@ def test_everything_is_drawn_again_and_the_page_is_the_same(tmp_path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "pictures"), [("alcc", 12), ("hcfs", 13)])
-def test_the_page_of_a_study_holds_the_tables_that_are_kept(tmp_path, name, pictures) -> None:
-    shutil.copytree(ROOT / redraw.REFERENCE / name, tmp_path / name)
+@pytest.mark.parametrize("name", redraw.SHOWN_OF)
+def test_the_page_of_a_study_holds_the_tables_that_are_kept(tmp_path, name) -> None:
+    (tmp_path / "figures").mkdir()
     page = Path(shutil.copy(ROOT / "docs" / f"{name}.md", tmp_path))
-    _, report = redraw.redraw_study(name, tmp_path, tmp_path)
+    _, *figures = redraw.redraw_study(name, ROOT / redraw.REFERENCE, tmp_path)
     assert page.read_text() == (ROOT / "docs" / f"{name}.md").read_text()
-    assert report.read_text().count("<img ") == pictures
+    assert all(figure.stat().st_size > 10_000 for figure in figures)
