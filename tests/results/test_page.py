@@ -21,7 +21,7 @@ from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.cells import as_markdown, heading
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, verdict
 from lcc_rl.results.means import Means
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import in_words, worded
 from lcc_rl.results.tables import summary
 from lcc_rl.studies.results import StudyResults
 
@@ -97,7 +97,7 @@ def test_a_study_writes_files_and_fills_marked_tables(tmp_path) -> None:
     pd.testing.assert_frame_equal(read_parquet(tmp_path / "tables" / "energies.parquet"), TABLE)
     text = made.write("A study").read_text()
     assert "![A line](figures/line.png)" in text
-    assert as_markdown(TABLE) in text
+    assert as_markdown(worded(TABLE)) in text
 
 
 def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> None:
