@@ -17,8 +17,8 @@ import matplotlib as mpl
 import pytest
 from commands import DATA, QUICK, jobs_in_threads, process_state, run_command
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from page_blocks import PAGES, ROOT, Block, blocks, commands, inline, words_of
 from page_files import LEFT_OUT, write_named
-from pages import PAGES, ROOT, Block, blocks, commands, inline, words_of
 
 from lcc_rl import learn
 from lcc_rl.cli import console

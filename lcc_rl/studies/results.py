@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
@@ -17,7 +15,6 @@ from lcc_rl.results.cells import as_markdown
 from lcc_rl.results.names import worded
 
 PAGE = "results.md"
-MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 
 
 class StudyResults:
@@ -54,20 +51,3 @@ class StudyResults:
             text = "\n\n".join([f"# {title}", *self.blocks])
             temporary.write_text(f"{text}\n", encoding="utf-8")
         return self.folder / PAGE
-
-    def fill(self, page: Path) -> None:
-        """Write tables into a Markdown file, between ``<!-- table: name -->`` and ``<!-- end -->``.
-
-        Raises:
-            ResultsError: if there is no table of a marked name, or the file cannot be written.
-        """
-
-        def marked(found: re.Match[str]) -> str:
-            begin, name, end = found.groups()
-            if name not in self.tables:
-                raise ResultsError(f"{page}: no table {name!r}; known: {', '.join(self.tables)}")
-            return f"{begin}\n\n{as_markdown(worded(self.tables[name]))}\n\n{end}"
-
-        text = MARKED.sub(marked, page.read_text(encoding="utf-8"))
-        with atomic_path(page) as temporary:
-            temporary.write_text(text, encoding="utf-8")

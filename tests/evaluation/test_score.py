@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from pages import ROOT
+from page_blocks import ROOT
 
 import lcc_rl
 from lcc_rl.commands.score import about, main, scored

@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import run_command
-from pages import ROOT
+from page_blocks import ROOT
 from tensordict import TensorDict
 
 from lcc_rl.agents.factory import build_agent
