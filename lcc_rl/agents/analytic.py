@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.actor import seeded_mlp
 from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal
+from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.agents.objective import Objective
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.data.profiles import Profiles
@@ -65,6 +66,8 @@ class Analytic(Agent):
     humans_first: NonNegative = 0.0
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
+
+    loop = GradientLoop
 
     def settled(self) -> None:
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")

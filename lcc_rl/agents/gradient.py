@@ -12,7 +12,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, episode_statistics
 from lcc_rl.agents.objective import Objective
@@ -27,7 +26,7 @@ log = logging.getLogger("lcc_rl")
 WORTH_COMPILING = 100
 
 
-class GradientTrainer(TrainingLoop[Analytic]):
+class GradientLoop(TrainingLoop[Any]):
     """Trains by the simulator's gradient; arguments as of :class:`TrainingLoop`.
 
     A segment of the settings is the stretch through which gradients flow; the whole episode where

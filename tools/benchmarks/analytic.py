@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.harness import Row, Run, rates
 from lcc_rl.agents.factory import build_agent, make_trainer
-from lcc_rl.agents.gradient import GradientTrainer
+from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
 
@@ -28,7 +28,7 @@ def analytic(options: Namespace) -> list[Row]:
     agent.take(profiles)
     with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder, torch.enable_grad():
         trainer = make_trainer(cfg, agent, profiles, inputs.population, Path(folder))
-        assert isinstance(trainer, GradientTrainer)
+        assert isinstance(trainer, GradientLoop)
         own: Run = partial(trainer._numbers, trainer._source())
         batch = cfg.training.environments
         return rates(options, {OWN: own}, "iterations/s", {OWN: 1}, {}, batch, grad=True)

@@ -16,8 +16,9 @@ from benchmarks.harness import Row, Run, installed, rates
 from benchmarks.plain import alcc, training
 from lcc_rl.agents import DDPG, SAC, TD3
 from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.collecting import LEARNED_FROM, transitions
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.agents.replay import LEARNED_FROM, draws, transitions
+from lcc_rl.agents.replay import draws
 
 AGENTS: tuple[type[OffPolicy], ...] = (DDPG, TD3, SAC)
 SIZES = ((64, 60), (256, 40), (1024, 20))  # batch, updates of a repeat
