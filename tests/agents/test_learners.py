@@ -1,4 +1,4 @@
-"""PPO and a learner of the page's own: deterministic, resumable bit for bit, evaluated like others."""
+"""PPO, and the learner that a page shows: deterministic, and resumable bit for bit."""
 
 from __future__ import annotations
 
@@ -31,9 +31,8 @@ EACH = pytest.mark.parametrize("agent", AGENTS)
 @pytest.fixture(autouse=True)
 def my_learner(monkeypatch) -> None:
     """The module that docs/extend.md tells to write."""
-    (text,) = (
-        x.text for x in blocks(ROOT / "docs" / "extend.md") if "my_learner.py" in x.text[:20]
-    )
+    page = (block.text for block in blocks(ROOT / "docs" / "extend.md"))
+    (text,) = (text for text in page if text.startswith("# my_learner.py"))
     module = ModuleType("my_learner")
     monkeypatch.setitem(sys.modules, "my_learner", module)
     exec(text, vars(module))
@@ -85,11 +84,13 @@ def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
 
 
 def test_every_vehicle_is_a_trajectory_of_its_own(tmp_path, monkeypatch) -> None:
-    seen = []
-    update = PPO.update
-    monkeypatch.setattr(
-        PPO, "update", lambda self, data: (seen.append(data), update(self, data))[1]
-    )
+    seen, update = [], PPO.update
+
+    def seeing(self, data):
+        seen.append(data.clone())
+        return update(self, data)
+
+    monkeypatch.setattr(PPO, "update", seeing)
     loop = make(tmp_path, "ppo", "scenario.string='automated human automated human'")
     loop.run()
     data = seen[0]
