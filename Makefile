@@ -26,7 +26,7 @@ test-all: lint
 
 # Without them, test-all skips their tests: interfaces, the site, SUMO …
 extras: $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[test,interfaces,docs,bench,sumo,sweeps,fetch]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[test,interfaces,docs,bench,sumo,sweeps]"
 
 coverage: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --cov $(ARGS)

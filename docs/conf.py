@@ -35,7 +35,7 @@ autodoc_typehints_format, python_maximum_signature_line_length = "short", 80
 python_use_unqualified_type_names = True
 
 PLAIN = (".html",)  # opened, not saved, by a click
-OPENED = ("ring.html", "reports")
+OPENED = ("ring.html",)
 RING = "pretrained/ring-22"  # drives in ring.html, which is written here
 CONFIGURATION = "reference/configuration"
 NAMED = re.compile(r"(?<!!)\[[\w/]+\.md\]\(([\w/.]+\.md[^)\s]*)\)")  # a link that reads as its file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from pages import ROOT, blocks
+from page_blocks import ROOT, blocks
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs.transforms import Transform

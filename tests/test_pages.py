@@ -17,8 +17,8 @@ import matplotlib as mpl
 import pytest
 from commands import DATA, QUICK, jobs_in_threads, process_state, run_command
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from page_blocks import PAGES, ROOT, Block, blocks, commands, inline, words_of
 from page_files import LEFT_OUT, write_named
-from pages import PAGES, ROOT, Block, blocks, commands, inline, words_of
 
 from lcc_rl import learn
 from lcc_rl.cli import console
@@ -32,12 +32,11 @@ NOT_RUN = {
     "source": "of the shell",
     "export": "of the shell",
     "ls": "of the shell",
+    "curl": "downloads",
     "lcc-rl reproduce": "tests/studies run both studies at the size of a try",
-    "python tools/sumo_ring.py": "tests/interfaces/test_sumo_bridge.py drives in SUMO",
     "lcc-rl animate": "tests/results/test_motion.py runs it",
     "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
     "lcc-rl score": "tests/evaluation/test_score.py runs it",
-    "lcc-rl maps": "tests/results/test_figures.py runs it",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
     "python tools/kill_test.py": "takes an hour",
 }
@@ -60,6 +59,8 @@ ENOUGH = {
     "--iterations 200": "--iterations 2",
     '["experiment=limits"]': repr([LENGTH, *TRAINING, *WINDOWS, *DATA]),
     '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
+    'learn("alcc", words,': f'learn("alcc", [*words, *{list(SMALL)}],',
+    "n_trials=40": "n_trials=2",
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
@@ -70,13 +71,16 @@ ENOUGH = {
     "(0, 2999, 5999)": "(0, 9, 19)",
 }
 ENTRIES = {"run": "pipeline"}  # entry points that are not called as their command
-SHELL = {"source", "export", "ls"}
-ALWAYS = {"tools/sumo_ring.py": ("task=ring-22",)}  # settings that a tool gives itself
+SHELL = {"source", "export", "ls", "curl"}
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-NEEDS = {"interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime")}  # extras of a page
+# Extras of a page.
+NEEDS = {
+    "interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime"),
+    "sweeps.md": ("optuna",),
+}
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
-LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
+LAUNCH = ("hydra/launcher=",)  # of extras that need not be installed
 CHOICES = set((ROOT / "conf").rglob("*.yaml"))
 
 
@@ -149,7 +153,7 @@ class Reader:
             module = console.COMMANDS[rest[0]][0].replace(".", "/")
             options_exist(ROOT / f"{module}.py", rest)
         else:
-            assert program in SHELL or rest[0] == "-h"
+            assert program in SHELL or rest[0] == "-h", program
 
     def end(self, page: Path) -> None:
         """Check the commands and choices inside the text."""
@@ -177,7 +181,7 @@ class Runner(Reader):
 
     def command(self, words: list[str], error: str | None) -> None:
         """Run one command; one whose error the page shows ends with it."""
-        if shlex.join(words).startswith(tuple(NOT_RUN)) or "hydra/sweeper=" in " ".join(words):
+        if shlex.join(words).startswith(tuple(NOT_RUN)):
             return
         words = [word for word in words if not word.startswith(LAUNCH)]
         for group, (key, path) in LEFT_OUT.items():
@@ -247,7 +251,7 @@ def options_exist(source: Path, words: Sequence[str]) -> None:
     flags = {flag.replace("--no-", "--") for flag in given}
     assert all(f'"{flag}"' in text for flag in flags - {"--help"}), words
     typed = [word for word in words if re.match(r"[+~]?[\w./@]+=", word)]
-    once("train", (*ALWAYS.get(words[0], ()), *typed))
+    once("train", tuple(typed))
 
 
 @cache

@@ -71,7 +71,6 @@ def test_every_page_is_reached_and_links_read_as_words(site) -> None:
         text = (site / address).read_text(encoding="utf-8")
         assert not re.search(r"<a [^>]*>(<[^>]+>)*[\w/]+\.md<", text), address
     assert (site / "ring.html").exists()
-    assert (site / "reports" / "alcc.html").exists()
 
 
 def test_signatures_are_not_cut_off(site) -> None:

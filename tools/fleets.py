@@ -1,28 +1,14 @@
-"""What fleets save over the share of automated vehicles, as figures of docs/figures.
-
-``python tools/fleets.py i24-mixed`` prints what learned fleets save beside the front of a rule, as
-a Markdown table, and draws both, of what tools/keep.py fleets keeps. ``python tools/fleets.py
-ring-22 <evaluation>…`` keeps the scores of evaluations of ring-22, each with another
-scenario.string, and draws them; without runs it draws again what is kept.
-"""
+"""What fleets save over the share of automated vehicles, for docs/tasks.md."""
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from leaderboard import task_scores
 from matplotlib.figure import Figure
 
-from lcc_rl.cli.guard import main_guard
-from lcc_rl.errors import require
-from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, save, style
-from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, style
 from lcc_rl.results.cells import markdown_row
 from lcc_rl.results.fronts import (
     DISTANCE,
@@ -38,11 +24,8 @@ from lcc_rl.results.fronts import (
 from lcc_rl.results.intervals import Estimate
 
 SHARE, LEARNED = "penetration", "learned"
-REFERENCE, FIGURES = Path("outputs/reference/tasks"), Path("docs/figures")
-RING = "fleets_ring"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
 HUMAN, RULE = "human", "idm_acc"
-FRONTS = "fleets_fronts.parquet"
 SETTINGS = {  # of what is kept for fronts, for readers
     "front": "I-24, 100 s",
     "free": "free driving, 100 s",
@@ -61,16 +44,6 @@ SHOWN_AS = {
     "pi_saturation": ("PI with saturation", "#d55e00"),
 }
 COLOURS = ("#56b4e9", "#009e73", "#e69f00", "#cc79a7")  # of the shares of a front
-
-
-def scored(run: Path) -> pd.DataFrame:
-    """Return the scores of one evaluation, with its share of automated vehicles."""
-    cfg, task, _, found = task_scores(run)
-    require(task.name == "ring-22", f"{run}: an evaluation of {task.name}, not of ring-22")
-    found["strategy"] = found["strategy"].astype(str).replace(cfg.variant, LEARNED)
-    string = cfg.scenario.vehicles
-    found.insert(0, SHARE, string.count(AUTOMATED) / len(string))
-    return found
 
 
 def fronts(rows: pd.DataFrame) -> str:
@@ -156,7 +129,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
 
 
 @paper
-def drawn(table: pd.DataFrame) -> Figure:
+def drawn_ring(table: pd.DataFrame) -> Figure:
     """Draw what the ring shows over the share; hollow where a limit is missed."""
     figure = new_figure(PAGE, 3.2)
     axes = figure.subplots(1, len(SHOWN))
@@ -189,27 +162,3 @@ def drawn(table: pd.DataFrame) -> Figure:
         figure, "filled: keeps all limits of the task; vertical lines: 95 % interval of learned"
     )
     return figure
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Keep the scores of the runs given, and draw."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("task", choices=["i24-mixed", "ring-22"])
-    parser.add_argument("runs", nargs="*", type=Path, help="folders of evaluations of ring-22")
-    parser.add_argument("--reference", type=Path, default=REFERENCE, help="where scores are kept")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder of the image")
-    options = parser.parse_args(words)
-    if options.task == "i24-mixed":
-        rows = read_parquet(options.reference / FRONTS)
-        print(fronts(rows))
-        save(drawn_fronts(rows), options.figures / "fleets.png")
-        return 0
-    kept = options.reference / f"{RING}.parquet"
-    if options.runs:
-        write_parquet(pd.concat(map(scored, options.runs), ignore_index=True), kept)
-    print(save(drawn(read_parquet(kept)), options.figures / f"{RING}.png"))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main_guard(main)())

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import torch
 from pydantic import Field
@@ -16,6 +16,9 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Settings, values
+
+if TYPE_CHECKING:
+    from lcc_rl.agents.loop import TrainingLoop
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
@@ -45,8 +48,10 @@ class Scene:
 class Agent(Settings, ABC):
     """Settings of an algorithm; started in a scene, what it learns: ``policy``.
 
-    ``policy`` reads ``"observation"`` and writes ``"action"``.
+    ``policy`` reads ``"observation"`` and writes ``"action"``; ``loop`` trains it.
     """
+
+    loop: ClassVar[type[TrainingLoop[Any]]]
 
     if TYPE_CHECKING:  # what setup makes
 
@@ -66,17 +71,29 @@ class Agent(Settings, ABC):
     def take(self, profiles: Profiles) -> None:
         """Take what depends on the records to learn behind: nothing, unless overridden."""
 
-    @abstractmethod
     def anneal(self, share: float) -> float:
-        """Set the learning rates after this share of the training; return the policy's."""
+        """Set the learning rates after this share of the training; return the policy's.
 
-    @abstractmethod
+        Unless overridden they stay as they are.
+        """
+        rates = (x.param_groups[0]["lr"] for x in self._parts().values() if hasattr(x, "step"))
+        return float(next(rates, 0.0))
+
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
+        """Return everything that :meth:`load_state_dict` needs to resume bit for bit.
 
-    @abstractmethod
+        Unless overridden that is the state of every attribute that has one, such as networks and
+        optimizers; random numbers come from :func:`derived_seed` and need no state.
+        """
+        return {name: part.state_dict() for name, part in self._parts().items()}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+
+    def _parts(self) -> dict[str, Any]:
+        return {name: part for name, part in vars(self).items() if hasattr(part, "state_dict")}
 
 
 def derived_seed(*parts: object) -> int:

@@ -9,22 +9,43 @@ et al., "Accelerated policy learning with parallel differentiable simulation", I
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Sequence
+from dataclasses import field
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from lcc_rl.agents.actor import seeded_mlp
-from lcc_rl.agents.agent import Fraction, Scene, anneal
-from lcc_rl.agents.simulated import SimulatedAgent
+from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal
+from lcc_rl.agents.gradient import GradientLoop
+from lcc_rl.agents.objective import Objective
+from lcc_rl.agents.rules import make_policy
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import require
-from lcc_rl.settings import Count, NonNegative, Positive
+from lcc_rl.settings import Count, NonNegative, Positive, Share
 
 
-class Analytic(SimulatedAgent):
-    """A policy, its optimizer, the objective's smooth terms and, if asked for, a value."""
+class Analytic(Agent):
+    """A policy, its optimizer, the objective's smooth terms and, if asked for, a value.
 
+    Once started, ``policy`` is the module.
+    """
+
+    # A network; a rule with learned constants (idm, acc); or a network on top of a rule
+    # (residual_idm, residual_acc).
+    policy: Any = "network"
+    constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
+    hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of a network
+    # Nodes of reward terms that take the place of those of the same name in the objective; their
+    # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
+    surrogates: dict[str, Any] = field(default_factory=dict)
+    # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
+    # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
+    limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
+    limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
+    regularizers: dict[str, Any] = field(default_factory=dict)  # terms of the objective only
     learning_rate: Positive = 3e-3  # of the policy at the start; it falls along half a cosine
     final_lr_fraction: Fraction = 0.05  # of it that is left at the end
     # Gradients longer than this are shortened to it; through 300 steps of traffic they can become
@@ -46,11 +67,23 @@ class Analytic(SimulatedAgent):
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
 
+    loop = GradientLoop
+
     def settled(self) -> None:
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
 
     def setup(self, scene: Scene) -> None:
-        super().setup(scene)
+        assert scene.observation is not None
+        self.objective = Objective(self, scene.device, scene.world)
+        module = make_policy(
+            self.policy,
+            scene.observation,
+            self.hidden,
+            scene.seed,
+            self.constants,
+            scene.max_acceleration,
+        )
+        self.policy = module.to(scene.device)
         size, seed = scene.observation_size, scene.seed + 1
         self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
         self.value = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
@@ -61,6 +94,10 @@ class Analytic(SimulatedAgent):
             betas=(0.9, 0.99),
         )
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=self.value_lr)
+
+    def take(self, profiles: Profiles) -> None:
+        """Take the limits that recorded drivers set."""
+        self.objective.limits.take(profiles)
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""

@@ -6,11 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.agents.agent import Agent, Scene
-from lcc_rl.agents.analytic import Analytic
-from lcc_rl.agents.gradient import GradientTrainer
 from lcc_rl.agents.loop import TrainingLoop
-from lcc_rl.agents.replay import Trainer
-from lcc_rl.agents.tuned import SearchLoop, Tuned
 from lcc_rl.config import identity
 from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import StudyConfig
@@ -46,18 +42,15 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
 
 def make_trainer(
     cfg: StudyConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
-) -> TrainingLoop:
+) -> TrainingLoop[Any]:
     """Build the training loop of an agent with its environment.
 
     Raises:
         ConfigError: naming the option at fault.
     """
-    own = after_humans(cfg, cfg.agent.get("humans_first", 0.0))
+    own = after_humans(cfg, getattr(agent, "humans_first", 0.0))
     env = build_env(own, profiles, population, cfg.training.environments, 0, cfg.device)
-    loops: dict[type, Any] = {Analytic: GradientTrainer, Tuned: SearchLoop}
-    loop: Any = next((loops[kind] for kind in loops if isinstance(agent, kind)), Trainer)
-    trained: TrainingLoop = loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
-    return trained
+    return agent.loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
 def check_lengths(cfg: StudyConfig) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -11,12 +12,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.agents.loop import REPORTED, episode_statistics
-from lcc_rl.agents.simulated import SimulatedLoop
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, episode_statistics
+from lcc_rl.agents.objective import Objective
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
-from lcc_rl.pieces.base import next_key
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.pieces.base import as_key, next_key
+from lcc_rl.pieces.rewards import REWARD, RewardTerm
 
 log = logging.getLogger("lcc_rl")
 
@@ -24,7 +26,7 @@ log = logging.getLogger("lcc_rl")
 WORTH_COMPILING = 100
 
 
-class GradientTrainer(SimulatedLoop[Analytic]):
+class GradientLoop(TrainingLoop[Any]):
     """Trains by the simulator's gradient; arguments as of :class:`TrainingLoop`.
 
     A segment of the settings is the stretch through which gradients flow; the whole episode where
@@ -35,7 +37,9 @@ class GradientTrainer(SimulatedLoop[Analytic]):
     watched = "loss_actor"
 
     def _prepare(self) -> None:
-        super()._prepare()
+        self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
+        self.objective: Objective = self.agent.objective
+        self.objective.replace(self.terms)
         self.horizon -= self.agent.burn_in
         if not self.agent.bootstrap and self.settings.segment < self.horizon:
             log.warning(
@@ -52,6 +56,25 @@ class GradientTrainer(SimulatedLoop[Analytic]):
         if compiled is None:
             compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
         return self._rollout(compiled)
+
+    def _rollout(self, compiled: bool = False) -> DifferentiableRollout:
+        """Return what plays episodes for the objective, and records the reward's terms."""
+        known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
+        return DifferentiableRollout(
+            self.env,
+            wanted=self.objective.wanted(known),
+            observed=[REWARD, *(term.targets[0] for term in self.terms)],
+            compiled=compiled,
+        )
+
+    def _limits_row(self, shares: Mapping[str, float]) -> dict[str, float]:
+        """Return the columns of the limits: how often each was missed, and at which price."""
+        price, largest = self.objective.limits.price, self.objective.limits.largest
+        return {
+            **{f"limit_{name}": largest[name] for name in shares},
+            **{f"share_{name}": share for name, share in shares.items()},
+            **{f"price_{name}": price(name) for name in shares},
+        }
 
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Play one batch of episodes, with a gradient step after every segment of them."""

@@ -23,7 +23,7 @@ class Objective:
 
     Args:
         settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
-            :class:`lcc_rl.agents.simulated.SimulatedAgent`.
+            :class:`lcc_rl.agents.analytic.Analytic`.
         device: where the terms compute.
         world: what the terms share.
 

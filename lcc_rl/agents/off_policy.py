@@ -20,6 +20,7 @@ from torchrl.objectives.common import LossModule
 from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
 from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
 from lcc_rl.agents.fused import ActorCritic
+from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.agents.vectors import join, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole, given_as
@@ -78,6 +79,7 @@ class OffPolicy(Agent):
     # in less time; False differentiates the loss itself.
     fused: bool = True
 
+    loop = ReplayLoop
     critics: ClassVar[int] = 1
     joint: ClassVar[bool] = True  # whether one optimizer steps all that is learned at once
 

@@ -54,7 +54,7 @@ class SampledAction(TensorDictModuleBase):
 
     sigma: Tensor
 
-    def __init__(self, head: Head) -> None:
+    def __init__(self, head: nn.Module) -> None:
         self.in_keys = [OBSERVATION, SEED, STEP]
         self.out_keys = [ACTION]
         super().__init__()

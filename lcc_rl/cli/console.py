@@ -24,9 +24,7 @@ TOOLS = {
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
     "score": ("lcc_rl.commands.score", "any policy on every task and source that it fits"),
     "animate": ("lcc_rl.commands.animate", "episodes as a moving picture: page, SVG, GIF, MP4"),
-    "maps": ("lcc_rl.commands.maps", "what policies do over gap and relative speed"),
-    "reproduce": ("lcc_rl.studies.reproduce", "a paper's study, to one page"),
-    "fetch": ("lcc_rl.commands.fetch", "download NGSIM trajectories"),
+    "reproduce": ("lcc_rl.studies.reproduce", "a paper's study: tables and figures"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
     "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
 }

@@ -12,14 +12,13 @@ log = logging.getLogger("lcc_rl")
 
 
 @entry_point("train", "lcc_rl.commands.training")
-def main(cfg: TrainConfig) -> float | list[float]:
-    """Train into the run's folder; return the objective to a sweeper that optimises."""
-    from lcc_rl.commands.training import complete, objective, run  # loads torch
+def main(cfg: TrainConfig) -> None:
+    """Train into the run's folder."""
+    from lcc_rl.commands.training import complete, run  # loads torch
 
     folder = resumed_folder(cfg, ("resume", "trust", "logger"))
-    episodes = complete(cfg, folder) if is_sweep() else run(cfg, folder)
+    (complete if is_sweep() else run)(cfg, folder)
     log.info("results in %s", folder)
-    return objective(cfg, episodes)
 
 
 if __name__ == "__main__":

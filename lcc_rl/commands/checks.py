@@ -20,7 +20,7 @@ from lcc_rl.envs.inputs import (
     constant_profiles,
 )
 from lcc_rl.envs.rollout import OBSERVATION
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import any_leader, plan_of
 from lcc_rl.evaluation.named import DIRECT, controller_of
 from lcc_rl.evaluation.strategies import Strategy, applies, deployed
@@ -28,25 +28,6 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
 
-# What a sweeper may optimise: columns of the summary that need no other strategy beside them.
-OBJECTIVES = {
-    "episodes": (
-        "kj_per_km",
-        "total_path_energy_kj",
-        "total_energy_kj",
-        "total_net_energy_kj",
-        "cav_energy_kj",
-        "hdv_energy_kj",
-        "collisions",
-        "min_ttc_s",
-        "share_ttc_unsafe",
-        "share_time_gap_long",
-        "share_time_gap_long_moving",
-        "rms_jerk_mps3",
-    ),
-    # Of the table of windows; it has no energies, the default is read as the first.
-    "vehicles": ("speed_error_sum_mps", "jerk_sum_mps3", "collisions", "peak_jerk_mps3"),
-}
 MESSAGES = "communication"  # the piece by which connected vehicles hear of each other
 MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
 MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
@@ -65,7 +46,6 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
             "divide that of lcc-rl evaluate policy=<run>"
         )
     check_installed(cfg)
-    objectives(cfg)
     build_logger(cfg)
     build_source(cfg.data)
     build(cfg.split, "split", CALLED)
@@ -184,18 +164,6 @@ def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
     """Whether there is somebody to drive, by the same kind of controller as in another one."""
     kinds = [part.scenario.controllers[AUTOMATED].get(TARGET) for part in (cfg, own)]
     return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] == kinds[1]
-
-
-def objectives(cfg: TrainConfig) -> list[str]:
-    """Return the columns of the summary that ``objective`` names."""
-    known = OBJECTIVES[cfg.evaluation.rows]
-    names = [cfg.objective] if isinstance(cfg.objective, str) else cfg.objective
-    if cfg.evaluation.rows == "vehicles" and names == [TrainConfig.objective]:
-        return [known[0]]
-    for name in names or [""]:
-        if name not in known:
-            raise unknown_name("objective", name, known)
-    return names
 
 
 def check_measured(cfg: StudyConfig) -> None:

@@ -21,7 +21,7 @@ from rich.text import Text
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
-from lcc_rl.config import load, root_key
+from lcc_rl.config import NOT_IDENTITY, load, root_key, with_inputs
 from lcc_rl.config.nodes import TARGET, with_defaults
 from lcc_rl.config.schemas import (
     KINDS,
@@ -43,7 +43,15 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
-from lcc_rl.results.runs import FINAL, PARTS, check_folder, load_config, resumed_config, save_config
+from lcc_rl.results.runs import (
+    EPISODES,
+    FINAL,
+    PARTS,
+    check_folder,
+    load_config,
+    resumed_config,
+    save_config,
+)
 from lcc_rl.results.savings import RULE
 from lcc_rl.results.tables import remarks, summary
 from lcc_rl.runs.interrupts import INTERRUPTED
@@ -143,7 +151,11 @@ def _run(
         part.data = with_defaults(_episodes(cfg, folder))
         part.drivers = with_defaults({"_target_": BOOTSTRAP, "path": str(drivers)})
     tell(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
-    _train_all(trainings, folder, cfg.jobs)
+    try:
+        train_all(trainings, folder, cfg.jobs)
+    except Interrupted:
+        words = f"stopped; complete it with: lcc-rl run resume={folder}"
+        raise Interrupted(words) from None
     final.compare = [
         str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()
     ]
@@ -210,9 +222,19 @@ def _pass_on(lines: Sequence[str]) -> None:
         log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
 
 
-def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
-    """Train the variants side by side, each in a process and a folder of its own."""
-    todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name)}
+def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
+    """Train side by side, each in a process and a folder of its own; finished ones are skipped.
+
+    Args:
+        parts: the trainings, by their folders below ``folder``.
+        folder: the job's folder.
+        jobs: trainings at a time.
+
+    Raises:
+        LccError: the error of the first that failed, once all others ended.
+        Interrupted: on SIGINT or SIGTERM, after every running training saved its state.
+    """
+    todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name, cfg)}
     # A fresh interpreter per training: forking a process that has used torch's threads can hang.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _end_with_parent) as pool:
@@ -227,7 +249,7 @@ def _train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 process.terminate()  # a training saves its state first
-            raise Interrupted(f"stopped; complete it with: lcc-rl run resume={folder}") from None
+            raise Interrupted("stopped; the same command resumes it") from None
 
 
 def _end_with_parent() -> None:
@@ -263,8 +285,10 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
         handler.close()
 
 
-def _finished(folder: Path) -> bool:
-    return (folder / "episodes.parquet").exists()
+def _finished(folder: Path, cfg: TrainConfig) -> bool:
+    """Whether a training is complete; one of other settings is refused."""
+    check_folder(with_inputs(cfg), folder, *NOT_IDENTITY)
+    return (folder / EPISODES).exists()
 
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:

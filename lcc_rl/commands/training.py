@@ -12,7 +12,7 @@ import torch
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
-from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings, objectives
+from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
@@ -21,7 +21,6 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
-from lcc_rl.functional.safety import NEVER
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
@@ -174,12 +173,3 @@ def measured(rows: Rows) -> dict[str, Any]:
     vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
     table = case_table(rows, WINDOWS) if vehicles else summary(rows)
     return {str(key): value for key, value in table.iloc[-1].items()}
-
-
-def objective(cfg: TrainConfig, rows: Rows) -> float | list[float]:
-    """Return what a sweeper is to optimise: columns of the summary that ``objective`` names."""
-    found = measured(rows)
-    if pd.isna(found.get("min_ttc_s")):
-        found["min_ttc_s"] = NEVER  # no gap ever closed; a sweeper needs a number
-    values = [float(found[name]) for name in objectives(cfg)]
-    return values[0] if isinstance(cfg.objective, str) else values

@@ -16,7 +16,7 @@ from lcc_rl.config.compose import (
     parsed,
     with_inputs,
 )
-from lcc_rl.config.words import check_overrides, key_of, root_key
+from lcc_rl.config.words import check_overrides, key_of, quoted, root_key
 
 __all__ = [
     "HYDRA_ERRORS",
@@ -34,6 +34,7 @@ __all__ = [
     "load",
     "own_file",
     "parsed",
+    "quoted",
     "root_key",
     "with_inputs",
 ]

@@ -37,10 +37,10 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 CONF = "lcc_rl.conf"
 # Settings that do not change any row of a result.
 NOT_IDENTITY = (
-    *("resume", "jobs", "sweep", "objective", "logger", "trust", "figure_formats", "table"),
+    *("resume", "jobs", "sweep", "logger", "trust", "figure_formats", "table"),
     "training.keep_every",
 )
-# Launchers and sweepers that come with other packages: which extra brings them.
+# Launchers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hydra's keys are without quotes.
@@ -243,7 +243,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     """Return what Hydra refused in one line, with the nearest choice that exists."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        if group in ("hydra/launcher", "hydra/sweeper") and name in EXTRAS:
+        if group == "hydra/launcher" and name in EXTRAS:
             return ConfigError(f"{group}/{name} is not installed: {how_to_install(EXTRAS[name])}")
         known = error.options or ()
         if not group:

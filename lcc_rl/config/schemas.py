@@ -184,7 +184,6 @@ class StudyConfig(BaseConfig):
 class TrainConfig(StudyConfig):
     """``lcc-rl train``."""
 
-    objective: str | list[str] = "total_path_energy_kj"
     logger: Node = None
 
 

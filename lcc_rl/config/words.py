@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
 from lcc_rl.errors import ConfigError
 
@@ -10,6 +11,11 @@ from lcc_rl.errors import ConfigError
 def key_of(override: str) -> str:
     """Return the dotted key that an override changes."""
     return override.lstrip("+~").split("=")[0]
+
+
+def quoted(path: str | Path) -> str:
+    """Return a path quoted for Hydra's command line."""
+    return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def root_key(override: str) -> str:

@@ -2,24 +2,22 @@
 
 Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Per stretch without a
 missing frame the positions are smoothed, speed and acceleration are their derivatives, and space
-headways are derived again. Smoothing is off unless a configuration names one of these classes.
+headways are derived again. Smoothing is off unless a configuration names this class
+or a function of trajectories.
 
-At the ends of a stretch a window is one-sided or short: measured on noisy positions of known
-motion, the error of the speed is there 3 times that of the interior with Savitzky–Golay and 16
-times with the exponential average, that of the acceleration 6 and 21 times. Rows whose window is
-not whole are therefore left out, 0.7 s (1.7 s) at each end by default; shorter stretches entirely.
+At the ends of a stretch a window is one-sided. On noisy positions of known motion, the error of the
+speed there is 3 times that of the interior, and that of the acceleration 6 times. Rows whose window
+is not whole are left out, by default 0.7 s at each end; shorter stretches are left out entirely.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import correlate1d
 from scipy.signal import savgol_filter
 
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders, stretches
@@ -29,8 +27,22 @@ from lcc_rl.settings import Settings
 Array = NDArray[np.float64]
 
 
-class Smoothing(ABC):
-    """Smoothing of the positions of trajectories, called with them."""
+class SavitzkyGolay(Settings):
+    """Local polynomial fits of positions, called with trajectories.
+
+    Speed and acceleration are the derivatives of the polynomial.
+    """
+
+    # Length of the window [s]; an odd number of frames is taken, at least this long.
+    window_s: Annotated[float, Field(gt=0.0, lt=600.0)] = 1.5
+    order: Annotated[int, Field(ge=2, le=100)] = 3  # of the polynomial
+
+    def settled(self) -> None:
+        if self.window_s < FRAME * (self.order + 1):
+            raise ConfigError(
+                f"smoothing.window_s must be at least {FRAME * (self.order + 1):g} s for order "
+                f"{self.order}, got {self.window_s}"
+            )
 
     def __call__(self, trajectories: Trajectories) -> Trajectories:
         """Return smoothed trajectories; the given ones are not changed.
@@ -75,11 +87,15 @@ class Smoothing(ABC):
         return Trajectories(samples, replace(report, notes=[*report.notes, note]))
 
     @property
-    @abstractmethod
+    def window(self) -> int:
+        """Frames of the window."""
+        return round(self.window_s / FRAME) | 1
+
+    @property
     def margin(self) -> int:
         """Rows at each end of a stretch whose window is not whole."""
+        return self.window // 2
 
-    @abstractmethod
     def smooth(self, position: Array) -> tuple[Array, Array, Array]:
         """Smooth stretches that lie one after another, as if they were one.
 
@@ -90,60 +106,8 @@ class Smoothing(ABC):
             Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; values within
             ``margin`` rows of an end are not used.
         """
-
-
-class SavitzkyGolay(Smoothing, Settings):
-    """Local polynomial fits; speed and acceleration are the derivatives of the polynomial."""
-
-    # Length of the window [s]; an odd number of frames is taken, at least this long.
-    window_s: Annotated[float, Field(gt=0.0, lt=600.0)] = 1.5
-    order: Annotated[int, Field(ge=2, le=100)] = 3  # of the polynomial
-
-    def settled(self) -> None:
-        if self.window_s < FRAME * (self.order + 1):
-            raise ConfigError(
-                f"smoothing.window_s must be at least {FRAME * (self.order + 1):g} s for order "
-                f"{self.order}, got {self.window_s}"
-            )
-
-    @property
-    def window(self) -> int:
-        """Frames of the window."""
-        return round(self.window_s / FRAME) | 1
-
-    @property
-    def margin(self) -> int:
-        return self.window // 2
-
-    def smooth(self, position: Array) -> tuple[Array, Array, Array]:
         settings = {"polyorder": self.order, "delta": FRAME, "mode": "nearest"}
         smoothed, speed, acceleration = (
             savgol_filter(position, self.window, deriv=order, **settings) for order in range(3)
         )
         return smoothed, speed, acceleration
-
-
-class ExponentialAverage(Smoothing, Settings):
-    """Symmetric exponential moving average of Thiemann, Treiber and Kesting (2008).
-
-    A sample k frames away weighs exp(−k·0.1 s/width), up to three widths away. Speed and
-    acceleration are central differences of the smoothed positions and of these speeds.
-    """
-
-    width_s: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.5  # the authors' for positions [s]
-
-    @property
-    def reach(self) -> int:
-        """Frames of the kernel on each side."""
-        return round(3.0 * self.width_s / FRAME)
-
-    @property
-    def margin(self) -> int:
-        return self.reach + 2  # one more for each difference
-
-    def smooth(self, position: Array) -> tuple[Array, Array, Array]:
-        kernel = np.exp(-np.abs(np.arange(-self.reach, self.reach + 1)) * FRAME / self.width_s)
-        smoothed = correlate1d(position, kernel / kernel.sum(), mode="nearest")
-        central = np.array([-0.5, 0.0, 0.5]) / FRAME
-        speed = correlate1d(smoothed, central, mode="nearest")
-        return smoothed, speed, correlate1d(speed, central, mode="nearest")

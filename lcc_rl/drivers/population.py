@@ -5,34 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.drivers.parameters import (
     COLUMNS,
     DEFAULT_BOUNDS,
     IDM,
-    MODEL,
     PLAUSIBLE,
     REACTION,
-    Bounds,
     at_bound,
     users,
 )
 from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of, reaction_of
-from lcc_rl.errors import LAST_SEED, ConfigError, DataError
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.io.memory import require_memory
-from lcc_rl.settings import Count, NonNegative, Positive, checked
-
-DRAWN = 250  # bytes of a driver that is drawn: its parameters in four tables, and its name
+from lcc_rl.settings import NonNegative, Positive, checked
 
 
 @dataclass(frozen=True)
@@ -230,51 +223,6 @@ def _flags(table: pd.DataFrame) -> Tensor:
         return torch.tensor(table["desired_speed_at_bound"].to_numpy(bool))
     values = table[COLUMNS["desired_speed"]].to_numpy(np.float64)
     return torch.tensor(at_bound(values, DEFAULT_BOUNDS["desired_speed"]))
-
-
-@checked
-def kde(
-    path: str | Path | None = None,
-    drivers: Count = 1000,
-    seed: Annotated[int, Field(ge=0, le=LAST_SEED)] = 0,
-    bandwidth: Positive | None = None,
-    bounds: Mapping[str, Any] | None = None,
-    mode: str | None = None,
-) -> DriverPopulation:
-    """Population drawn from a Gaussian kernel density estimate of the joint distribution.
-
-    Args:
-        path: table of calibrated drivers; None takes the shipped I-80 drivers.
-        drivers: number of drivers to draw.
-        seed: seed of the draw.
-        bandwidth: factor on the data's spread; None takes Scott's rule.
-        bounds: calibration bounds by parameter, to which draws are clipped; else their defaults.
-        mode: see :func:`load_drivers`; globally calibrated drivers have five joint parameters.
-
-    Raises:
-        DataError: if the table is not sound, or too small or degenerate for a density.
-    """
-    require_memory({f"kde: drivers={drivers}": drivers * DRAWN})
-    limits = Bounds(**(bounds or {}))
-    table = load_drivers(path, mode)
-    models = sorted(set(models_of(table, "driver table")))
-    if len(models) > 1:
-        raise DataError(f"kde: expected drivers of one model, the table has {', '.join(models)}")
-    columns = {name: COLUMNS[name] for name in LAWS[models[0]].parameters}
-    names = [name for name, column in columns.items() if np.ptp(table[column].to_numpy()) > 0.0]
-    values = table[[COLUMNS[name] for name in names]].to_numpy(np.float64).T
-    from scipy.stats import gaussian_kde  # here: it loads for a second
-
-    try:
-        density = gaussian_kde(values, bw_method=bandwidth)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise DataError(f"kde: {len(table)} drivers do not span a density: {error}") from error
-    draws = density.resample(drivers, seed=np.random.default_rng(seed))
-    drawn = {column: np.full(drivers, table[column].iloc[0]) for column in columns.values()}
-    for name, row in zip(names, draws, strict=True):
-        drawn[COLUMNS[name]] = row.clip(*getattr(limits, name))
-    found = from_table(pd.DataFrame(drawn).assign(**{MODEL: models[0]}))
-    return replace(found, reaction=reaction_of(table, "driver table"), mode=mode_of(table))
 
 
 @checked

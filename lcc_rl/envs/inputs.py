@@ -22,8 +22,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
 
-# What makes drivers of a table, by default the shipped one.
-TABLED = ("lcc_rl.drivers.population.bootstrap", "lcc_rl.drivers.population.kde")
+BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"  # of a table, by default the shipped one
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
 
@@ -159,7 +158,7 @@ def described(population: Population, cfg: StudyConfig) -> str:
 
 def _origin(drivers: Mapping[str, Any]) -> str:
     """Return where drivers come from; of a function of the user's own only its name is known."""
-    if drivers[TARGET] not in TABLED:
+    if drivers[TARGET] != BOOTSTRAP:
         return short_name(drivers[TARGET])
     path = drivers.get("path")
     return f"calibrated, {path}" if path else "fitted to NGSIM I-80, shipped"

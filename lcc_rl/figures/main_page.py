@@ -75,11 +75,11 @@ def write_page(
     page = Page(folder)
     size, table = headline
 
-    def figures(names: dict[str, str]) -> list[tuple[str, str, Path]]:
+    def figures(names: dict[str, str]) -> list[tuple[str, Path]]:
         paths = {page.folder / f"{name}.png": caption for name, caption in names.items()}
-        return [("", caption, path) for path, caption in paths.items() if path.exists()]
+        return [(caption, path) for path, caption in paths.items() if path.exists()]
 
-    page.add("Results", words, [("", size, for_print(table))], figures(RESULTS))
+    page.add("Results", words, [(size, for_print(table))], figures(RESULTS))
     learned = [str(name) for name in table["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
@@ -91,7 +91,7 @@ def write_page(
     for heading, names in {"By driver": improvements, "Drivers": DRIVERS}.items():
         if drawn := figures(names):
             page.add(heading, figures=drawn)
-    page.add("All measures", tables=[("", "Means per strategy", _transposed(found))])
+    page.add("All measures", tables=[("Means per strategy", _transposed(found))])
     return page.write(TITLE, commands)
 
 

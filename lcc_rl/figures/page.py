@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import platform
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
@@ -15,39 +14,33 @@ from typing import Any
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader
-from matplotlib.figure import Figure
 from PIL import Image  # comes with matplotlib
 
-from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import save
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.io.files import PROCESSOR, parquet_metadata, write_parquet
-from lcc_rl.results.cells import as_markdown, columns
+from lcc_rl.io.files import PROCESSOR, parquet_metadata
+from lcc_rl.results.cells import columns
 from lcc_rl.results.names import worded
 
-MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")
 
 
 class Page:
-    """A page of results; its tables and figures are also written as files.
+    """A page of results, without scripts or network.
 
     Args:
-        folder: gets ``report.html``, ``tables/<name>.parquet`` and ``figures/<name>.png``.
-        formats: further formats of the figures, as files only.
+        folder: gets ``report.html``.
     """
 
-    def __init__(self, folder: str | Path, formats: Iterable[str] = ()) -> None:
-        self.folder, self.formats = Path(folder), tuple(formats)
-        self.tables: dict[str, pd.DataFrame] = {}
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
         self.sections: list[dict[str, Any]] = []
 
     def add(
         self,
         heading: str,
         text: str = "",
-        tables: Iterable[tuple[str, str, pd.DataFrame]] = (),
-        figures: Iterable[tuple[str, str, Figure | Path]] = (),
+        tables: Iterable[tuple[str, pd.DataFrame]] = (),
+        figures: Iterable[tuple[str, Path]] = (),
         details: Sequence[tuple[str, str]] = (),
     ) -> None:
         """Add a section.
@@ -55,57 +48,22 @@ class Page:
         Args:
             heading: its title.
             text: plain paragraphs, separated by blank lines.
-            tables: name, caption and rows, see :func:`lcc_rl.results.cells.columns`; a table
-                without a name is not written as a file.
-            figures: name, caption and the figure, or the file of a figure that is drawn already.
+            tables: caption and rows, see :func:`lcc_rl.results.cells.columns`.
+            figures: caption and file.
             details: titles and long texts, folded away.
         """
-        shown, drawn = [], []
-        for name, caption, frame in tables:
-            if name:
-                write_parquet(frame, self.folder / "tables" / f"{name}.parquet")
-                self.tables[name] = frame
-            shown.append((_line(caption), columns(worded(frame))))
-        for name, caption, figure in figures:
-            if isinstance(figure, Figure):
-                place = self.folder / "figures" / f"{name}.png"
-                figure = save(figure, place, dpi=130, formats=self.formats)
-            drawn.append((_line(caption), _webp(figure)))
+        shown = [(_line(caption), columns(worded(frame))) for caption, frame in tables]
+        drawn = [(_line(caption), _webp(path)) for caption, path in figures]
         paragraphs = [_line(part) for part in text.split("\n\n") if part.strip()]
         section = {"heading": heading, "paragraphs": paragraphs, "tables": shown}
         self.sections.append(section | {"figures": drawn, "details": details})
 
-    def fill(self, page: Path) -> None:
-        """Write tables into a Markdown file, between ``<!-- table: name -->`` and ``<!-- end -->``.
-
-        Raises:
-            ResultsError: if the page has no table of a marked name, or the file cannot be written.
-        """
-
-        def table(found: re.Match[str]) -> str:
-            begin, name, end = found.groups()
-            if name not in self.tables:
-                raise ResultsError(f"{page}: no table {name!r}; known: {', '.join(self.tables)}")
-            return f"{begin}\n\n{as_markdown(worded(self.tables[name]))}\n\n{end}"
-
-        text = MARKED.sub(table, page.read_text())
-        with atomic_path(page) as part:
-            part.write_text(text)
-
-    def write(
-        self,
-        title: str,
-        commands: Sequence[str] = (),
-        details: Sequence[tuple[str, str]] = (),
-        more: str = "",
-    ) -> Path:
+    def write(self, title: str, commands: Sequence[str] = ()) -> Path:
         """Add how the results were made, and write ``report.html``.
 
         Args:
             title: the page's title.
-            commands: the commands, oldest first, with dates if they are known.
-            details: titles and long texts of the last section, folded away.
-            more: further paragraphs of the last section.
+            commands: the commands, oldest first.
 
         Returns:
             The page's path.
@@ -124,8 +82,8 @@ class Page:
             text += f" Its trainings ran on: {', '.join(counted)}."
         versions = pd.DataFrame(rows, columns=["package", "version"])
         listing = [("Commands", "\n".join(commands))] if commands else []
-        made = [("", "Versions that wrote this page", versions)]
-        self.add("How it was made", text + more, made, details=[*listing, *details])
+        made = [("Versions that wrote this page", versions)]
+        self.add("How it was made", text, made, details=listing)
         pages = Environment(
             loader=PackageLoader("lcc_rl", "assets"), autoescape=True, trim_blocks=True
         )

@@ -16,7 +16,6 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
 
 Series = NDArray[np.float64]
-RESPONSES = "responses.parquet"  # what strategies do over gap and relative speed
 EPISODE = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ
 
 
@@ -131,13 +130,6 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Motion:
         raise ResultsError("the sample episode has no leader")
     front = np.cumsum(leader * step)
     return Motion(time, roles, speed, gap, front, leader, length, None)
-
-
-def visited(motion: Motion) -> Series:
-    """Return speed, gap and relative speed of automated vehicles at every moment, ``[n, 3]``."""
-    own = [place for place, role in enumerate(motion.roles) if role == AUTOMATED]
-    entries = (motion.speed, motion.gap, motion.ahead - motion.speed)
-    return np.stack([entry[:, own].ravel() for entry in entries], -1)
 
 
 Found = tuple[Series, Series | None, Series, Series, tuple[str, ...]]

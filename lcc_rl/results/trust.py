@@ -14,6 +14,7 @@ from lcc_rl.errors import ConfigError, ResultsError
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
+RETIRED = ("objective",)  # settings of earlier versions that changed no row
 
 
 def trusted(
@@ -37,6 +38,7 @@ def trusted(
         if isinstance(value, str) and "${" in value:
             raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
     check_targets(content, where, trust)
+    content = {key: value for key, value in content.items() if key not in RETIRED}
     places = forget_places(content)
     if "trust" in content:
         content["trust"] = list(trust)

@@ -31,7 +31,6 @@ from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.search import register as register_search
 from lcc_rl.runs.states import CONFIG, Busy, busy, described, is_claimed, no_run, record, survey
 
 log = logging.getLogger("lcc_rl")
@@ -40,7 +39,6 @@ PLAN = "sweep.json"
 MOST_RUNS = 100_000  # of a sweep: Hydra would hold all of them in memory
 LONGEST_NAME = 100  # characters of a folder's name before the hash
 SILENT = logging.CRITICAL + 1
-NO_RESULT = None  # returned to the sweeper; Optuna refuses NaN
 
 
 def register_resolvers() -> None:
@@ -152,7 +150,6 @@ class SweepCallback(Callback):
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
         if not any(state.state == "running" for state in survey(folder)):
             remove_leftovers(folder)
-        register_search()
         if sys.stdout.isatty():
             self._draw(config, plan.runs)
 
@@ -220,14 +217,12 @@ class Plan:
 
 def make_plan(config: DictConfig) -> Plan:
     """Return the plan of a sweep's configuration."""
-    sweeper = config.hydra.sweeper
     typed = [str(item) for item in config.hydra.overrides.task]
-    typed += [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
+    params = config.hydra.sweeper.get("params") or {}
+    typed += [f"{key}={value}" for key, value in params.items()]
     parsed = OverridesParser.create().parse_overrides(result_overrides(typed))
     swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
-    if "n_trials" in sweeper:
-        return Plan(int(sweeper.n_trials), varied)
     values = (islice(item.sweep_string_iterator(), MOST_RUNS + 1) for item in swept.values())
     return Plan(math.prod(sum(1 for _ in some) for some in values), varied)
 
@@ -257,13 +252,13 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         raise KeyboardInterrupt from error
     except Busy as error:
         log.info("%s: left to it", error)
-        return NO_RESULT
+        return None
     except Exception as error:
         if was_interrupted(error):  # the interrupt broke into a library, which made it this error
             raise KeyboardInterrupt from error
         record(folder, error)
         log.error("%s failed: %s", folder.name, described(error))
-        return NO_RESULT
+        return None
 
 
 def conclude(folder: Path) -> None:

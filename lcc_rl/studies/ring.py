@@ -5,21 +5,21 @@ Humans drive all cars until a wave has developed; then one car is automated, or 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from lcc_rl.commands import evaluation
+from lcc_rl.commands.evaluation import complete
 from lcc_rl.config import load
-from lcc_rl.figures.page import Page
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.cells import signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS, stored_config
-from lcc_rl.studies.runner import note, read_notes
+from lcc_rl.studies.results import StudyResults
 
+EVALUATION = "evaluation"
 HUMAN = "human"
 RIVALS = ("follower_stopper", "pi_saturation")
 SETTINGS = (
@@ -34,67 +34,42 @@ TITLE = "One automated car on a ring"
 FIELD = {"driven by": "field experiment", "speeds against humans": "−80.8 %", "fuel": "−42.5 %"}
 
 
-def run(folder: Path, overrides: Sequence[str], command: str) -> None:
+def run(folder: Path, overrides: Sequence[str]) -> None:
     """Evaluate the rules and the shipped policy after a handover.
 
     Args:
         folder: the study's folder.
         overrides: further options of ``lcc-rl evaluate``.
-        command: the command line, stored in the folder's notes.
 
     Raises:
         LccError: one clear error for wrong settings or files.
     """
-    cfg = load("evaluate", [*SETTINGS, *overrides])
-    evaluation.run(cfg, folder, replace=True)
-    note(folder, "ring", command)
+    complete(load("evaluate", [*SETTINGS, *overrides]), folder / EVALUATION)
 
 
-def write_results(
-    folder: str | Path, formats: Iterable[str] = (), page: Path | None = None
-) -> Path:
-    """Write the study's page, ``report.html``, from its evaluation.
+def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
+    """Write the study's table and diagrams from its evaluation.
 
-    Args:
-        folder: holds config.yaml, episodes.parquet and steps.parquet.
-        formats: further formats of the figures.
-        page: Markdown file whose marked table is written anew, too.
-
-    Returns:
-        The path of report.html.
+    Speeds vary by each car's standard deviation in time; fuel is net of kinetic energy, per km of
+    all cars. The field experiment is compared with the wave before the handover, the others with
+    the same minutes of human drivers.
 
     Raises:
         ResultsError: if a table is missing or cannot be read.
     """
-    made = Page(folder, formats)
-    rows, steps = (read_parquet(made.folder / name) for name in (EPISODES, STEPS))
-    cfg = stored_config(made.folder)
-    names = list(dict.fromkeys(rows["strategy"]))
-    pictures = {name: space_time(steps, [name], cfg) for name in names}
-    drawn = [
-        (name.replace("/", "_"), in_words(name), figure)
-        for name, figure in pictures.items()
-        if figure is not None
-    ]
-    text = words(cfg, len(rows) // len(names))
-    made.add("After the handover", text, [("ring", "Means over the episodes", table(rows))], drawn)
-    if page is not None:
-        made.fill(page)
-    return made.write(TITLE, read_notes(made.folder).get("commands", ()))
-
-
-def words(cfg: Mapping[str, Any], episodes: int) -> str:
-    """Return what the table shows."""
-    scenario, first = cfg["scenario"], cfg["evaluation"]["humans_first"]
-    lasting = scenario["horizon"] * scenario["time_step"]
-    return f"""{scenario["string"]} on {scenario["circumference"]:g} m. Humans drive all cars for
-        {first:g} s; then one car changes its driver, and the next {lasting:g} s are measured, in
-        {episodes} episodes. A wave counts as damped once the standard deviation of the speeds stays
-        below 0.5 m/s. Speeds vary by each car's standard deviation in time; fuel is net of kinetic
-        energy, per km of all cars.
-
-        In the field (Stern et al. 2018) what followed the handover is compared with the wave
-        before it, here with the same minutes of human drivers."""
+    place = folder / EVALUATION
+    rows, steps = (read_parquet(place / name) for name in (EPISODES, STEPS))
+    cfg, found = stored_config(place), StudyResults(folder, formats)
+    first = cfg["evaluation"]["humans_first"]
+    lasting = cfg["scenario"]["horizon"] * cfg["scenario"]["time_step"]
+    caption = f"{lasting:g} s after {first:g} s in which humans drive all cars: means over episodes"
+    found.table("ring", caption, table(rows))
+    for name in dict.fromkeys(rows["strategy"]):
+        figure = space_time(steps, [name], cfg)
+        if figure is not None:
+            found.figure(name.replace("/", "_"), in_words(name), figure)
+    found.write(TITLE)
+    return found
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -113,14 +88,14 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
         damped = (
             f"{times.mean():.0f} s" if times.notna().all() else f"{times.count()} of {len(times)}"
         )
-        change = {key: own[key] / humans[key] - 1.0 for key in ("speed_std_mps", "fuel")}
+        ratios = (own / humans).to_dict()
+        changes = (f"{signed(100 * (ratios[x] - 1), '+.1f')} %" for x in ("speed_std_mps", "fuel"))
         found.append(
             {
                 "driven by": in_words(str(name)),
                 "damped after": damped,
                 "speeds vary [m/s]": own["speed_std_mps"],
-                "speeds against humans": f"{100 * change['speed_std_mps']:+.1f} %",
-                "fuel": f"{100 * change['fuel']:+.1f} %",
+                **dict(zip(("speeds against humans", "fuel"), changes, strict=True)),
                 "mean speed [m/s]": own["mean_speed_mps"],
                 "smallest gap [m]": part["min_gap_m"].min(),
             }

@@ -12,7 +12,7 @@ from helpers import POPULATION, REWARD, TERMS, compose, make_agent, slow_but, st
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.gradient import GradientTrainer
+from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import Diverged, Interrupted
@@ -30,14 +30,14 @@ SMALL = (
 WHOLE = ("training.segment=${scenario.horizon}", "agent.bootstrap=false", "agent.gamma=1")
 
 
-def make(folder, *overrides: str, variant: str = "alcc") -> GradientTrainer:
+def make(folder, *overrides: str, variant: str = "alcc") -> GradientLoop:
     cfg = compose(variant, *SMALL, *overrides)
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
     agent = make_agent(cfg)
-    return GradientTrainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+    return GradientLoop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
-def weights(trainer: GradientTrainer) -> torch.Tensor:
+def weights(trainer: GradientLoop) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
 
 

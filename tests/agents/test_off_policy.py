@@ -12,7 +12,7 @@ from torchrl.objectives import SoftUpdate
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.off_policy import leaves
-from lcc_rl.agents.replay import Trainer, draws
+from lcc_rl.agents.replay import ReplayLoop, draws
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 
@@ -28,13 +28,13 @@ SMALL = (
 EACH = pytest.mark.parametrize("agent", ["td3", "sac"])
 
 
-def make(folder, agent: str, *overrides: str, variant: str = "alcc") -> Trainer:
+def make(folder, agent: str, *overrides: str, variant: str = "alcc") -> ReplayLoop:
     cfg = compose(variant, f"agent={agent}", *SMALL, *overrides)
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    return Trainer(make_agent(cfg), env, cfg.training, cfg.seed, folder, identity(cfg))
+    return ReplayLoop(make_agent(cfg), env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
-def weights(trainer: Trainer) -> torch.Tensor:
+def weights(trainer: ReplayLoop) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
 
 

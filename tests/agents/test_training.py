@@ -9,8 +9,9 @@ import pytest
 import torch
 from helpers import ACTION, POPULATION, compose, make_agent, small_env, string, wavy_profiles
 
+from lcc_rl.agents.collecting import transitions
 from lcc_rl.agents.loop import episode_statistics
-from lcc_rl.agents.replay import Trainer, transitions
+from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import Interrupted, ResultsError
@@ -27,14 +28,14 @@ SMALL = (
 )
 
 
-def make(folder, *overrides: str) -> Trainer:
+def make(folder, *overrides: str) -> ReplayLoop:
     cfg = compose("alcc", *SMALL, *overrides)
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
     agent = make_agent(cfg)
-    return Trainer(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+    return ReplayLoop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
-def weights(trainer: Trainer) -> torch.Tensor:
+def weights(trainer: ReplayLoop) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
 
 

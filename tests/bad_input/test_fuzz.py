@@ -46,7 +46,7 @@ CHOICES = {
 SMALL = ("experiment=smoke", "scenario.horizon=20")
 RECIPES = (
     *("", "", "+filter=cbf", "+knowledge=memory", "+knowledge=preview", "scenario=ring agent=none"),
-    *("agent=td3", "agent=sac", "agent=analytic", "agent=none", "drivers=fixed", "drivers=kde"),
+    *("agent=td3", "agent=sac", "agent=analytic", "agent=none", "drivers=fixed"),
     *("split.by=vehicle", "split=single", "experiment=single_profile", "leader=trajectories"),
     *("scenario.string=automated*2", "scenario.string={size:6,penetration:0.3}"),
     "controller@scenario.controllers.automated=handover",

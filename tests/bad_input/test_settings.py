@@ -150,10 +150,10 @@ def test_what_must_be_positive_is_refused_at_every_door(number) -> None:
 def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
     tmp_path, monkeypatch
 ) -> None:
-    many = ("drivers=kde", "drivers.drivers=2000", "evaluation.drivers=null")
+    many = ("evaluation.drivers=null", "evaluation.repeats=8")
     cfg = tiny("evaluate", "variant=idm", *many, agent=False)
     monkeypatch.setattr(memory, "available", lambda device: 12 * 2**20)
-    with pytest.raises(ConfigError, match="an evaluation of 4000 episodes of 40 steps side by"):
+    with pytest.raises(ConfigError, match="an evaluation of 3984 episodes of 40 steps side by"):
         evaluation.run(cfg, tmp_path)
 
 

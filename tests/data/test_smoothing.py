@@ -9,11 +9,11 @@ import pytest
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.smoothing import ExponentialAverage, SavitzkyGolay, Smoothing
+from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.trajectories import Trajectories
 
 FOOT = 0.3048
-EVERY = [SavitzkyGolay(), SavitzkyGolay(window_s=0.8, order=2), ExponentialAverage()]
+EVERY = [SavitzkyGolay(), SavitzkyGolay(window_s=0.8, order=2)]
 
 
 def drive(folder: Path, position_ft: np.ndarray) -> Trajectories:
@@ -23,7 +23,7 @@ def drive(folder: Path, position_ft: np.ndarray) -> Trajectories:
 
 
 @pytest.mark.parametrize("smoothing", EVERY, ids=str)
-def test_even_motion_is_kept_and_gives_its_speed(tmp_path: Path, smoothing: Smoothing) -> None:
+def test_even_motion_is_kept_and_gives_its_speed(tmp_path: Path, smoothing: SavitzkyGolay) -> None:
     samples = smoothing(drive(tmp_path, 5.0 * np.arange(60))).samples
     inner = np.arange(60)[smoothing.margin : 60 - smoothing.margin]
     assert samples["frame"].tolist() == inner.tolist()
@@ -42,18 +42,6 @@ def test_a_polynomial_passes_savitzky_golay_unchanged(tmp_path: Path) -> None:
         samples["speed_mps"], FOOT * (40 + 6 * time - 0.6 * time**2), atol=1e-3
     )
     np.testing.assert_allclose(samples["acceleration_mps2"], FOOT * (6 - 1.2 * time), atol=2e-2)
-
-
-def test_exponential_average_against_a_hand_computed_value(tmp_path: Path) -> None:
-    position = np.zeros(15)
-    position[7] = 10.0
-    samples = ExponentialAverage(width_s=0.1)(drive(tmp_path, position)).samples
-    side = np.exp([-1.0, -2.0, -3.0])
-    full = 1 + 2 * side.sum()
-    expected = np.array([side[1], side[0], 1.0, side[0], side[1]]) / full
-    np.testing.assert_allclose(samples["position_m"] / (10 * FOOT), expected, atol=1e-6)
-    rise = (expected[2] - expected[0]) * 10 * FOOT / 0.2
-    assert samples["speed_mps"].iloc[1] == pytest.approx(rise, rel=1e-5)
 
 
 def noisy_drives(folder: Path) -> tuple[Trajectories, np.ndarray, np.ndarray]:
@@ -77,7 +65,7 @@ def noisy_drives(folder: Path) -> tuple[Trajectories, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("smoothing", EVERY, ids=str)
-def test_the_ends_are_as_good_as_the_interior(tmp_path: Path, smoothing: Smoothing) -> None:
+def test_the_ends_are_as_good_as_the_interior(tmp_path: Path, smoothing: SavitzkyGolay) -> None:
     raw, speed, acceleration = noisy_drives(tmp_path)
     samples = smoothing(raw).samples
     vehicle, frame = samples["vehicle"].to_numpy() - 1, samples["frame"].to_numpy()
@@ -94,14 +82,14 @@ def test_headways_follow_the_smoothed_positions(tmp_path: Path) -> None:
     rows = pair(range(60))
     rows[90][5] = str(float(rows[90][5]) + 20)  # the leader jumps once
     (tmp_path / "file.csv").write_text(csv_text(rows))
-    samples = ExponentialAverage()(read_ngsim(tmp_path / "file.csv")).samples
-    follower, leader = samples.iloc[:26], samples.iloc[26:]
+    samples = SavitzkyGolay()(read_ngsim(tmp_path / "file.csv")).samples
+    follower, leader = samples.iloc[:46], samples.iloc[46:]
     np.testing.assert_allclose(
         follower["space_headway_m"],
         leader["position_m"].to_numpy() - follower["position_m"].to_numpy(),
         atol=1e-5,
     )
-    assert 60 * FOOT < follower["space_headway_m"].iloc[13] < 65 * FOOT
+    assert 60 * FOOT < follower["space_headway_m"].iloc[23] < 65 * FOOT
     assert leader["space_headway_m"].isna().all()
 
 

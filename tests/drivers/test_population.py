@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.drivers.population import bootstrap, fixed, from_table, kde, load_drivers
+from lcc_rl.drivers.population import bootstrap, fixed, from_table, load_drivers
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.idm import IDMConstants
@@ -79,20 +79,6 @@ def test_draws_follow_the_seed_and_keep_pairs_together():
     assert set(zip(chosen.desired_speed.tolist(), chosen.time_gap.tolist(), strict=True)) <= pairs
 
 
-def test_kde_resembles_the_drivers_within_the_bounds():
-    population, drawn = bootstrap(), kde(drivers=5000, seed=1)
-    assert len(drawn) == 5000
-    assert drawn.constants == population.constants
-    assert drawn.desired_speed.min() >= 5.0
-    assert drawn.desired_speed.max() <= 40.0
-    assert drawn.time_gap.min() >= 0.3
-    assert drawn.time_gap.max() <= 4.0
-    assert drawn.time_gap.mean() == pytest.approx(population.time_gap.mean().item(), rel=0.05)
-    assert drawn.summary()["correlation"] == pytest.approx(0.15, abs=0.06)
-    assert torch.equal(drawn.desired_speed, kde(drivers=5000, seed=1).desired_speed)
-    assert not torch.equal(drawn.desired_speed, kde(drivers=5000, seed=2).desired_speed)
-
-
 def test_drivers_of_several_models_are_a_population(table, written):
     table = table.assign(model=["idm", "gipps"] * 10)
     table["leader_deceleration_mps2"] = np.where(table["model"] == "gipps", 2.8, np.nan)
@@ -103,8 +89,6 @@ def test_drivers_of_several_models_are_a_population(table, written):
     assert set(own) == {*LAWS["idm"].parameters, *LAWS["gipps"].parameters}
     expected = table["leader_deceleration_mps2"].to_numpy()
     np.testing.assert_allclose(own["leader_deceleration"], expected, rtol=1e-6)
-    with pytest.raises(DataError, match="drivers of one model"):
-        kde(written(table))
     with pytest.raises(DataError, match="row 1, column 'leader_deceleration_mps2'"):
         from_table(table.assign(leader_deceleration_mps2=99.0))
 
@@ -114,7 +98,6 @@ def test_a_table_says_how_its_drivers_react(table, written):
     assert bootstrap(written(table)).reaction == Reaction()
     assert bootstrap(written(reacting)).reaction == Reaction(0.7, 0.2)
     assert bootstrap(written(reacting), acceleration_noise=0.0).reaction == Reaction(0.7, 0.0)
-    assert kde(written(reacting), drivers=9).reaction == Reaction(0.7, 0.2)
     reacting.loc[3, "reaction_delay_s"] = 0.5
     with pytest.raises(DataError, match=r"'reaction_delay_s' must be 0 to 3, the same for all"):
         bootstrap(written(reacting))
@@ -154,8 +137,6 @@ def test_bad_tables_end_in_one_clear_error(table, written, change, message):
         (lambda: replace(fixed(), ids=()), "no drivers"),
         (lambda: bootstrap(reaction_delay=50.0), "reaction delay must be 0 to 3, got 50"),
         (lambda: fixed(acceleration_noise=9.0), "reaction noise must be 0 to 3, got 9"),
-        (lambda: kde(bandwidth=-1.0), "bandwidth"),
-        (lambda: kde(drivers=0), "drivers"),
     ],
 )
 def test_no_driver_is_like_that(call, name):

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 
 from lcc_rl.agents.actor import GaussianExploration, shared_policy
-from lcc_rl.agents.replay import LEARNED_FROM
+from lcc_rl.agents.collecting import LEARNED_FROM
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import Step, pieces_of
 from lcc_rl.pieces.base import SEED, as_key

@@ -218,7 +218,6 @@ def own_drivers() -> DriverPopulation:
     ("words", "origin"),
     [
         ("drivers=i80", "fitted to NGSIM I-80, shipped, drivers.mode=local"),
-        ("drivers=kde", "fitted to NGSIM I-80, shipped, drivers.mode=local"),
         ("drivers=fixed", "fixed"),
         (f"drivers._target_={__name__}.own_drivers", "own_drivers"),
     ],

@@ -8,7 +8,7 @@ import pytest
 import torch
 from commands import DATA
 from helpers import single_env
-from pages import ROOT, blocks
+from page_blocks import ROOT, blocks
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector

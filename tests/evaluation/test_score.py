@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from commands import content
-from pages import ROOT
+from page_blocks import ROOT
 
 import lcc_rl
 from lcc_rl.commands.score import about, main, scored

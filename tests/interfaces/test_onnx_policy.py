@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from helpers import POPULATION, small_env, wavy_profiles
-from pages import ROOT, blocks
+from page_blocks import ROOT, blocks
 from tensordict import TensorDict
 
 import lcc_rl

@@ -10,31 +10,23 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import tiny
-from helpers import POPULATION
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 from study_frames import episodes, training, windows
 
-from lcc_rl.commands import evaluation, maps
-from lcc_rl.config import load
+from lcc_rl.commands import evaluation
 from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.drivers.population import load_drivers
-from lcc_rl.evaluation.responses import responses
-from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.drawing import COLUMN, PAGE, colour, save
 from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
-from lcc_rl.figures.policy_maps import accelerations, winners
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.figures.training import learning_curve, training_figure
-from lcc_rl.io.files import read_parquet
 from lcc_rl.results.headline import headline
 from lcc_rl.results.means import Means
-from lcc_rl.results.motion import RESPONSES
-from lcc_rl.results.policies import load_policy
 from lcc_rl.results.tables import summary
 from lcc_rl.studies.alcc import figures as alcc
 
@@ -274,51 +266,6 @@ def test_a_ring_closes_and_no_line_crosses_it() -> None:
         assert np.abs(np.diff(segments, axis=1)).max() < 30.0
 
 
-def grid() -> pd.DataFrame:
-    """Two strategies that brake below 10 m, one with a winner."""
-    gap, relative = (x.ravel() for x in np.meshgrid(np.linspace(1, 20, 15), np.linspace(-3, 3, 15)))
-    found = [
-        {"strategy": name, "speed_mps": speed, "gap_m": gap, "relative_speed_mps": relative}
-        | {"acceleration_mps2": 0.2 * (gap - 10.0) + 0.1 * relative}
-        | {"winner": (gap > 12) * 1.0 if name == "alcc" else np.nan}
-        for name in ("alcc", "idm_acc")
-        for speed in (2.0, 6.0)
-    ]
-    return pd.concat(map(pd.DataFrame, found), ignore_index=True)
-
-
-def test_maps_brake_in_red_below_and_accelerate_in_blue_above(tmp_path) -> None:
-    figure = accelerations(grid(), pd.DataFrame(columns=steps().columns), {"scenario": {}})
-    titles = [axis.get_title(loc="left") for axis in figure.axes[:4]]
-    names = ("network, for all", "tuned IDM")
-    assert titles == [f"{name}, at {speed} m/s" for name in names for speed in (2, 6)]
-    image = pixels(figure, tmp_path / "map.png")
-    for axis in figure.axes[:4]:
-        box = axis.get_window_extent()
-        left, right, low, high = (
-            int(80 / figure.dpi * x) for x in (box.x0, box.x1, box.y0, box.y1)
-        )
-        above = image[len(image) - high + 8, left + 8 : right - 8].mean(0)
-        below = image[len(image) - low - 16, left + 8 : right - 8].mean(0)
-        assert above[2] > above[0] + 40  # blue
-        assert below[0] > below[2] + 40  # red
-    image = pixels(winners(grid()), tmp_path / "winners.png")
-    assert all(count(image, hue) > 1000 for hue in PARENTS.values())
-
-
-@pytest.mark.parametrize("name", ["idm_acc", "pretrained/alcc", "cacc tuned"])
-def test_responses_have_the_right_signs_at_the_corners(name) -> None:
-    cfg = load("evaluate", [f"variant={'hcfs' if name.startswith('cacc') else 'alcc'}"])
-    learned = name.startswith("pretrained")
-    strategy = trained(cfg, name, load_policy(name), POPULATION) if learned else baseline(cfg, name)
-    rows = responses(strategy, POPULATION, [8.0, 3.0], [1.0, 8.0, 60.0], [-4.0, 0.0, 4.0])
-    assert len(rows) == 9 + 6  # at 3 m/s nobody ahead can be 4 m/s slower
-    found = rows.set_index(["speed_mps", "gap_m", "relative_speed_mps"])["acceleration_mps2"]
-    assert found[8.0, 1.0, -4.0] < -1.0
-    assert found[8.0, 60.0, 4.0] > 0.3
-    assert found[8.0, 1.0, -4.0] <= found[8.0, 8.0, 0.0] <= found[8.0, 60.0, 4.0]
-
-
 def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     learned = ("variant=alcc", "policy=pretrained", "evaluation.baselines=[idm]")
     cfg = tiny("evaluate", *learned, "figure_formats=[png,svg]", agent=False)
@@ -327,8 +274,6 @@ def test_an_evaluation_draws_its_figures_in_every_format(tmp_path) -> None:
     stems = {kind: {stem for stem, _, own in drawn if own == kind} for kind in ("png", "svg")}
     assert {"overview", "improvement_alcc_vs_idm"} <= stems["png"]
     assert stems["png"] == stems["svg"]
-    assert [path.name for path in maps.run(tmp_path)] == ["policy_map.png"]
-    assert set(read_parquet(tmp_path / RESPONSES)["strategy"]) == {"alcc", "idm_acc"}
 
 
 @pytest.mark.usefixtures("blank_figures")

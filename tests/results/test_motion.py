@@ -18,7 +18,7 @@ from lcc_rl.commands import animate as command
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.figures.animation import COLOURS, LARGEST, animate, frames, page
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.motion import Motion, motion_of, sample_episodes, visited
+from lcc_rl.results.motion import Motion, motion_of, sample_episodes
 
 OPEN = {"string": "automated human", "road": "open", "circumference": None, "vehicle_length": 5.0}
 RING = {**OPEN, "road": "ring", "circumference": 40.0}
@@ -39,7 +39,6 @@ def test_vehicles_stand_behind_the_leader_by_gaps_and_lengths() -> None:
     assert motion.front.tolist() == [0.0, 5.0, 10.0, 15.0]
     assert motion.position[0].tolist() == [-12.0, -26.0]
     assert motion.ahead[0].tolist() == [10.0, 8.0]
-    assert visited(motion)[0].tolist() == [8.0, 7.0, 2.0]
     assert motion_of(rows(cav_speed=np.nan, cav_gap=np.nan), OPEN).roles == ("human",)
 
 

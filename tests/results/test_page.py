@@ -15,14 +15,15 @@ from study_frames import episodes
 
 from lcc_rl.api import Run
 from lcc_rl.config import load
-from lcc_rl.figures.drawing import new_figure
+from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.cells import as_markdown, heading
 from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, verdict
 from lcc_rl.results.means import Means
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import in_words, worded
 from lcc_rl.results.tables import summary
+from lcc_rl.studies.results import StudyResults
 
 TABLE = pd.DataFrame(
     {
@@ -41,11 +42,11 @@ TABLE = pd.DataFrame(
 def page(tmp_path_factory):
     figure = new_figure(2.0, 1.0)
     figure.subplots().plot([0, 1], [0, 1])
-    made = Page(tmp_path_factory.mktemp("page"), formats=["svg"])
+    made = Page(tmp_path_factory.mktemp("page"))
     write_parquet(pd.DataFrame({"a": [1]}), made.folder / "run" / "training.parquet")
-    shown = [("energies", "A table", TABLE)]
-    made.add("First & last", "One < two.\n\nNext.", shown, [("line", "A line", figure)])
-    made.write("A study", ["lcc-rl reproduce alcc"], [("Configuration", "seed: 0")])
+    drawn = save(figure, made.folder / "line.png")
+    made.add("First & last", "One < two.\n\nNext.", [("A table", TABLE)], [("A line", drawn)])
+    made.write("A job", ["lcc-rl run"])
     return made
 
 
@@ -55,11 +56,12 @@ def test_a_page_holds_everything_and_fetches_nothing(page) -> None:
     assert all(link.startswith(("#", "data:image/")) for link in links)
     assert not re.search(r"<script|<link|url\(|@import|https?://", html)
     assert "default-src 'none'" in html
-    assert html.count("<table>") == html.count("<details>") == 2
+    assert html.count("<table>") == 2
+    assert html.count("<details>") == 1
     for words in (
         "First &amp; last",
         "One &lt; two.</p>",
-        "lcc-rl reproduce alcc",
+        "lcc-rl run",
         "<td>torch</td>",
     ):
         assert words in html
@@ -79,14 +81,23 @@ def test_cells_are_formatted_for_readers(page) -> None:
     )
 
 
-def test_tables_and_figures_are_files_too_and_pictures_keep_every_pixel(page) -> None:
-    pd.testing.assert_frame_equal(read_parquet(page.folder / "tables" / "energies.parquet"), TABLE)
-    drawn = page.folder / "figures" / "line.png"
-    assert drawn.with_suffix(".svg").exists()
+def test_pictures_keep_every_pixel(page) -> None:
     html = (page.folder / "report.html").read_text()
     (data,) = re.findall(r"data:image/webp;base64,([^\"]+)", html)
     shown = Image.open(BytesIO(base64.b64decode(data))).convert("RGBA")
-    assert shown.tobytes() == Image.open(drawn).convert("RGBA").tobytes()
+    assert shown.tobytes() == Image.open(page.folder / "line.png").convert("RGBA").tobytes()
+
+
+def test_a_study_writes_files_and_fills_marked_tables(tmp_path) -> None:
+    figure = new_figure(2.0, 1.0)
+    made = StudyResults(tmp_path, ["svg"])
+    made.table("energies", "A table", TABLE)
+    made.figure("line", "A line", figure)
+    assert (tmp_path / "figures" / "line.svg").exists()
+    pd.testing.assert_frame_equal(read_parquet(tmp_path / "tables" / "energies.parquet"), TABLE)
+    text = made.write("A study").read_text()
+    assert "![A line](figures/line.png)" in text
+    assert as_markdown(worded(TABLE)) in text
 
 
 def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> None:

@@ -13,14 +13,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from commands import AGENT, NO_AGENT, TINY, run_command, tiny
+from commands import AGENT, NO_AGENT, TINY, run_command
 from omegaconf import OmegaConf
 
 from lcc_rl import results
-from lcc_rl.commands import training
 from lcc_rl.config import load
 from lcc_rl.envs import inputs
-from lcc_rl.errors import ConfigError
 from lcc_rl.runs import sweeps
 from lcc_rl.runs.states import claim
 from lcc_rl.runs.sweeps import run_name
@@ -107,14 +105,6 @@ def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
     done = run_command("lcc_rl.cli.train", *SWEEP, "seed=range(0)", cwd=tmp_path)
     assert done.returncode == 2
     assert "nothing was swept" in done.stderr
-
-
-def test_objectives_are_columns_of_the_summary(tmp_path) -> None:
-    cfg = tiny("train", "variant=idm", "objective=[kj_per_km,collisions]", agent=False)
-    rows = training.run(cfg, tmp_path, quiet=True)
-    assert training.objective(cfg, rows)[1] == rows["collided"].sum()
-    with pytest.raises(ConfigError, match=r"objective 'kj_per_k'.*'kj_per_km'"):
-        training.run(tiny("train", "objective=kj_per_k"), tmp_path / "b")
 
 
 def on_terminal(cwd: Path, *words: str) -> str:

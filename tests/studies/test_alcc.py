@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from table_text import long_table
@@ -10,68 +11,75 @@ from table_text import long_table
 from lcc_rl.config.schemas import as_plain
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.studies.alcc import study
+from lcc_rl.studies.study import Study
 
 NAMES = "data.columns={vehicle: id, time: t, speed: v, leader: ahead, gap: gap}"
 
 
+def one(folder: Path, recipe: str = "paper_alcc", **more: Any) -> Study:
+    return Study(folder, recipe, **{"seeds": 1, **more})
+
+
 def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> None:
-    own = study.Study(tmp_path, "paper_alcc", 1)
-    main = as_plain(own.runs(tmp_path, study.MAIN)[0].compose())
+    own = one(tmp_path)
+    main = as_plain(study.trainings(own, study.MAIN)["alcc/seed_0"])
     seen = []
     for name, change in study.ABLATIONS.items():
-        runs = own.runs(tmp_path, change)
-        assert [f"variant={x}" for x in change.variants] == [run.overrides[1] for run in runs]
-        cfg = as_plain(runs[0].compose())
+        runs = study.trainings(own, change)
+        assert [f"{x}/seed_0" for x in change.variants] == [*runs]
+        assert [cfg.variant for cfg in runs.values()] == [*change.variants]
+        cfg = as_plain(runs["alcc/seed_0"])
         assert (cfg == main) == (name in ("recipe_paper_alcc", "gamma_0.9"))
         assert cfg == main or cfg not in seen
         seen.append(cfg)
-    quick = study.Study(tmp_path, "quickstart", 1)
-    found = quick.runs(tmp_path, study.ABLATIONS["recipe_paper_alcc"])[0].compose()
+    quick = one(tmp_path, "quickstart")
+    found = study.trainings(quick, study.ABLATIONS["recipe_paper_alcc"])["alcc/seed_0"]
     assert as_plain(found) == main
     single = study.Change(("split.profile=5",), recipes=("single_profile",))
-    cfg = own.runs(tmp_path, single)[0].compose()
+    cfg = study.trainings(own, single)["alcc/seed_0"]
     assert (cfg.split["profile"], cfg.scenario.pieces["leader"]["start"]) == (5, "first")
     assert cfg.training.episodes == 3000
 
 
 @pytest.mark.parametrize(
-    ("settings", "parts", "words"),
+    ("settings", "how", "words"),
     [
-        ({"seeds": 0}, ("main", "ablations"), "seeds must lie from 1 to"),
-        ({"ablations": ("no_safty",)}, ("main", "ablations"), "no_safety"),
-        ({"ablations": ("mine:reward.terms.safty.weight=0",)}, ["ablations"], "safty"),
-        ({"overrides": ("sede=1",)}, ("main", "ablations"), "sede"),
-        ({}, ["ablation"], "ablations"),
+        ({"seeds": 0}, {}, "seeds must lie from 1 to"),
+        ({}, {"ablations": ["no_safty"]}, "no_safety"),
+        ({}, {"ablations": ["mine:reward.terms.safty.weight=0"]}, "safty"),
+        ({"overrides": ("sede=1",)}, {}, "sede"),
+        ({}, {"parts": ["ablation"]}, "ablations"),
     ],
 )
-def test_wrong_settings_come_before_any_work(tmp_path, settings, parts, words) -> None:
+def test_wrong_settings_come_before_any_work(tmp_path, settings, how, words) -> None:
     with pytest.raises(ConfigError, match=words):
-        study.run(study.Study(tmp_path, **settings), parts, "typed")
+        study.run(one(tmp_path, **settings), **how)
     assert not list(tmp_path.iterdir())
 
 
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
-    run = study.Study(folder, "smoke", 1).runs(folder / "train", study.MAIN)[0]
-    assert Path(run.compose().data["path"]) == folder / "trajectories.parquet"
+    cfg = study.trainings(one(folder, "smoke"), study.MAIN)["alcc/seed_0"]
+    assert Path(cfg.data["path"]) == folder / "trajectories.parquet"
 
 
-def of_one_file(folder: Path, *overrides: str) -> study.Study:
+def of_one_file(folder: Path, *overrides: str) -> Study:
     """A study of a table that is one recording, calibrated quickly."""
     long_table(cars=4).to_csv(folder / "lab.csv", index=False)
     path = f"data.path='{folder / 'lab.csv'}'"
     quick = [f"calibration.{x}_genetic.generations=2" for x in ("local", "global")]
-    return study.Study(
-        folder / "study", "smoke", 1, ("data=table", path, NAMES, *quick, *overrides)
-    )
+    words = ("data=table", path, NAMES, *quick, *overrides)
+    return one(folder / "study", "smoke", overrides=words)
 
 
 def test_a_study_of_one_file_divides_it_by_vehicle(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(study, "run_all", lambda *arguments: [])
+    for name in ("train_all", "complete"):
+        monkeypatch.setattr(study, name, lambda *arguments: None)
     own = of_one_file(tmp_path, "split.by=vehicle")
-    assert study.run(own, ["main"], "typed") == []
+    study.run(own, ["main"])
     assert (own.folder / study.DRIVERS).is_file()
-    single = own.runs(tmp_path, study.ABLATIONS["one_training_profile"])[0].compose()
+    change = study.ABLATIONS["one_training_profile"]
+    single = study.trainings(own, change)["alcc/seed_0"]
     assert single.split["held_out"]["by"] == "vehicle"
     assert single.split["profile"] == 0
 
@@ -79,5 +87,5 @@ def test_a_study_of_one_file_divides_it_by_vehicle(tmp_path, monkeypatch) -> Non
 def test_a_study_whose_data_cannot_be_divided_leaves_no_file(tmp_path) -> None:
     own = of_one_file(tmp_path)
     with pytest.raises(DataError, match=r"only \['lab'\] found"):
-        study.run(own, ["main"], "typed")
+        study.run(own, ["main"])
     assert not own.folder.exists()

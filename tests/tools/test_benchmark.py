@@ -43,6 +43,6 @@ def test_quick_run_writes_sane_rows(tmp_path, capsys, name) -> None:
 
 def test_a_wrong_plain_loop_is_not_timed(monkeypatch) -> None:
     monkeypatch.setattr("benchmarks.plain.motor_power", lambda speed, acceleration: speed)
-    options = command.parse(["env", "--quick", "--device", "cpu"])
+    options = command.parse(["env", "--quick"])
     with pytest.raises(RuntimeError, match="plain loop is off"):
         command.env(options)

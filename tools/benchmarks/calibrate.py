@@ -91,7 +91,7 @@ def calibrate(options: Namespace) -> list[Row]:
     found: dict[str, Any] = {}
     plain = [objective(observed, int(index)) for index in few]
     runs = {
-        OURS: ours(found, observed, options.device),
+        OURS: ours(found, observed),
         PYTHON: scipy(found, PYTHON, plain, options.quick),
         NUMBA: scipy(found, NUMBA, everyone, options.quick),
     }
@@ -111,11 +111,11 @@ def calibrate(options: Namespace) -> list[Row]:
     return rows
 
 
-def ours(found: dict[str, Any], observed: Observed, device: str) -> Run:
+def ours(found: dict[str, Any], observed: Observed) -> Run:
     """Return the fit of every driver at once."""
 
     def run() -> None:
-        drivers = Calibrator()(observed, device=device).drivers.set_index("episode")
+        drivers = Calibrator()(observed).drivers.set_index("episode")
         found[OURS] = drivers.loc[observed.identity["episode"]]
 
     return run

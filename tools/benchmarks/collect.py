@@ -16,8 +16,8 @@ from benchmarks.plain import PlainLoop, State, alcc, check_resets, training
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.collecting import LEARNED_FROM
 from lcc_rl.agents.loop import REPORTED
-from lcc_rl.agents.replay import LEARNED_FROM
 from lcc_rl.envs import StringCollector
 
 OTHER = "stable-baselines3"
@@ -37,7 +37,7 @@ def collect(options: Namespace) -> list[Row]:
     """
     check_resets(options)
     batch, steps = (16, 10) if options.quick else (1024, 60)
-    policy = DDPG().start(Scene(7, device=options.device)).policy
+    policy = DDPG().start(Scene(7)).policy
     runs: dict[str, Run] = {}
     against: dict[str, list[str]] = {}
     for ending in endings(options):

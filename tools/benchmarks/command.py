@@ -32,12 +32,10 @@ from benchmarks.read import read
 from benchmarks.string import string
 from benchmarks.train import train
 from benchmarks.update import update
-from lcc_rl.config.schemas import Device
 from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import how_to_install, unknown_name
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import processor, read_parquet, write_parquet
-from lcc_rl.io.memory import torch_device
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million, Parallel
 
@@ -45,7 +43,6 @@ LISTED = (
     *(read, loading, start, env, string, gym, collect, update, train, analytic),
     *(calibrate, evaluate),
 )
-NO_DEVICE = ("read", "loading", "start")  # always on the processor
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {
     function.__name__: function for function in LISTED
 }
@@ -60,11 +57,6 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
     parser.add_argument("--episodes", help="episode table to calibrate (default: the stream's)")
     parser.add_argument(
         "--compile", action=BooleanOptionalAction, help="compiled cases (default: yes)"
-    )
-    parser.add_argument(
-        "--device",
-        type=typed(Device),
-        help="cpu or cuda (default: cpu, and cuda where there is one)",
     )
     parser.add_argument("--threads", type=typed(Parallel), default=1, help="threads of torch")
     parser.add_argument(
@@ -95,8 +87,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if name not in BENCHMARKS:
             raise unknown_name("benchmark", name, BENCHMARKS)
     out = new_file(options.out, "--out", lambda path: "benchmark" in TableFile(path).header)
-    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    chosen = [str(torch_device(options.device))] if options.device else devices
     torch.set_num_threads(options.threads)
     harness.timer = options.clock
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -113,14 +103,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "repeats": options.repeats,
     }
     for name in options.names or BENCHMARKS:
-        for device in ["cpu"] if name in NO_DEVICE else chosen:
-            measured = BENCHMARKS[name](Namespace(**{**vars(options), "device": device}))
-            console.print(drawn(f"{name}, {device}", measured))
-            where = {"device": device, "load": os.getloadavg()[0]}
-            rows += [{"benchmark": name, **row, **where} for row in measured]
-            # After each, so that what is measured stays whatever happens to the next.
-            if rows:
-                table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
-                write_parquet(table, out)
+        measured = BENCHMARKS[name](options)
+        console.print(drawn(name, measured))
+        load = os.getloadavg()[0]
+        rows += [{"benchmark": name, **row, "load": load} for row in measured]
+        # After each, so that what is measured stays whatever happens to the next.
+        if rows:
+            table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
+            write_parquet(table, out)
     console.print(f"{len(rows)} rows: {out}")
     return 0

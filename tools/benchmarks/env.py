@@ -38,7 +38,7 @@ def env(options: Namespace) -> list[Row]:
 def ways(options: Namespace, batch: int, steps: int, ending: str) -> dict[str, Run]:
     """Return every way to take so many steps, all eager or, with an ending, all compiled."""
     env = alcc(options, batch, far=True)
-    zero = torch.zeros(batch, 1, 1, device=options.device)
+    zero = torch.zeros(batch, 1, 1)
     plain, start = PlainLoop(env), env.reset()
     advance = plain.step
     if ending:

@@ -36,17 +36,10 @@ def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
 
 
 def seconds(run: Run) -> float:
-    """Return the seconds of a run, from when to when the accelerator has nothing left to do."""
-    begun = clock()
+    """Return the seconds of a run."""
+    begun = TIMERS[timer]()
     run()
-    return clock() - begun
-
-
-def clock() -> float:
-    """Read the time [s] once the accelerator, if any, has done what it was given."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return TIMERS[timer]()
+    return TIMERS[timer]() - begun
 
 
 def rates(
@@ -159,7 +152,7 @@ def numbers_of(row: Any) -> tuple[str, str]:
 
 def page(rows: pd.DataFrame) -> str:
     """Return rows as a table in Markdown, below a line on where and when they were measured."""
-    kinds = ("machine", "device", "torch", "threads", "clock", "repeats", "date")
+    kinds = ("machine", "torch", "threads", "clock", "repeats", "date")
     where = (f"{kind} {', '.join(map(str, rows[kind].unique()))}" for kind in kinds)
     lines = [
         f"{'; '.join(where)}; load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."

@@ -42,7 +42,7 @@ def study(quick: bool) -> tuple[StudyConfig, Inputs]:
 def training(options: Namespace, batch: int) -> TransformedEnv:
     """Build the ALCC environment of a training: gaps spread at the start, episodes that end."""
     cfg, inputs = study(options.quick)
-    return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
+    return build_env(cfg, inputs.training, inputs.population, batch)
 
 
 def alcc(options: Namespace, batch: int, far: bool = False, followers: int = 1) -> TransformedEnv:
@@ -52,7 +52,7 @@ def alcc(options: Namespace, batch: int, far: bool = False, followers: int = 1) 
     start = {"standstill_gap": 500.0, "time_gap": 30.0} if far else {}
     cfg.scenario.start["automated"] |= {**start, "gap_range": [1.0, 1.0]}
     cfg.scenario.string = f"automated human*{followers}"
-    return build_env(cfg, inputs.training, inputs.population, batch, device=options.device)
+    return build_env(cfg, inputs.training, inputs.population, batch)
 
 
 class PlainLoop:
@@ -206,7 +206,7 @@ class PlainLoop:
 
     def seeds(self) -> Tensor:
         """Draw the seeds of new episodes."""
-        return torch.randint(2**31, (self.rows, 1)).to(self.leader.speeds.device)
+        return torch.randint(2**31, (self.rows, 1))
 
 
 def following(first: Tensor, others: Tensor) -> Tensor:
@@ -231,7 +231,7 @@ def _check_steps(env: TransformedEnv, steps: int) -> None:
     plain, generator, td = PlainLoop(env), torch.Generator().manual_seed(0), env.reset()
     state = plain.start(td)
     for step in range(steps):
-        action = torch.rand(64, 1, generator=generator).to(env.device or "cpu") * 2.0 - 1.0
+        action = torch.rand(64, 1, generator=generator) * 2.0 - 1.0
         td = env.step(td.set(ACTION, action.unsqueeze(-2)))
         state, written = plain.step(state, action)
         for name in ("observation", "reward"):

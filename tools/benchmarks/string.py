@@ -9,7 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import sumo_ring
 import torch
 from tensordict import TensorDict
 
@@ -17,6 +16,7 @@ from benchmarks.env import collecting
 from benchmarks.harness import Row, Run, agree, endings, rates
 from benchmarks.plain import PlainLoop, alcc
 from benchmarks.plain_numba import NumbaString
+from benchmarks.sumo import start
 from lcc_rl.config import load
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.evaluation.rollout import Player
@@ -41,7 +41,7 @@ def batch(options: Namespace) -> list[Row]:
     """Return the rows of many strings side by side."""
     count, steps = (4, 10) if options.quick else (1024, 30)
     env = alcc(options, count, True, SIZE - 1)
-    start, zero = env.reset(), torch.zeros(count, 1, 1, device=options.device)
+    start, zero = env.reset(), torch.zeros(count, 1, 1)
     plain, loops = PlainLoop(env), NumbaString(PlainLoop(env), start.cpu())
     runs: dict[str, Run] = {NUMBA: partial(loops.play, steps)}
     against: dict[str, list[str]] = {}
@@ -90,7 +90,7 @@ def ring(options: Namespace) -> list[Row]:
             sumo.simulationStep()
 
     with TemporaryDirectory(prefix="lcc_rl_benchmark_") as name:
-        sumo_ring.start(cfg, Path(name), around)
+        start(cfg, Path(name), around)
         try:
             simulate()
             theirs = [sumo.vehicle.getSpeed(f"car{number}") for number in range(SIZE)]

@@ -77,7 +77,7 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
 def their_agent(options: Namespace, vector: VecEnv, kind: str, **how: Any) -> Any:
     """Return stable-baselines3's agent of that name with the paper's layers."""
     layers = {"net_arch": [200, 100, 50]}
-    settings = {"policy_kwargs": layers, "gamma": 0.9, "device": options.device, **how}
+    settings = {"policy_kwargs": layers, "gamma": 0.9, "device": "cpu", **how}
     return getattr(stable_baselines3, kind)("MlpPolicy", vector, **settings)
 
 

@@ -16,7 +16,8 @@ from benchmarks.harness import Row, Run, alternate, installed, rows_of
 from benchmarks.plain import alcc, study, training
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.agent import Scene
-from lcc_rl.agents.replay import Trainer, transitions
+from lcc_rl.agents.collecting import transitions
+from lcc_rl.agents.replay import ReplayLoop
 
 WIDTH = 20  # environments side by side
 
@@ -78,8 +79,8 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path, updates: f
     env = alcc(options, WIDTH)
     env.base_env.horizon = steps // WIDTH  # episodes of one segment
     agent = DDPG(batch_size=batch, updates_per_transition=updates)
-    agent = agent.start(Scene(7, device=options.device))
-    trained = Trainer(agent, env, cfg.training, 0, folder, "benchmark")
+    agent = agent.start(Scene(7))
+    trained = ReplayLoop(agent, env, cfg.training, 0, folder, "benchmark")
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
     trained.buffer.extend(transitions(played))
     collector = trained._source()

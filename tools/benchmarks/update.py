@@ -14,20 +14,19 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from benchmarks.collect import OTHER
 from benchmarks.harness import Row, Run, installed, rates
 from benchmarks.plain import alcc, training
-from benchmarks.plain_update import PlainDDPG, PlainSAC, PlainTD3, PlainUpdate, check
 from lcc_rl.agents import DDPG, SAC, TD3
 from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.collecting import LEARNED_FROM, transitions
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.agents.replay import LEARNED_FROM, draws, transitions
+from lcc_rl.agents.replay import draws
 
-# Of every agent: the update by hand.
-AGENTS: dict[type[OffPolicy], type[PlainUpdate]] = {DDPG: PlainDDPG, TD3: PlainTD3, SAC: PlainSAC}
+AGENTS: tuple[type[OffPolicy], ...] = (DDPG, TD3, SAC)
 SIZES = ((64, 60), (256, 40), (1024, 20))  # batch, updates of a repeat
 QUICK = ((16, 2), (32, 2))
 
 
 def update(options: Namespace) -> list[Row]:
-    """Return updates per second, beside those written by hand and stable-baselines3's.
+    """Return updates per second, beside those of TorchRL's losses and stable-baselines3's.
 
     All updates include drawing the batch from the buffer, all losses and backward passes, Adam
     and the soft target updates, all in single precision. stable-baselines3's is its ``train()``,
@@ -36,24 +35,22 @@ def update(options: Namespace) -> list[Row]:
     played = transitions(alcc(options, 1000).rollout(20, break_when_any_done=False))
     rows: list[Row] = []
     for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
-        agent = kind(batch_size=batch).start(Scene(7, device=options.device))
+        agent = kind(batch_size=batch).start(Scene(7))
         name = kind.__name__
-        own, plain, loss, other = (
+        own, loss, other = (
             f"{name}.update",
-            f"plain {name}",
             f"TorchRL's {name}Loss",
             f"{OTHER} {name}",
         )
-        slow = kind(batch_size=batch, fused=False).start(Scene(7, device=options.device))
+        slow = kind(batch_size=batch, fused=False).start(Scene(7))
         runs: dict[str, Run] = {
             own: times(count, own_update(agent, played)),
-            plain: times(count, plain_update(agent, played)),
             loss: times(count, own_update(slow, played)),
         }
         if installed():
             model = their_update(options, agent, played)
             runs[other] = partial(model.train, count, batch)
-        against = {own: [plain, loss, other], other: [plain]}
+        against = {own: [loss, other]}
         counts = dict.fromkeys(runs, count)
         rows += rates(options, runs, "updates/s", counts, against, batch, grad=True)
     return rows
@@ -76,18 +73,6 @@ def own_update(agent: OffPolicy, played: TensorDictBase) -> Run:
     buffer.extend(played)
     draw = draws(buffer, torch.Generator().manual_seed(0))
     return lambda: agent.update(next(draw))
-
-
-def plain_update(agent: OffPolicy, played: TensorDictBase) -> PlainUpdate:
-    """Return the update by hand, checked, with the transitions of the agent's buffer."""
-    reached = {"reached": "observation", "reward": "reward", "terminated": "terminated"}
-    columns = {name: played["next", key] for name, key in reached.items()}
-    columns |= {name: played[name] for name in ("observation", "action")}
-    kind, plain = type(agent), AGENTS[type(agent)]
-    loss = kind(batch_size=agent.batch_size, fused=False)
-    loss = loss.start(Scene(7, seed=1, device=agent.device))
-    check(loss, plain(loss, columns))
-    return plain(agent, columns)
 
 
 def their_update(options: Namespace, agent: OffPolicy, played: TensorDictBase) -> Any:

@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from lcc_rl.commands import evaluation
-from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, known_settings, read_once
-from lcc_rl.config import key_of, load, root_key
-from lcc_rl.config.schemas import PipelineConfig, StudyConfig
-from lcc_rl.errors import unknown_name
-from lcc_rl.studies.runner import (
-    EPISODES,
-    FINISHED,
-    BaseStudy,
-    Outcome,
-    Run,
-    check_accepted,
-    differences,
-    note,
-    note_problems,
-    quoted,
-    run_all,
-    up_to_date,
+from lcc_rl.commands.evaluation import complete
+from lcc_rl.commands.pipeline import (
+    TRAJECTORIES,
+    calibrate_once,
+    known_settings,
+    read_once,
+    train_all,
 )
+from lcc_rl.config import key_of, load, quoted, root_key, with_inputs
+from lcc_rl.config.schemas import EvaluateConfig, PipelineConfig, TrainConfig
+from lcc_rl.errors import unknown_name
+from lcc_rl.studies.study import Study
 
-log = logging.getLogger("lcc_rl")
-
+TRAIN, EVALUATION = "train", "evaluation"
 DRIVERS = Path("calibration/drivers.parquet")
-ROWS = f"*/seed_*/{EPISODES}"
 PARTS = ("main", "ablations")
 OF_CALIBRATION = ("data", "calibration")  # overrides that only the calibration takes
 # Overrides that the calibration does not take.
@@ -85,157 +76,96 @@ def chosen_ablation(item: str) -> tuple[str, Change]:
     return name, ABLATIONS[name]
 
 
-def chooses_agent(overrides: Iterable[str]) -> bool:
-    """Whether overrides choose an agent other than the recipe's."""
-    return any(key_of(item) == "agent" for item in overrides)
+def default_recipe(overrides: Iterable[str]) -> str | None:
+    """Return the recipe of the study, ``paper_alcc``; None where overrides choose an agent."""
+    return None if any(key_of(item) == "agent" for item in overrides) else "paper_alcc"
 
 
-@dataclass(frozen=True)
-class Study(BaseStudy):
-    """The settings of the ALCC study.
-
-    Attributes:
-        ablations: names of :data:`ABLATIONS` or further ones as ``name:override``, e.g.
-            ``early:reward.terms.safety.threshold=6``; None for all.
-    """
-
-    recipe: str | None = "paper_alcc"
-    ablations: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for item in self.ablations or ():
-            chosen_ablation(item)
-
-    def settings(
-        self, entry: str, variant: str, *own: str, recipes: Sequence[str] = ()
-    ) -> list[str]:
-        """Return the overrides of a run: recipe, the study's inputs, the user's, its own."""
-        given = {root_key(item) for item in self.overrides}
-        data = f"data.path={quoted(self.folder / TRAJECTORIES)}"
-        drivers = f"drivers.path={quoted(self.folder / DRIVERS)}"
-        shared = [
-            item
-            for item in self.overrides
-            if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
-        ]
-        settings = known_settings(shared, entry)
-        if SINGLE in own:  # the user's split is then that of ``held_out``
-            moved = [x for x in settings if key_of(x).startswith("split.")]
-            settings = [x for x in settings if x not in moved]
-            own = (*own, *(x.replace("split.", "split.held_out.", 1) for x in moved))
-        return [
-            f"experiment=[{','.join([*filter(None, [self.recipe]), *recipes])}]",
-            f"variant={variant}",
-            "data=episodes",
-            data,
-            *(() if "drivers" in given else ("drivers=calibrated", drivers)),
-            *settings,
-            *own,
-        ]
-
-    def runs(self, folder: Path, change: Change, seeds: Iterable[int] | None = None) -> list[Run]:
-        """Return a training per seed and variant, all variants of a seed first."""
-        numbers = range(self.seeds) if seeds is None else seeds
-        own, recipes = change.overrides, change.recipes
-        return [
-            Run(
-                folder / variant / f"seed_{seed}",
-                tuple(self.settings("train", variant, f"seed={seed}", *own, recipes=recipes)),
-            )
-            for seed in numbers
-            for variant in change.variants
-        ]
-
-    def earlier(self, folder: Path, change: Change) -> list[Outcome]:
-        """Return finished trainings of further seeds with the same settings."""
-        found = {int(path.parent.name.removeprefix("seed_")) for path in folder.glob(ROWS)}
-        runs = self.runs(folder, change, sorted(found - set(range(self.seeds))))
-        return [
-            Outcome(run, FINISHED)
-            for run in runs
-            if run.finished and not differences(run, run.compose(), self.accept)
-        ]
+def settings(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
+    """Compose a run: recipe, the study's inputs, the user's overrides, its change, its own."""
+    given = {root_key(item) for item in study.overrides}
+    shared = [
+        item
+        for item in study.overrides
+        if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
+    ]
+    users, changed = known_settings(shared, entry), change.overrides
+    if SINGLE in changed:  # the user's split is then that of ``held_out``
+        moved = [x for x in users if key_of(x).startswith("split.")]
+        users = [x for x in users if x not in moved]
+        changed = (*changed, *(x.replace("split.", "split.held_out.", 1) for x in moved))
+    drivers = ("drivers=calibrated", f"drivers.path={quoted(study.folder / DRIVERS)}")
+    words = [
+        f"experiment=[{','.join([*filter(None, [study.recipe]), *change.recipes])}]",
+        f"variant={variant}",
+        "data=episodes",
+        f"data.path={quoted(study.folder / TRAJECTORIES)}",
+        *(() if "drivers" in given else drivers),
+        *users,
+        *changed,
+        *own,
+    ]
+    return load(entry, words)
 
 
-def run(study: Study, parts: Sequence[str] = PARTS, command: str = "") -> list[Outcome]:
+def trainings(study: Study, change: Change) -> dict[str, TrainConfig]:
+    """Return a training per seed and variant, all variants of a seed first, by their folders."""
+    return {
+        f"{variant}/seed_{seed}": settings(study, "train", variant, change, f"seed={seed}")
+        for seed in range(study.seeds)
+        for variant in change.variants
+    }
+
+
+def run(study: Study, parts: Sequence[str] = PARTS, ablations: Sequence[str] = ()) -> None:
     """Calibrate, train and evaluate; finished runs are skipped.
 
     Args:
         study: the settings.
         parts: some of :data:`PARTS`.
-        command: the command line, stored in the folder's notes.
-
-    Returns:
-        The outcome of every training.
+        ablations: names of :data:`ABLATIONS` or further ones as ``name:override``, e.g.
+            ``early:reward.terms.safety.threshold=6``; empty for all.
 
     Raises:
         LccError: one clear error for wrong settings, data or files.
     """
-    series = _series(study, parts)
-    composed = [study.runs(folder, change)[0].compose() for folder, change in series.items()]
-    for cfg in composed:  # before any work
-        check_accepted(study.accept, cfg)
-    calibration = _calibration(study, composed[0])
+    series = {
+        folder: (change, trainings(study, change))
+        for folder, change in _series(study, parts, ablations).items()
+    }
+    calibration = _calibration(study, next(iter(series.values()))[1])
     read_once(calibration, study.folder)
-    if command:
-        note(study.folder, "alcc", command)
     calibrate_once(calibration, study.folder)
-    outcomes = []
-    for folder, change in series.items():
-        trained = run_all(study.runs(folder, change), study.jobs, study.accept)
-        settings = study.settings("evaluate", "alcc", *change.overrides, recipes=change.recipes)
-        evaluated = study.folder if change is MAIN else folder
-        found = trained + study.earlier(folder, change)
-        _evaluate(settings, found, evaluated / "evaluation")
-        outcomes += trained
-    note_problems(study.folder, outcomes)
-    return outcomes
+    for folder, (change, runs) in series.items():
+        train_all(runs, folder, study.jobs)
+        cfg: EvaluateConfig = settings(study, "evaluate", "alcc", change)
+        cfg.compare = [str(folder)]
+        place = study.folder if change is MAIN else folder
+        complete(with_inputs(cfg), place / EVALUATION)
 
 
-def _series(study: Study, parts: Sequence[str]) -> dict[Path, Change]:
+def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dict[Path, Change]:
     """Return the series of trainings of the parts by their folders."""
     for part in parts:
         if part not in PARTS:
             raise unknown_name("part", part, PARTS)
-    found = {study.folder / "train": MAIN} if "main" in parts else {}
+    found = {study.folder / TRAIN: MAIN} if "main" in parts else {}
     if "ablations" in parts:
         # Ablations that change nothing are left out, and of short runs those that train long.
-        gamma = study.runs(study.folder, MAIN)[0].compose().agent["gamma"]
+        gamma = settings(study, "train", "alcc", MAIN).agent["gamma"]
         left_out = {f"gamma_{gamma:g}", f"recipe_{study.recipe}"}
         if study.recipe in (None, SMOKE):
             left_out |= set(OF_DDPG)
-        chosen = study.ablations or tuple(name for name in ABLATIONS if name not in left_out)
-        ablations = map(chosen_ablation, chosen)
-        found |= {study.folder / "ablations" / name: change for name, change in ablations}
+        chosen = ablations or tuple(name for name in ABLATIONS if name not in left_out)
+        named = map(chosen_ablation, chosen)
+        found |= {study.folder / "ablations" / name: change for name, change in named}
     return found
 
 
-def _calibration(study: Study, training: StudyConfig) -> PipelineConfig:
+def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
     """Return the settings of the calibration, whose data are divided as those of a training."""
     own = [item for item in study.overrides if root_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
-    cfg.split, cfg.scenario = training.split, training.scenario
+    first = next(iter(runs.values()))
+    cfg.split, cfg.scenario = first.split, first.scenario
     return cfg
-
-
-def _evaluate(settings: Sequence[str], outcomes: Sequence[Outcome], folder: Path) -> None:
-    """Evaluate every finished policy beside the human baselines, unless that is done.
-
-    Args:
-        settings: overrides of the entry point ``evaluate``.
-        outcomes: trainings in ``<variant>/seed_<n>``; those that did not finish are left out.
-        folder: folder of the evaluation.
-    """
-    runs = sorted(
-        (outcome.run.folder for outcome in outcomes if outcome.status == FINISHED),
-        key=lambda path: (path.parent.name, int(path.name.removeprefix("seed_"))),
-    )
-    if not runs:
-        log.warning("%s: nothing trained to evaluate", folder)
-        return
-    cfg = load("evaluate", settings)
-    cfg.compare = [str(path) for path in runs]
-    if not up_to_date(cfg, folder, runs):
-        log.info("evaluating %d policies into %s", len(runs), folder)
-        evaluation.run(cfg, folder, own=False, quiet=True, replace=True)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from lcc_rl.commands.evaluation import evaluate_and_write
-from lcc_rl.commands.pipeline import known_settings
-from lcc_rl.config import load, root_key
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.commands.evaluation import evaluate_and_write, made_by
+from lcc_rl.commands.pipeline import known_settings, train_all
+from lcc_rl.config import identity, load, quoted, root_key, with_inputs
+from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
@@ -25,24 +25,14 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
-from lcc_rl.results.runs import STEPS, save_config
+from lcc_rl.results.runs import EPISODES, STEPS, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.studies.hcfs.tables import LEARNED, per_run, rounded
-from lcc_rl.studies.runner import (
-    EPISODES,
-    FINISHED,
-    BaseStudy,
-    Outcome,
-    Run,
-    check_accepted,
-    note,
-    note_problems,
-    run_all,
-    up_to_date,
-)
+from lcc_rl.studies.study import Study
 
 log = logging.getLogger("lcc_rl")
 
+RECIPE = "paper_hcfs"
 BASELINES = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
 TRAINING = "training.parquet"
@@ -50,66 +40,49 @@ TRAINING = "training.parquet"
 WLTC = "+leader.full_length.wltc={path: wltc_3b, scale: 0.5}"
 
 
-@dataclass(frozen=True)
-class Study(BaseStudy):
-    """The settings of the HCFS study; its trainings are those of the DDPG parent."""
-
-    recipe: str | None = "paper_hcfs"
-
-    def runs(self) -> list[Run]:
-        """Return a training of the DDPG parent per seed."""
-        # Only the study's evaluation drives the full-length record.
-        own = (f"experiment={self.recipe}", f"variant={LEARNED}", *self.overrides)
-        return [
-            Run(
-                self.folder / LEARNED / f"seed_{seed}",
-                (*own, "evaluation.full_length=false", f"seed={seed}"),
-            )
-            for seed in range(self.seeds)
-        ]
-
-    def evaluation(self, *own: str) -> StudyConfig:
-        """Return the configuration of an evaluation of the hybrid."""
-        shared = known_settings(list(self.overrides), "evaluate")
-        more = () if any(root_key(item) == "leader" for item in self.overrides) else (WLTC,)
-        words = [f"experiment={self.recipe}", "variant=hcfs", *more, *shared, *own]
-        return load("evaluate", words)
+def trainings(study: Study) -> dict[str, TrainConfig]:
+    """Return a training of the DDPG parent per seed, by their folders."""
+    # Only the study's evaluation drives the full-length record.
+    own = (f"experiment={study.recipe}", f"variant={LEARNED}", *study.overrides)
+    return {
+        f"seed_{seed}": load("train", [*own, "evaluation.full_length=false", f"seed={seed}"])
+        for seed in range(study.seeds)
+    }
 
 
-def run(study: Study, command: str = "") -> list[Outcome]:
+def evaluation(study: Study, *own: str) -> StudyConfig:
+    """Return the configuration of an evaluation of the hybrid."""
+    shared = known_settings(list(study.overrides), "evaluate")
+    more = () if any(root_key(item) == "leader" for item in study.overrides) else (WLTC,)
+    words = [f"experiment={study.recipe}", "variant=hcfs", *more, *shared, *own]
+    cfg: StudyConfig = load("evaluate", words)
+    return cfg
+
+
+def run(study: Study) -> None:
     """Train the DDPG parents and evaluate every strategy; finished runs are skipped.
 
     Args:
         study: the settings.
-        command: the command line, stored in the folder's notes.
-
-    Returns:
-        The outcome of every training.
 
     Raises:
         LccError: one clear error for wrong settings or files.
     """
-    cfg = study.evaluation()
-    check_accepted(study.accept, study.runs()[0].compose())
-    if command:
-        note(study.folder, "hcfs", command)
-    outcomes = run_all(study.runs(), study.jobs, study.accept)
-    note_problems(study.folder, outcomes)
+    cfg, runs, place = evaluation(study), trainings(study), study.folder / LEARNED
+    train_all(runs, place, study.jobs)
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     target = study.folder / "evaluation"
     _evaluate(baselines(cfg), cfg, inputs, target / BASELINES)
-    done = [outcome.run.folder for outcome in outcomes if outcome.status == FINISHED]
-    for folder in sorted(done):
-        own = study.evaluation(f"policy='{folder}'")
+    done = [place / name for name in runs]
+    for folder in done:
+        own = evaluation(study, f"policy={quoted(folder)}")
         weights, trained = load_policy(folder)
         check_policy(own, trained)
         own.agent = trained.agent
         learned = with_weights(own, weights, trained.seed, str(folder), inputs.population)
-        strategies = hybrid_strategies(own, learned)
-        _evaluate(strategies, own, inputs, target / folder.name, folder)
-    keep(study.folder, sorted(done))
-    return outcomes
+        _evaluate(hybrid_strategies(own, learned), own, inputs, target / folder.name)
+    keep(study.folder, done)
 
 
 def keep(folder: Path, trainings: Sequence[Path]) -> None:
@@ -160,10 +133,10 @@ def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
 
 
 def _evaluate(
-    strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path, *trained: Path
+    strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path
 ) -> None:
     """Evaluate into a folder, unless that is done."""
-    if up_to_date(cfg, folder, trained):
+    if made_by(folder / EPISODES) == identity(with_inputs(cfg)):
         return
     log.info("evaluating %d strategies into %s", len(strategies), folder)
     (folder / EPISODES).unlink(missing_ok=True)  # never beside another configuration

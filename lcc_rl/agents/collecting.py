@@ -1,0 +1,125 @@
+"""The loop of agents that learn from what a collector plays, after every segment of it."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import BaseCollector, Collector
+
+from lcc_rl.agents.actor import ACTION, OBSERVATION, shared_policy
+from lcc_rl.agents.agent import derived_seed
+from lcc_rl.agents.checks import check_batch, check_learner
+from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop, episode_statistics
+from lcc_rl.envs import StringCollector
+from lcc_rl.pieces.rewards import REWARD
+
+# What is learned from, as the environment names it and as the losses do.
+LEARNED_FROM = {
+    OBSERVATION: ("observation",),
+    ACTION: ("action",),
+    ("next", *OBSERVATION): ("next", "observation"),
+    ("next", *REWARD): ("next", "reward"),
+    ("next", "done"): ("next", "done"),
+    ("next", "terminated"): ("next", "terminated"),
+}
+
+# Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
+WORTH_COMPILING = 40_000
+
+
+class CollectingLoop(TrainingLoop[AgentT]):
+    """Plays batches of episodes by the agent's policy and its exploration, ``agent.noise``.
+
+    A subclass says what is learned from a segment; arguments as of :class:`TrainingLoop`.
+    """
+
+    @abstractmethod
+    def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
+        """Learn from a segment; return the means of the losses, ``loss_value`` among them.
+
+        Args:
+            batch: transitions, ``[environments, steps]``, by the keys of :data:`LEARNED_FROM`.
+            before: transitions of the segments before it, those of all vehicles.
+        """
+
+    def explore(self, share: float) -> float:
+        """Set the exploration after this share of the training; return its standard deviation."""
+        return 1.0
+
+    def _source(self) -> BaseCollector:
+        self.noise = self.agent.noise.to(self.env.device or "cpu")
+        return self._collector(self.settings.segment, self._compiled())
+
+    def _collector(self, steps: int, compiled: bool) -> BaseCollector:
+        policy = TensorDictSequential(shared_policy(self.agent.policy), self.noise)
+        frames = steps * self.env.batch_size.numel()
+        if self.settings.collector == "torchrl":
+            how = {"total_frames": -1, "auto_register_policy_transforms": False}
+            return Collector(self.env, policy, frames_per_batch=frames, **how)
+        keys = (*LEARNED_FROM, *REPORTED)
+        return StringCollector(
+            self.env, policy, frames_per_batch=frames, keys=keys, compiled=compiled
+        )
+
+    def _compiled(self) -> bool:
+        """Whether to compile the environment: if left open, where the whole training pays for it.
+
+        The whole, not what remains, so that a resumed training computes what it would have.
+        """
+        if self.settings.compiled is not None:
+            return self.settings.compiled
+        return self.iterations * self.horizon >= WORTH_COMPILING
+
+    def _iterate(self, collector: BaseCollector) -> dict[str, float]:
+        """Play one batch of episodes, learning after every segment of them."""
+        share, steps = self.iteration / self.iterations, self.settings.segment
+        sigma, rate = self.explore(share), self.agent.anneal(share)
+        self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
+        collector.reset()
+        segments = iter(collector)
+        played, losses, spent = [], [], [0.0, 0.0]
+        for part in range(self.horizon // steps):
+            begun = time.perf_counter()
+            self.explore(share)
+            batch = next(segments)
+            check_batch(batch, part * steps)
+            played.append(batch.select(*REPORTED))
+            collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
+            before = self.iteration * (self.horizon // steps) + part
+            losses.append(self.learn(batch, before * size))
+            check_learner(self.agent.policy, losses[-1], self.advice)
+            spent[0] += collected - begun
+            spent[1] += time.perf_counter() - collected
+        self.iteration += 1
+        row = {
+            "iteration": float(self.iteration),
+            "episodes": float(self.iteration * self.env.batch_size[0]),
+            "transitions": float(self.iteration * size * len(played)),
+            "updates": float(self.updates),
+            "exploration_sigma": sigma,
+            "learning_rate": rate,
+            **episode_statistics(torch.cat(played, dim=1)),
+            **{name: sum(loss[name] for loss in losses) / len(losses) for name in losses[0]},
+        }
+        self._record(row, *spent)
+        return row
+
+
+def transitions(batch: TensorDictBase) -> TensorDictBase:
+    """Return what is learned from a batch ``[environments, steps]``, one transition a row.
+
+    Every automated vehicle's is a transition of its own, ``[environments × steps × A]``; all of
+    them end when the episode does.
+    """
+    shape = batch.get(("next", *REWARD)).shape[:-1]
+    rows = TensorDict(batch_size=[shape.numel()], device=batch.device)
+    for source, target in LEARNED_FROM.items():
+        entry = batch.get(source)
+        if entry.ndim == len(shape):
+            entry = entry.unsqueeze(-2).expand(*shape, 1)
+        rows.set(target, entry.reshape(-1, entry.shape[-1]))
+    return rows

@@ -1,0 +1,138 @@
+"""Proximal policy optimization, on TorchRL's loss and advantage (Schulman et al., 2017)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from lcc_rl.agents.actor import make_actor, seeded_mlp
+from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
+from lcc_rl.agents.collecting import CollectingLoop, transitions
+from lcc_rl.agents.sac import SampledAction
+from lcc_rl.pieces.rewards import REWARD
+from lcc_rl.settings import Count, NonNegative, Positive, Share
+
+LOG_PROB = "action_log_prob"  # where TorchRL's loss expects it
+
+
+class Gaussian(nn.Module):
+    """Mean and standard deviation of the action before the tanh; the latter is the same always."""
+
+    def __init__(self, mean: nn.Module, sigma: float) -> None:
+        super().__init__()
+        self.mean, self.log_sigma = mean, nn.Parameter(torch.tensor([sigma]).log())
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return both, each ``[*batch, 1]``."""
+        mean = self.mean(observation)
+        return mean, self.log_sigma.exp().expand_as(mean)
+
+
+class OnPolicyLoop(CollectingLoop[Any]):
+    """Learns from each segment once; arguments as of :class:`TrainingLoop`."""
+
+    advice = "Lower agent.learning_rate or agent.clip"
+
+    def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
+        vehicles = batch.get(("next", *REWARD)).shape[2]
+        # Time last, a row per vehicle: advantages are of trajectories.
+        rows = transitions(batch).reshape(*batch.shape, vehicles).permute(0, 2, 1)
+        losses = self.agent.update(rows.reshape(-1, batch.shape[1]).contiguous())
+        self.updates += 1
+        return {name: float(value) for name, value in losses.items()}
+
+
+class PPO(Agent):
+    """A Gaussian policy and a value, learned by clipped ratios; the mean is what is kept."""
+
+    gamma: Share = 0.99  # discount
+    td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
+    hidden: Sequence[Count] = (64, 64)  # ReLU layers of policy and value
+    learning_rate: Positive = 1e-3  # of both at the start; it falls along half a cosine
+    final_lr_fraction: Fraction = 0.1  # of it that is left at the end
+    clip: Fraction = 0.2  # largest change of the ratio of probabilities that earns anything
+    epochs: Count = 10  # passes over the transitions of a segment
+    batch_size: Count = 1024  # transitions of a gradient step
+    entropy: NonNegative = 0.0  # price of a narrow distribution
+    sigma: Positive = 0.5  # standard deviation before the tanh at the start
+    clip_norm: Positive = 0.5  # gradients longer than this are shortened to it
+
+    loop = OnPolicyLoop
+
+    def setup(self, scene: Scene) -> None:
+        size, device = scene.observation_size, scene.device
+        self.count = 0
+        self.policy = make_actor(size, 1, self.hidden, scene.seed).to(device)
+        self.head = head = Gaussian(self.policy.module[0], self.sigma).to(device)
+        self.noise = SampledAction(head)
+        self.actor = ProbabilisticActor(
+            TensorDictModule(head, in_keys=["observation"], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+        )
+        value = ValueOperator(seeded_mlp(size, 1, self.hidden, scene.seed + 1)).to(device)
+        self.advantage = GAE(gamma=self.gamma, lmbda=self.td_lambda, value_network=value)
+        self.loss = ClipPPOLoss(
+            self.actor,
+            value,
+            clip_epsilon=self.clip,
+            entropy_bonus=self.entropy > 0.0,
+            entropy_coeff=self.entropy,
+            critic_coeff=1.0,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self.weights = [*self.loss.parameters()]
+        self.optimizer = torch.optim.Adam(self.weights, lr=self.learning_rate)
+
+    def anneal(self, share: float) -> float:
+        return anneal([self.optimizer], share, self.final_lr_fraction)
+
+    def update(self, data: TensorDictBase) -> dict[str, Tensor]:
+        """Learn from trajectories.
+
+        Args:
+            data: transitions as of :data:`LEARNED_FROM`, ``[trajectories, steps]``.
+
+        Returns:
+            The means of ``loss_actor`` and ``loss_value``, and the standard deviation ``sigma``.
+        """
+        with torch.random.fork_rng(devices=[]):  # of the shuffle, and of TorchRL's entropy
+            torch.manual_seed(derived_seed(self.seed, self.count, "update"))
+            self.count += 1
+            with torch.no_grad():
+                data = self.advantage(data)
+                data[LOG_PROB] = self.actor.get_dist(data).log_prob(data["action"])
+            rows = data.reshape(-1)
+            shuffled = (torch.randperm(len(rows)) for _ in range(self.epochs))
+            parts = (part for order in shuffled for part in order.split(self.batch_size))
+            found = [self._step(rows[part]) for part in parts]
+        actor, value = (torch.stack(each).mean() for each in zip(*found, strict=True))
+        sigma = self.head.log_sigma.detach().exp().mean()
+        return {"loss_actor": actor, "loss_value": value, "sigma": sigma}
+
+    def _step(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        losses = self.loss(batch)
+        actor, value = losses["loss_objective"], losses["loss_critic"]
+        self.optimizer.zero_grad()
+        (actor + value + losses.get("loss_entropy", 0.0)).backward()
+        nn.utils.clip_grad_norm_(self.weights, self.clip_norm)
+        self.optimizer.step()
+        return actor.detach(), value.detach()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"count": self.count, **super().state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.count = state["count"]
+        super().load_state_dict(state)

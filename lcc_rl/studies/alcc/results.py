@@ -1,0 +1,163 @@
+"""Tables and figures of the ALCC study, from the study's parquet files alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from lcc_rl import results
+from lcc_rl.errors import ResultsError
+from lcc_rl.figures import evaluation as run_figures
+from lcc_rl.figures.calibration import calibration_figure, joint_figure
+from lcc_rl.figures.training import learning_curve
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.means import WINDOWS, Means
+from lcc_rl.results.names import in_words
+from lcc_rl.results.runs import EPISODES, STEPS
+from lcc_rl.results.savings import LEADER
+from lcc_rl.studies.alcc import figures, paper_tables, tables
+from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS, EVALUATION
+from lcc_rl.studies.results import StudyResults
+
+TITLE = "Adaptive Leading Cruise Control: the study"
+CURVES = "training.parquet"  # learning curves of the main trainings, if these are not there
+ITSELF = "this study"
+BOTH = {"alcc", "reference"}
+TUNED = ("idm_acc", "acc")
+SHARES = [
+    f"{which}_{name}"
+    for name in ("unsafe_ttc_pct", tables.LONG)
+    for which in ("mean", "worst_seed")
+]
+
+
+def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
+    """Write tables/*.parquet, figures/*.png and results.md from a study's parquet files.
+
+    Parts whose runs do not exist are left out.
+
+    Args:
+        folder: a study's folder, written by ``lcc-rl reproduce alcc``, or what is kept of it.
+        formats: further formats of the figures.
+
+    Raises:
+        ResultsError: if there is no evaluation in the folder, or a file cannot be read.
+    """
+    found = StudyResults(folder, formats)
+    if not any(map(_finished, folder.glob(f"**/{EVALUATION}"))):
+        raise ResultsError(f"{folder}: no {EVALUATION}/{EPISODES}; lcc-rl reproduce alcc makes it")
+    main = Means.read(folder / EVALUATION) if _finished(folder / EVALUATION) else None
+    if main is not None:
+        add_main(found, main)
+    _learning(found)
+    _ablations(found, main)
+    _people(found)
+    found.write(TITLE)
+    return found
+
+
+def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Return tables that fit the width of a page of the documentation, by name."""
+    energies, human, shares = (
+        table[~table.iloc[:, 0].isin(TUNED)]
+        for table in (shown["energies"], shown["human_energy"], shown["constraints"])
+    )
+    human = human[human["energy"] == paper_tables.NAMES[""]]
+    parts = ["strategy", "total_path_energy_kj", "total_path_energy_kj_low"]
+    parts += ["total_path_energy_kj_high", "total_energy_kj", *tables.PARTS]
+    return {
+        "parts": energies.loc[energies["strategy"] != "direct", parts],
+        "behind": human.drop(columns=["energy", "least_driver_pct", "most_driver_pct"]),
+        "shares": shares[["strategy", "collisions", *SHARES]],
+    }
+
+
+def add_main(found: StudyResults, means: Means) -> None:
+    """Add the tables and figures of the main evaluation."""
+    windows, size = means.windows, means.size()
+    found.table("headline", f"Energy of both saved, {size}", tables.headline(windows))
+    found.table("energies", f"Energy per episode, {size}", tables.energies(windows))
+    if set(LEADER) <= set(windows):
+        caption = "Path energy saved in thirds of the windows, by the leader's energy and speed"
+        found.table("strata", caption, tables.strata(windows))
+    caption = "Path energy of controlled car and human driver by strategy (Fig. 11)"
+    found.figure("distributions", caption, figures.distributions(means.drivers))
+    path = found.folder / EVALUATION / STEPS
+    if path.exists() and ((steps := read_parquet(path))["strategy"] == "alcc").any():
+        caption = "One held-out episode of the network for all, first seed (Fig. 7)"
+        found.figure("sample_episode", caption, run_figures.sample_episode(steps, "alcc"))
+    found.table("constraints", f"Safety and efficiency, {size}", tables.constraints(windows))
+    found.table("constraints_by_seed", "Every seed", tables.constraints_by_seed(windows))
+    if set(windows["strategy"]) >= BOTH:
+        _awareness(found, means)
+        _generalization(found, windows)
+    table = paper_tables.human_energy(means)
+    found.table("human_energy", f"Human driver's energy with and without the car, {size}", table)
+    for name in sorted(BOTH & set(windows["strategy"])):
+        caption = f"Human driver's path energy behind {in_words(name)} (Fig. 9)"
+        found.figure(f"human_energy_{name}", caption, run_figures.human_energy(means, name))
+
+
+def _awareness(found: StudyResults, means: Means) -> None:
+    caption = f"Table IV beside this study, {means.size()}"
+    found.table("table_iv", caption, paper_tables.table_iv(means.drivers))
+    found.table("holistic", "Saving per driver", paper_tables.holistic(means))
+    caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"
+    figure = run_figures.paired_improvement(means, "alcc", "reference")
+    found.figure("improvement", caption, figure)
+
+
+def _generalization(found: StudyResults, windows: pd.DataFrame) -> None:
+    caption = "Saving of alcc against reference over profiles, beside the paper's 4"
+    found.table("generalization_row", caption, paper_tables.generalization_row(windows))
+    found.table("generalization", "Every held-out window", paper_tables.generalization(windows))
+    caption = "Energies and saving on every held-out window (Fig. 12)"
+    found.figure("generalization", caption, figures.generalization_figure(windows))
+
+
+def _learning(found: StudyResults) -> None:
+    if (found.folder / CURVES).exists():
+        training = read_parquet(found.folder / CURVES)
+    elif any((found.folder / "train").rglob("training.parquet")):
+        training = results.load(found.folder / "train", "training", strict=True)
+    else:
+        return
+    found.table("learning", "Learning curves, every seed", tables.learning(training))
+    found.figure("learning_curve", "Reward over training (Fig. 6)", learning_curve(training))
+    found.figure("reward_terms", "Every reward term", figures.reward_terms(training))
+
+
+def _ablations(found: StudyResults, main: Means | None) -> None:
+    means = {
+        path.parent.name: Means.read(path)
+        for path in found.folder.glob(f"ablations/*/{EVALUATION}")
+        if _finished(path)
+    }
+    if not means:
+        return
+    order = [*(name for name in ABLATIONS if name in means), *sorted(means.keys() - ABLATIONS)]
+    parts = {ITSELF: main} if main is not None else {}
+    parts |= {name: means[name] for name in order}
+    windows = pd.concat(
+        [one.windows.assign(ablation=name) for name, one in parts.items()], ignore_index=True
+    )
+    found.table("series", "Energy as drawn of both vehicles", tables.series(windows))
+    found.table("ablations", "Path energy, safety and efficiency", tables.comparison(windows))
+    caption = "Energy, safety and efficiency under each change"
+    found.figure("ablations", caption, figures.comparison_figure(windows))
+
+
+def _people(found: StudyResults) -> None:
+    """Add the calibration and the power map."""
+    found.figure("power_map", "The motor's power map (A2; Fig. 2)", figures.power_map())
+    if (found.folder / DRIVERS).exists():
+        drivers = read_parquet(found.folder / DRIVERS)
+        found.figure("calibration", "Calibration (Fig. 4)", calibration_figure(drivers))
+        caption = "Joint distribution of desired speed and time gap (Fig. 5)"
+        found.figure("joint_distribution", caption, joint_figure(drivers))
+
+
+def _finished(evaluation: Path) -> bool:
+    return any((evaluation / name).exists() for name in (WINDOWS, EPISODES))

@@ -1,0 +1,98 @@
+"""Tables and figures of the HCFS study, from the study's parquet files alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.figures import platoon
+from lcc_rl.figures.training import learning_curve
+from lcc_rl.io.files import read_parquet
+from lcc_rl.results.runs import EPISODES, STEPS
+from lcc_rl.results.string_tables import case_table
+from lcc_rl.studies.hcfs import tables
+from lcc_rl.studies.hcfs.study import TRAINING
+from lcc_rl.studies.hcfs.tables import LEARNED
+from lcc_rl.studies.results import StudyResults
+
+LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
+SOURCES = "sources.parquet"  # rows of the windows of other sources of leaders
+TITLE = "Hybrid Car-Following Strategy: the study"
+# The paper's table and figures of each case: speeds, jerk, and who drives.
+CASES = {
+    "case 1": ("Table IV", 4, 5, 6),
+    "case 2": ("Table V", 7, 8, 9),
+    "case 3": ("Table VI", 10, 11, 12),
+}
+RULES = ("cacc path", "cacc paper_like", "cacc tuned")
+HYBRIDS = ("hcfs", "hcfs oracle", "hcfs untuned")
+PARENTS = ("cacc tuned", LEARNED)
+STRATEGIES = (*RULES, LEARNED, *HYBRIDS, "deadbeat")
+IN_CASES = ("cacc paper_like", "cacc tuned", LEARNED, "hcfs", "hcfs untuned", "deadbeat")
+WHOLE = ("cacc tuned", LEARNED, "hcfs", "hcfs literal", "deadbeat")
+
+
+def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
+    """Write tables/*.parquet, figures/*.png and results.md from a study's parquet files.
+
+    Args:
+        folder: holds episodes.parquet, steps.parquet and training.parquet, written by
+            ``lcc-rl reproduce hcfs``.
+        formats: further formats of the figures.
+
+    Raises:
+        ResultsError: if a table is missing or cannot be read.
+    """
+    found = StudyResults(folder, formats)
+    episodes, steps = (read_parquet(folder / name) for name in (EPISODES, STEPS))
+    _windows(found, episodes)
+    for case in CASES:
+        _case(found, episodes, steps, case)
+    found.table("table_iv", "Table IV as printed, on another record", tables.printed())
+    found.table("weights", "Σ reward from Σ|e_v| and Σ|jerk| of Table IV", tables.weights())
+    whole = tables.whole_records(episodes, WHOLE)
+    found.table("whole", "Σ reward over whole records (least … most of the trainings)", whole)
+    gains = tables.whole_gains(episodes, PARENTS)
+    found.table("whole_gains", "HCFS against its parents over whole records", gains)
+    if (folder / SOURCES).exists():  # only where platoons drove behind other leaders, too
+        runs = read_parquet(folder / SOURCES)
+        shown = tables.sources(runs, ("cacc tuned", "hcfs", "hcfs first"))
+        found.table("sources", "Windows of other sources of leaders", shown)
+        found.table("sources_in_full", "The same of all strategies", tables.sources(runs))
+    if (folder / LENGTHS).exists():  # only where several studies were put side by side
+        lengths = tables.lengths(read_parquet(folder / LENGTHS))
+        found.table("lengths", "Σ reward per window by the length of the training", lengths)
+    curve = learning_curve(read_parquet(folder / TRAINING))
+    found.figure("learning_curve", "Learning curve of the DDPG parent", curve)
+    found.write(TITLE)
+    return found
+
+
+def _windows(found: StudyResults, episodes: pd.DataFrame) -> None:
+    others = [name for name in STRATEGIES if name != "hcfs"]
+    gained = tables.win_rates(episodes, "hcfs", [*others, "deadbeat oracle"])
+    untuned = tables.win_rates(episodes, "hcfs untuned", ["cacc paper_like", LEARNED, "hcfs"])
+    cases = tables.over_cases(episodes, tuple(CASES), IN_CASES)
+    found.table("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES))
+    found.table("win_rates", "HCFS (rule: CACC tuned) against every other", gained)
+    found.table("win_rates_untuned", "HCFS with the CACC of Table IV", untuned)
+    found.table("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOWS))
+    found.table("cases", "Σ reward in the cases of the paper", cases)
+
+
+def _case(found: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
+    stem, (table, speeds, jerk, who) = case.replace(" ", "_"), CASES[case]
+    found.table(stem, f"{case} ({table} of the paper)", case_table(episodes, case))
+    pictures = {
+        ("velocities", f"speeds (Fig. {speeds})"): platoon.velocities(steps, case),
+        ("jerk", f"jerk and its bound (Fig. {jerk})"): platoon.jerks(steps, case, 30.0),
+        ("switching_hcfs", f"who drives, hcfs (Fig. {who})"): platoon.switching(steps, case),
+        ("switching_hcfs_oracle", "who drives, hcfs oracle"): platoon.switching(
+            steps, case, "hcfs oracle"
+        ),
+    }
+    for (name, words), figure in pictures.items():
+        found.figure(f"{stem}_{name}", f"{case}: {words}", figure)

@@ -1,0 +1,53 @@
+"""Tables and figures of a study, as files and on a Markdown page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from lcc_rl.figures.drawing import save
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import write_parquet
+from lcc_rl.results.cells import as_markdown
+from lcc_rl.results.names import worded
+
+PAGE = "results.md"
+
+
+class StudyResults:
+    """Tables and figures of a study, written as they are added.
+
+    Args:
+        folder: gets ``tables/<name>.parquet``, ``figures/<name>.png`` and ``results.md``.
+        formats: further formats of the figures.
+    """
+
+    def __init__(self, folder: str | Path, formats: Iterable[str] = ()) -> None:
+        self.folder, self.formats = Path(folder), tuple(formats)
+        self.tables: dict[str, pd.DataFrame] = {}
+        self.blocks: list[str] = []
+
+    def table(self, name: str, caption: str, table: pd.DataFrame) -> None:
+        """Write a table below a caption."""
+        write_parquet(table, self.folder / "tables" / f"{name}.parquet")
+        self.tables[name] = table
+        self.blocks.append(f"**{caption}** (`{name}`)\n\n{as_markdown(worded(table))}")
+
+    def figure(self, name: str, caption: str, figure: Figure) -> None:
+        """Write a figure with a caption."""
+        place = save(figure, self.folder / "figures" / f"{name}.png", 130, self.formats)
+        self.blocks.append(f"![{caption}](figures/{place.name})\n\n{caption}")
+
+    def write(self, title: str) -> Path:
+        """Write ``results.md`` with all tables and figures; return its path.
+
+        Raises:
+            ResultsError: if the page cannot be written.
+        """
+        with atomic_path(self.folder / PAGE) as temporary:
+            text = "\n\n".join([f"# {title}", *self.blocks])
+            temporary.write_text(f"{text}\n", encoding="utf-8")
+        return self.folder / PAGE

@@ -1,0 +1,243 @@
+"""Write tables and figures of the documentation from outputs/reference: python tools/pages.py
+
+Tables stand in docs/*.md between ``<!-- table: name -->`` and ``<!-- end -->``, figures in
+docs/figures. The commands that the pages name draw the other figures. What is kept in
+outputs/reference was made by the tools of the tag history/2026-11, see its README.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import sys
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import fleets
+import measured_energy
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from lcc_rl.cli.guard import main_guard
+from lcc_rl.config import load
+from lcc_rl.config.nodes import build
+from lcc_rl.config.schemas import as_plain
+from lcc_rl.data.leaders import stretch
+from lcc_rl.errors import require
+from lcc_rl.figures.calibration import twins_figure
+from lcc_rl.figures.drawing import COLUMN, footnote, new_figure, paper, save, style
+from lcc_rl.figures.platoon import record_figure
+from lcc_rl.figures.space_time import space_time
+from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.files import read_parquet
+from lcc_rl.io.settings import read_json
+from lcc_rl.results import board
+from lcc_rl.results.cells import as_markdown, markdown_row, signed
+from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
+from lcc_rl.results.headline import saved
+from lcc_rl.results.names import in_words, worded
+from lcc_rl.results.runs import reading
+from lcc_rl.results.scores import FLOW, LEAST, Task, keeps, limited
+from lcc_rl.results.scores import SHARE as IS_SHARE
+from lcc_rl.studies.alcc.results import narrow
+from lcc_rl.studies.reproduce import RESULTS
+
+REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
+MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
+LIMIT = "limit_"  # begins the columns of kept scores that hold the task's limits
+# Figures of the studies whose rows are kept, on their pages.
+SHOWN_OF = {
+    "alcc": ("learning_curve", "improvement"),
+    "hcfs": ("case_1_velocities", "case_1_switching_hcfs"),
+}
+SHOWN = {
+    "human": "all cars: human drivers",
+    "pi_saturation": "one car: PI with saturation",
+    "alcc": "one car: learned",
+}
+KINDS_SHOWN = {  # variant and policy, how it is named, its colour and whether its dots are filled
+    ("alcc", "idm"): ("IDM, tuned by search", "#d55e00", True),
+    ("alcc", "idm_gradient"): ("IDM, tuned by gradient", "#cc79a7", True),
+    ("own_energy", "network"): ("network, its own energy", "#0072b2", False),
+    ("alcc", "network"): ("network", "#0072b2", True),
+    ("alcc", "memory"): ("network with memory", "#56b4e9", True),
+    ("alcc", "preview"): ("network with preview", "#009e73", True),
+}
+
+
+def fill(page: Path, tables: Mapping[str, str]) -> None:
+    """Write tables into a Markdown file, between their marks.
+
+    Raises:
+        ConfigError: if there is no table of a marked name.
+        ResultsError: if the file cannot be written.
+    """
+
+    def marked(found: re.Match[str]) -> str:
+        begin, name, end = found.groups()
+        require(name in tables, f"{page}: no table {name!r}; known: {', '.join(tables)}")
+        return f"{begin}\n\n{tables[name].strip()}\n\n{end}"
+
+    text = MARKED.sub(marked, page.read_text(encoding="utf-8"))
+    with atomic_path(page) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def study(name: str, reference: Path, docs: Path) -> None:
+    """Write the tables of a study's page, and the figures that it shows."""
+    with TemporaryDirectory() as place:
+        kept = shutil.copytree(reference / name, Path(place) / name)
+        found = RESULTS[name](kept).tables
+        found |= narrow(found) if name == "alcc" else {}
+        fill(docs / f"{name}.md", {x: as_markdown(worded(table)) for x, table in found.items()})
+        for figure in SHOWN_OF[name]:
+            shown = docs / "figures" / f"{name}_{figure}.png"
+            shutil.copyfile(kept / "figures" / f"{figure}.png", shown)
+
+
+def tasks(reference: Path, docs: Path) -> None:
+    """Write the tables of docs/tasks.md and docs/leaderboard.md."""
+    kept = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
+    parts = [task_table(name, table) for name, table in kept.items() if "score_name" in table]
+    fronts = fleets.fronts(kept["fleets_fronts"])
+    fill(docs / "tasks.md", {"fleets": fronts, "tasks": "\n\n".join(parts)})
+    files = sorted((reference / "scores").glob("*.json"))
+    documents = {path.name: read_json(path) for path in files}
+    with reading(reference / "scores"):
+        table = board.as_markdown(documents)
+    fill(docs / "leaderboard.md", {"board": table})
+
+
+def task_table(name: str, table: pd.DataFrame) -> str:
+    """Return the Markdown table of a task below its name; the kept scores hold every measure."""
+    first = {str(key): value for key, value in table.iloc[0].items()}
+    limits = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
+    given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
+    task = Task(name=name, limits=limits, **given)
+    names = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h] (%)", "limits"]
+    lines = [[*names, "decision [ms]"]]
+    whole = table.set_index("strategy").loc[task.against, FLOW]
+    for row in table.to_dict("records"):
+        share = (100.0 * row[f"saving{end}"] for end in ("", "_low", "_high"))
+        cells = [
+            in_words(str(row["strategy"])),
+            f"{row['score']:.2f}",
+            saved(*share),
+            signed(-100.0 * row["distance_lost"]),
+            f"{row[FLOW]:,.0f} ({signed(100.0 * (row[FLOW] / whole - 1.0))})",
+            "kept" if row["kept"] else broken(task, row),
+            f"{row['decision_ms']:.2f}" if np.isfinite(row["decision_ms"]) else "",
+        ]
+        lines.append(cells)
+    head, *others = map(markdown_row, lines)
+    bounds = ", ".join(bounded(column, bound) for column, bound in task.limits.items())
+    words = f"Saved against {in_words(task.against)}. Limits: {bounds or 'no collision'}."
+    title = f"### {name}\n\n{first['windows']} windows. {words}"
+    return "\n".join([title, "", head, "|" + "---|" * len(lines[0]), *others])
+
+
+def bounded(column: str, bound: float) -> str:
+    """Return a column and its limit in words."""
+    return f"{limited(column)} {'≥' if column.startswith(LEAST) else '≤'} {measured(column, bound)}"
+
+
+def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
+    """Return the limits that are not kept with their values, or the collisions."""
+    found = [
+        f"{limited(column)} {measured(column, row[column])}"
+        for column, bound in task.limits.items()
+        if not keeps(column, row[column], bound)
+    ]
+    return "; ".join(found) or f"{row['collisions']} collisions"
+
+
+def measured(column: str, value: float) -> str:
+    """Return a value of a limited column with its unit."""
+    if column.startswith(IS_SHARE):
+        return f"{100.0 * value:.2f} %"
+    return f"{value:.0f} m" if column.endswith("_m") else f"{value:.2f} s"
+
+
+def figure_of_record() -> Figure:
+    """Draw the speed record that platoons train on, and their test cases."""
+    cfg = load("evaluate", ["variant=cacc"])
+    step, used = cfg.scenario.time_step, cfg.leader["training"]["udds"]
+    leaders = build(cfg.leader, "leader").load(
+        step, cfg.scenario.horizon, len(cfg.scenario.vehicles)
+    )
+    record = stretch(used["path"], step, used["scale"])
+    return record_figure(record, used["from_s"], leaders.cases)
+
+
+@paper
+def figure_of_limits(windows: pd.DataFrame) -> Figure:
+    """Draw path energy over the share of long time gaps: a dot per training, a line per kind.
+
+    Args:
+        windows: one row per training and held-out window.
+    """
+    figure = new_figure(COLUMN, 3.2)
+    axes = figure.subplots()
+    kinds = dict(list(windows.groupby(KINDS)))
+    for kind, (label, hue, filled) in KINDS_SHOWN.items():
+        line = points(kinds[kind]).sort_values(SHARE)
+        look: dict[str, Any] = {"color": hue, "mfc": hue if filled else "white", "ms": 3.0}
+        axes.plot(100.0 * line[SHARE], line[ENERGY], "-" if filled else "--", color=hue)
+        each = kinds[kind].groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
+        axes.plot(100.0 * each[SHARE], each[ENERGY], "o", **look)
+        axes.plot([], [], "o-" if filled else "o--", label=label, **look)
+    figure.legend(loc="outside upper left", ncols=2, frameon=False)
+    style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy [kJ per episode]")
+    footnote(figure, "dot: one training; line: means at limits of 0.5, 1 and 2 %")
+    return figure
+
+
+def figure_of_ring(reference: Path) -> Figure:
+    """Draw every vehicle's way on the ring."""
+    cfg = as_plain(load("evaluate", ["task=ring-22"]))
+    steps = read_parquet(reference / "tasks" / "ring_steps.parquet").replace({"strategy": SHOWN})
+    figure = space_time(steps, list(SHOWN.values()), cfg, every=1)
+    assert figure is not None
+    return figure
+
+
+def figures(reference: Path, folder: Path) -> list[Path]:
+    """Draw the figures of what is kept; return the files written."""
+
+    def kept(name: str) -> pd.DataFrame:
+        return read_parquet(reference / f"{name}.parquet")
+
+    drawn: dict[str, Callable[[], Figure]] = {
+        "fleets": lambda: fleets.drawn_fronts(kept("tasks/fleets_fronts")),
+        "fleets_ring": lambda: fleets.drawn_ring(kept("tasks/fleets_ring")),
+        "limits": lambda: figure_of_limits(kept("limits/windows")),
+        "measured": lambda: measured_energy.figure_of(kept("measured_energy")),
+        "record": figure_of_record,
+        "ring": lambda: figure_of_ring(reference),
+        "twins": lambda: twins_figure(kept("twins")),
+    }
+    # The ring has thousands of lines: larger is over a megabyte.
+    dots = {"ring": 150}
+    return [save(draw(), folder / f"{x}.png", dots.get(x, 200)) for x, draw in drawn.items()]
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Write all pages and figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--reference", type=Path, default=REFERENCE, help="folder of the results")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the pages")
+    options = parser.parse_args(words)
+    for name in SHOWN_OF:
+        study(name, options.reference, options.docs)
+    tasks(options.reference, options.docs)
+    figures(options.reference, options.docs / "figures")
+    print(f"written: {options.docs}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_guard(main)())
