@@ -69,7 +69,7 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
         rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
         found[2] = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
-        return found, np.maximum(np.nan_to_num(rest, nan=9.0), FLOOR), sums
+        return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
     shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
     lags = np.stack([np.zeros(3), *shifts])
