@@ -141,7 +141,7 @@ class ArrayEpisodes:
             given.set(as_key(name), whole.expand(size).reshape(spec.shape).clone())
         return given
 
-    def step(self, actions: Array) -> Array:
+    def step(self, actions: Any) -> Array:
         """Take every episode a step further, also those that have ended.
 
         Args:
@@ -151,12 +151,17 @@ class ArrayEpisodes:
             ``[n, 3 + terms]``, float32: reward, terminated, truncated and the terms of the reward.
 
         Raises:
-            ConfigError: if the actions have another shape.
+            ConfigError: if the actions have another shape, or are no real numbers.
             Diverged: if an action, an observation or a reward is not a finite number.
         """
-        given = np.ascontiguousarray(actions, np.float32)
-        if given.shape != (self.count, 1):
-            raise ConfigError(f"actions must be {[self.count, 1]}, got {list(given.shape)}")
+        try:
+            given = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            given = np.empty(0, np.object_)
+        if given.shape != (self.count, 1) or given.dtype.kind not in "fiu":
+            wanted = f"actions must be real numbers {[self.count, 1]}"
+            raise ConfigError(f"{wanted}, got {list(given.shape)} {given.dtype}")
+        given = np.ascontiguousarray(given, np.float32)
         self.state, self.observation, results = self.advance(self.state, given)
         if not results[:, -1].all():
             named: dict[Key, Array] = {ACTION: given, SEEN: self.observation}
