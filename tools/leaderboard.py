@@ -162,17 +162,22 @@ def write_tables(reference: Path, page: Path) -> None:
 
 def write_board(scores: Path, page: Path) -> None:
     """Write the table of all files of ``lcc-rl score`` in a folder into the page."""
-    documents = {path.name: json.loads(path.read_text()) for path in sorted(scores.glob("*.json"))}
+    documents = {
+        path.name: json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(scores.glob("*.json"))
+    }
     _write_between(page, [as_markdown(documents)])
 
 
 def _write_between(page: Path, parts: Sequence[str]) -> None:
     """Replace what stands between the marks of a page."""
-    text = page.read_text()
+    text = page.read_text(encoding="utf-8")
     require(BEGIN in text and END in text, f"{page}: it lacks the lines {BEGIN} and {END}")
     before, after = text.partition(BEGIN)[0], text.partition(END)[2]
     with atomic_path(page) as part:
-        part.write_text("\n".join([f"{before}{BEGIN}\n", *parts, f"{END}{after}"]))
+        part.write_text(
+            "\n".join([f"{before}{BEGIN}\n", *parts, f"{END}{after}"]), encoding="utf-8"
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -88,9 +88,9 @@ class Page:
                 raise ResultsError(f"{page}: no table {name!r}; known: {', '.join(self.tables)}")
             return f"{begin}\n\n{as_markdown(worded(self.tables[name]))}\n\n{end}"
 
-        text = MARKED.sub(table, page.read_text())
+        text = MARKED.sub(table, page.read_text(encoding="utf-8"))
         with atomic_path(page) as part:
-            part.write_text(text)
+            part.write_text(text, encoding="utf-8")
 
     def write(
         self,

@@ -25,7 +25,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from lcc_rl.config import as_meant, key_of
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, ResultsError, how_to_install
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.states import survey
 from lcc_rl.settings import Count, Settings, parse
@@ -157,7 +157,7 @@ def load_optuna() -> ModuleType:
         import optuna
     except ImportError as error:
         words = "hydra/sweeper=lcc_optuna needs Optuna"
-        raise ConfigError(f"{words}: pip install 'lcc_rl[sweeps]'") from error
+        raise ConfigError(f"{words}: {how_to_install('sweeps')}") from error
     return optuna
 
 
@@ -218,4 +218,6 @@ def write_best(study: Any, path: Path) -> None:
         for trial in study.best_trials
     ]
     with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump({"name": "optuna", "best": best}, sort_keys=False))
+        temporary.write_text(
+            yaml.safe_dump({"name": "optuna", "best": best}, sort_keys=False), encoding="utf-8"
+        )

@@ -237,4 +237,4 @@ def read_notes(folder: Path) -> dict[str, Any]:
 def _write_notes(folder: Path, **changed: object) -> None:
     with atomic_path(folder / NOTES) as temporary:
         notes = read_notes(folder) | changed
-        temporary.write_text(json.dumps(notes, indent=1, ensure_ascii=False))
+        temporary.write_text(json.dumps(notes, indent=1, ensure_ascii=False), encoding="utf-8")

@@ -280,7 +280,7 @@ def _made(page: Page) -> Path:
     configs = sorted((page.folder / "train").glob(f"*/*/{CONFIG}"))
     firsts = {path.parents[1].name: path for path in reversed(configs)}
     details += [
-        (f"Configuration of {name}, {path.parent.name}", path.read_text())
+        (f"Configuration of {name}, {path.parent.name}", path.read_text(encoding="utf-8"))
         for name, path in sorted(firsts.items())
     ]
     seeds = [f"{p.parents[1].name}/{p.parent.name}" for p in configs]
