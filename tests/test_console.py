@@ -17,6 +17,7 @@ from commands import run_command
 
 import lcc_rl
 from lcc_rl.cli.console import COMMANDS
+from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 
 ROOT = Path(__file__).parents[1]
@@ -145,6 +146,30 @@ def test_commands_run_on_a_newer_python_in_a_clone_that_is_installed_elsewhere()
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "seed: 7" in done.stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "use"),
+    [
+        ("optuna", "sweeps", lambda: import_module("lcc_rl.runs.search").load_optuna()),
+        ("libsumo", "sumo", lambda: import_module("lcc_rl.interfaces.sumo").load_sumo()),
+        (
+            "onnx",
+            "interfaces",
+            lambda: import_module("lcc_rl.interfaces.export").main(["pretrained/alcc", "x.onnx"]),
+        ),
+    ],
+)
+def test_an_extra_that_is_missing_is_one_line(
+    package, extra, use, monkeypatch, tmp_path, capsys
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ConfigError, SystemExit)) as error:
+        use()
+    text = f"{error.value} {capsys.readouterr().err}"
+    assert package in text.lower()
+    assert f"pip install -e '.[{extra}]'" in text
 
 
 def test_advice_to_install_is_what_a_clone_can_do() -> None:

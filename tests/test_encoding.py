@@ -24,7 +24,9 @@ def by_code_page(tree: ast.AST) -> Iterator[int]:
         name = call.func.attr if method else getattr(call.func, "id", "")
         if name in TEXTS and len(call.args) <= TEXTS[name]:
             yield call.lineno
-        if name not in OPENERS or (method and getattr(call.func.value, "id", "") in {"os", "Image"}):
+        if name not in OPENERS or (
+            method and getattr(call.func.value, "id", "") in {"os", "Image"}
+        ):
             continue
         bound = method and getattr(call.func.value, "id", "") not in {"gzip", "io", "tempfile"}
         place = OPENERS[name] - (bound and name == "open")

@@ -74,7 +74,9 @@ SHELL = {"source", "export", "ls"}
 ALWAYS = {"tools/sumo_ring.py": ("task=ring-22",)}  # settings that a tool gives itself
 MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-NEEDS = {"interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime")}  # extras of a page
+NEEDS = {
+    "interfaces.md": ("gymnasium", "stable_baselines3", "onnx", "onnxscript", "onnxruntime")
+}  # extras of a page
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
 LAUNCH = ("hydra/launcher=", "hydra/sweeper=")  # of extras that need not be installed
 CHOICES = set((ROOT / "conf").rglob("*.yaml"))
