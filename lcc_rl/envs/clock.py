@@ -146,12 +146,6 @@ def reset_options(env: EnvBase) -> dict[Key, Any]:
     return {key: spec for key, spec in specs.items() if key != STEP}
 
 
-def _fits(found: torch.Size, wanted: torch.Size) -> bool:
-    """Whether a shape is the wanted one, of which −1 is any size: a transform may ask for that."""
-    pairs = zip(found, wanted, strict=False)
-    return len(found) == len(wanted) and all(size in (-1, given) for given, size in pairs)
-
-
 class Traffic(TransformedEnv):
     """A clock and the pieces that move the vehicles, as one environment."""
 
@@ -174,11 +168,7 @@ class Traffic(TransformedEnv):
         return self
 
     def rand_step(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Take a step by a random action; without a state to step from, the first of new episodes.
-
-        Args:
-            tensordict: what ``reset`` or ``step_mdp`` returned.
-        """
+        """Take a step by a random action; without a TensorDict, the first of new episodes."""
         return super().rand_step(self.reset() if tensordict is None else tensordict)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -204,7 +194,14 @@ class Traffic(TransformedEnv):
             # Another shape may fit nevertheless: one action would drive every vehicle.
             # Another type would spread to what is observed.
             found, wanted = tensordict.get(key, None), self.full_action_spec[key]
-            if found is None or (_fits(found.shape, wanted.shape) and found.dtype == wanted.dtype):
+            if found is None:
+                continue
+            # A transform may take any size, −1, of several actions in a row.
+            size = [x if y < 0 else y for x, y in zip(found.shape, wanted.shape, strict=False)]
+            if (list(found.shape), found.ndim) == (
+                size,
+                wanted.ndim,
+            ) and found.dtype == wanted.dtype:
                 continue
             expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")

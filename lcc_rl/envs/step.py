@@ -19,19 +19,8 @@ from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import any_lost
-from lcc_rl.pieces.base import (
-    SEED,
-    STEP,
-    Feature,
-    Key,
-    Piece,
-    RewardPiece,
-    State,
-    StepTransform,
-    as_key,
-    root_key,
-)
-from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
+from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
+from lcc_rl.pieces.rewards import REWARD, RewardPiece, RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
@@ -156,45 +145,34 @@ class Pieces(Compose):
         self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict = self._run(list(self.transforms), tensordict, next_tensordict)
+        next_tensordict = self._run(len(self.transforms), tensordict, next_tensordict)
         if not compiler.is_compiling():  # a compiled step cannot raise
             self._check_numbers(tensordict, next_tensordict)
         return next_tensordict
 
-    def _run(
-        self, transforms: list[Transform], td: TensorDictBase, next_td: TensorDictBase
-    ) -> TensorDictBase:
-        """Apply transforms to a step, pieces in one go."""
+    def _run(self, count: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
+        """Apply the first transforms to a step, pieces in one go."""
         waiting: list[Piece] = []
-        for place, transform in enumerate(transforms):
+        for place, transform in enumerate(self.transforms[:count]):
             if isinstance(transform, Piece):
                 waiting.append(transform)
                 continue
-            next_td = _apply(waiting, td, next_td)
-            waiting = []
-            if isinstance(transform, FrameSkipTransform):
-                next_td = self._skip_frames(transforms[:place], transform, td, next_td)
-            else:
-                next_td = transform._step(td, next_td)
+            next_td, waiting = _apply(waiting, td, next_td), []
+            again = isinstance(transform, FrameSkipTransform)
+            next_td = self._repeat(place, td, next_td) if again else transform._step(td, next_td)
         return _apply(waiting, td, next_td)
 
-    def _skip_frames(
-        self,
-        before: list[Transform],
-        skip: FrameSkipTransform,
-        td: TensorDictBase,
-        next_td: TensorDictBase,
-    ) -> TensorDictBase:
+    def _repeat(self, place: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
         """Take further steps by the same action, whose rewards add up, until an episode ends.
 
-        TorchRL's own transform steps the environment from the same TensorDict again; here the
-        state is in it.
+        TorchRL's own transform steps from the same TensorDict again; here the state is in it.
         """
+        skip: Any = self.transforms[place]
         rewards = skip.parent.reward_keys
         for _ in range(skip.frame_skip - 1):
             now = td.copy().update(next_td.exclude(*rewards))
             now.set(PARTIAL, ~next_td.get(DONE).flatten(len(td.batch_size) - 1))
-            reached = self._run(before, now, self.container.base_env._step(now))
+            reached = self._run(place, now, self.container.base_env._step(now))
             for key in rewards:
                 reached.set(key, reached.get(key) + next_td.get(key))
             next_td = reached
@@ -283,10 +261,9 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
                 f"{piece.title} reads {error}, which is not in the state that the step begins at: "
                 "transforms must keep it"
             ) from error
-        if moves is not None and not isinstance(piece, Feature):
-            _hold(moves, before, reached, piece.targets)
-        elif moves is not None and isinstance(piece, RewardPiece):
-            _hold(moves, {}, reached, piece.targets)
+        if moves is not None and isinstance(piece, StepTransform | RewardPiece):
+            earlier = {} if isinstance(piece, RewardPiece) else before
+            _hold(moves, earlier, reached, piece.targets)
     batch, device = next_td.batch_size, next_td.device
     spaces: dict[str, Any] = {}
     for key, value in reached.items():

@@ -8,6 +8,7 @@ import numpy as np
 
 from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import require
 from lcc_rl.figures.animation import road_picture
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Places, StringMotion
@@ -38,9 +39,8 @@ class Film:
         self.moments.append((speed, gap, ahead))
 
     def picture(self) -> Any:
-        """Return the present moment, ``[height, width, 3]``, uint8; black before the first."""
-        if not self.moments:
-            return np.zeros((128, 640, 3), np.uint8)
+        """Return the present moment, ``[height, width, 3]``, uint8."""
+        require(bool(self.moments), "call reset before render")
         speed, gap, ahead = map(np.asarray, zip(*self.moments, strict=True))
         string, length = self.motion.string, self.motion.vehicle_length
         time = np.arange(len(ahead)) * self.motion.time_step

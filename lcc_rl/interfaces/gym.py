@@ -25,7 +25,7 @@ from lcc_rl.errors import ConfigError, require, unknown_name
 VARIANTS = ("alcc", "reference", "own_energy")
 TERMS, MASK = "reward_terms", "reset_mask"
 LARGEST = 1e6  # beyond every speed [m/s], gap [m] and time [s] of a string, scaled
-MODES, FPS = ["rgb_array"], 10  # pictures; per second of a time step of 0.1 s
+MODES = ["rgb_array"]
 FIRST = np.zeros(1, np.int64)  # the place of the only episode
 
 
@@ -41,21 +41,24 @@ def register() -> None:
             )
 
 
-def _films(episodes: ArrayEpisodes, render_mode: Any) -> list[Any]:
-    """Return what draws each episode; nothing without a ``render_mode``.
+def _episodes(
+    variant: str, count: int, overrides: Sequence[str], held_out: bool, render_mode: Any
+) -> ArrayEpisodes:
+    """Build episodes side by side; arguments as of the environments.
 
     Raises:
-        ConfigError: if it is another than :data:`MODES`.
+        ConfigError: naming the setting at fault.
     """
-    if render_mode is None:
-        return []
     require(
-        render_mode in MODES,
-        f"render_mode must be None or {' or '.join(map(repr, MODES))}, got {render_mode!r}",
+        render_mode in (None, *MODES), f"render_mode must be None or {MODES}, got {render_mode!r}"
     )
-    from lcc_rl.interfaces.film import Film  # loads matplotlib
+    env = make_env(variant, count, overrides, held_out=held_out, single=True)
+    episodes = ArrayEpisodes(env)
+    if render_mode is not None:
+        from lcc_rl.interfaces.film import Film  # loads matplotlib
 
-    return [Film(episodes, place) for place in range(episodes.count)]
+        episodes.films = [Film(episodes, place) for place in range(count)]
+    return episodes
 
 
 def _seeds(seed: Any, count: int) -> list[int | None]:
@@ -110,7 +113,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
             ``render_mode`` is another.
     """
 
-    metadata: dict[str, Any] = {"render_modes": MODES, "render_fps": FPS}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": MODES, "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -119,9 +122,8 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         held_out: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        env = make_env(variant, 1, overrides, held_out=held_out, single=True)
-        self.episodes = ArrayEpisodes(env)
-        self.films, self.render_mode = _films(self.episodes, render_mode), render_mode
+        self.episodes = _episodes(variant, 1, overrides, held_out, render_mode)
+        self.render_mode = render_mode
         self.observation_space, self.action_space = _spaces(self.episodes)
         self.running = False
 
@@ -141,8 +143,6 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         observation = self.episodes.reset(FIRST, [seed], _options(options))[0]
         super().reset(seed=seed)
         self.running = True
-        for film in self.films:
-            film.expose(begins=True)
         return observation, {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -150,8 +150,6 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         if not self.running:
             raise ResetNeeded("call reset before the first step, and after the last of an episode")
         results = self.episodes.step([action])
-        for film in self.films:
-            film.expose(begins=False)
         reward, terminated, truncated, *terms = results[0].tolist()
         self.running = not (terminated or truncated)
         info = {TERMS: dict(zip(self.episodes.terms, terms, strict=True))}
@@ -159,7 +157,8 @@ class CarFollowing(gymnasium.Env[Array, Array]):
 
     def render(self) -> Any:
         """Return the road at the present moment, ``[height, width, 3]``, uint8."""
-        return self.films[0].picture() if self.films else None
+        films = self.episodes.films
+        return films[0].picture() if films else None
 
 
 class CarFollowingVector(VectorEnv[Array, Array, Array]):
@@ -182,10 +181,7 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
             unknown.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        **CarFollowing.metadata,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    metadata: dict[str, Any] = CarFollowing.metadata  # and the mode, of each vector
 
     def __init__(
         self,
@@ -202,16 +198,13 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
             f"max_episode_steps={max_episode_steps} is no setting of the vector: "
             f'use overrides=["scenario.horizon={max_episode_steps}"]',
         )
-        modes = {key: mode for mode in AutoresetMode for key in (mode, mode.value)}
-        if autoreset_mode not in modes:
-            raise unknown_name(
-                "autoreset_mode", str(autoreset_mode), [m.value for m in AutoresetMode]
-            )
-        self.mode = modes[autoreset_mode]
+        given = getattr(autoreset_mode, "value", autoreset_mode)
+        if given not in (names := [mode.value for mode in AutoresetMode]):
+            raise unknown_name("autoreset_mode", str(given), names)
+        self.mode = AutoresetMode(given)
         self.metadata = {**self.metadata, "autoreset_mode": self.mode}
-        env = make_env(variant, num_envs, overrides, held_out=held_out, single=True)
-        self.episodes = ArrayEpisodes(env)
-        self.films, self.render_mode = _films(self.episodes, render_mode), render_mode
+        self.episodes = _episodes(variant, num_envs, overrides, held_out, render_mode)
+        self.render_mode = render_mode
         self.single_observation_space, self.single_action_space = _spaces(self.episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -246,7 +239,6 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         observation = self.episodes.reset(places, seeds, options)
         super().reset(seed=seeds[0])
         self.running[places], self.ended[places] = True, False
-        self._expose(mask.astype(np.bool_))
         return observation, {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -270,16 +262,11 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
             observation = self.episodes.reset(np.flatnonzero(done))
         self.running = ~done | same
         self.ended = done & (self.mode == AutoresetMode.NEXT_STEP)
-        self._expose(done if same else begun)
         return observation, results[:, 0], ends[:, 0], ends[:, 1], info
 
     def render(self) -> tuple[Any, ...] | None:
         """Return the road of every place, ``[height, width, 3]``, uint8."""
-        return tuple(film.picture() for film in self.films) or None
-
-    def _expose(self, begins: Array) -> None:
-        for film, new in zip(self.films, begins, strict=False):
-            film.expose(bool(new))
+        return tuple(film.picture() for film in self.episodes.films) or None
 
 
 register()
