@@ -240,9 +240,7 @@ def _run(
     require(bool(found), f"nothing could be played: {why}")
     document = {"name": name, **about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
-        temporary.write_text(
-            json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-        )
+        temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
     tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for source in own:

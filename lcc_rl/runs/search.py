@@ -218,6 +218,5 @@ def write_best(study: Any, path: Path) -> None:
         for trial in study.best_trials
     ]
     with atomic_path(path) as temporary:
-        temporary.write_text(
-            yaml.safe_dump({"name": "optuna", "best": best}, sort_keys=False), encoding="utf-8"
-        )
+        text = yaml.safe_dump({"name": "optuna", "best": best}, sort_keys=False)
+        temporary.write_text(text, "utf-8")
