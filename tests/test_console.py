@@ -17,6 +17,7 @@ from commands import run_command
 
 import lcc_rl
 from lcc_rl.cli.console import COMMANDS
+from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 
 ROOT = Path(__file__).parents[1]
@@ -108,3 +109,71 @@ def test_a_wheel_runs_in_an_empty_folder(tmp_path) -> None:
     start = (sys.executable, "-P", "-c", program)
     ran(*start, "run", "experiment=smoke", "hydra.run.dir=job", cwd=empty)
     assert (empty / "job" / "report.html").exists()
+
+
+# What Python 3.14 does to every argument of a parser, and an installation that is not editable
+# does in the folder of the clone: the package beside conf/ is found, and lcc_rl.conf is not.
+NEWER = """
+import argparse, sys
+
+add = argparse._ActionsContainer.add_argument
+
+def check(self, action):
+    try:
+        "%" in (action.help or "")
+    except TypeError as error:
+        raise ValueError("badly formed help string") from error
+
+def added(self, *words, **settings):
+    action = add(self, *words, **settings)
+    if hasattr(self, "_get_formatter"):
+        self._check_help(action)
+    return action
+
+argparse._ActionsContainer._check_help = check
+argparse._ActionsContainer.add_argument = added
+sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(finder)]
+sys.path.insert(0, "")
+"""
+
+
+def test_commands_run_on_a_newer_python_in_a_clone_that_is_installed_elsewhere() -> None:
+    refused = f"{NEWER}\nfrom hydra._internal.utils import get_args_parser\nget_args_parser()"
+    done = subprocess.run([sys.executable, "-c", refused], capture_output=True, text=True)
+    assert "badly formed help string" in done.stderr
+    call = "from lcc_rl.cli.console import main\nmain(['train', '--cfg', 'job', 'seed=7'])"
+    command = [sys.executable, "-c", f"{NEWER}\n{call}"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert "seed: 7" in done.stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "use"),
+    [
+        ("optuna", "sweeps", lambda: import_module("lcc_rl.runs.search").load_optuna()),
+        ("libsumo", "sumo", lambda: import_module("lcc_rl.interfaces.sumo").load_sumo()),
+        (
+            "onnx",
+            "interfaces",
+            lambda: import_module("lcc_rl.interfaces.export").main(["pretrained/alcc", "x.onnx"]),
+        ),
+    ],
+)
+def test_an_extra_that_is_missing_is_one_line(
+    package, extra, use, monkeypatch, tmp_path, capsys
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ConfigError, SystemExit)) as error:
+        use()
+    text = f"{error.value} {capsys.readouterr().err}"
+    assert package in text.lower()
+    assert f"pip install -e '.[{extra}]'" in text
+
+
+def test_advice_to_install_is_what_a_clone_can_do() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "lcc_rl").rglob("*.py")]
+    wrong = [line for text in texts for line in text.splitlines() if "pip install" in line]
+    assert len(wrong) == 1  # lcc_rl.errors.how_to_install
+    assert "-e '.[" in wrong[0]

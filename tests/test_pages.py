@@ -76,7 +76,7 @@ MAKE = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), flags=re.M)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 # Extras of a page.
 NEEDS = {
-    "interfaces.md": ("gymnasium", "onnx", "onnxscript", "onnxruntime"),
+    "interfaces.md": ("gymnasium", "stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
     "sweeps.md": ("optuna",),
 }
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")

@@ -44,5 +44,5 @@ def numbers_in(text: str) -> set[str]:
 
 
 TABLE = Path(__file__).with_suffix(".toml")
-ROWS: list[dict[str, Any]] = tomllib.loads(TABLE.read_text())["equation"]
+ROWS: list[dict[str, Any]] = tomllib.loads(TABLE.read_text(encoding="utf-8"))["equation"]
 EQUATIONS = tuple(Equation(**{**row, "functions": tuple(row["functions"])}) for row in ROWS)

@@ -120,7 +120,7 @@ class Job:
 
     def tail(self) -> str:
         """Return the last lines of the command's output."""
-        lines = (self.root / "log").read_text(errors="replace").splitlines()
+        lines = (self.root / "log").read_text(errors="replace", encoding="utf-8").splitlines()
         return "\n".join(lines[-100:])
 
     def disturb(self, delay: float, kind: int, everyone: bool) -> bool:
@@ -174,7 +174,7 @@ def at_work(group: int) -> bool:
     """Return whether a process of a group lives; a zombie does not."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
-            state, _, own = path.read_text().rpartition(")")[2].split()[:3]
+            state, _, own = path.read_text(encoding="utf-8").rpartition(")")[2].split()[:3]
             if int(own) == group and state != "Z":
                 return True
     return False

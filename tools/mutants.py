@@ -64,7 +64,10 @@ class Mutant:
 
 def mutants() -> dict[str, Mutant]:
     """Return the listed faults by name."""
-    return {name: Mutant(name, **entry) for name, entry in tomllib.loads(LIST.read_text()).items()}
+    return {
+        name: Mutant(name, **entry)
+        for name, entry in tomllib.loads(LIST.read_text(encoding="utf-8")).items()
+    }
 
 
 class Copy:
@@ -83,7 +86,7 @@ class Copy:
                 (self.tree / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, self.tree / name)
         # The test of the list would miss there what a fault has replaced.
-        (self.tree / LIST.relative_to(ROOT)).write_text("")
+        (self.tree / LIST.relative_to(ROOT)).write_text("", encoding="utf-8")
         own = {"PYTHONPATH": str(self.tree), "XDG_CACHE_HOME": str(cache), "OMP_NUM_THREADS": "1"}
         self.environment = {**os.environ, **own}
 
@@ -111,13 +114,13 @@ class Copy:
             the fault survived), whether a test nearest to it found it, and the seconds.
         """
         path, begun, test = self.tree / mutant.file, time.monotonic(), ""
-        plain = path.read_text()
-        path.write_text(mutant.applied(plain))
+        plain = path.read_text(encoding="utf-8")
+        path.write_text(mutant.applied(plain), encoding="utf-8")
         try:
             for tests in stages:
                 test = test or self.first_failure(tests)
         finally:
-            path.write_text(plain)
+            path.write_text(plain, encoding="utf-8")
         row = {"name": mutant.name, "file": mutant.file, "breaks": mutant.breaks, "test": test}
         nearest = bool(test) and any(test.startswith(name) for name in mutant.tests)
         return {**row, "nearest": nearest, "seconds": time.monotonic() - begun}

@@ -93,7 +93,7 @@ def page() -> str:
 
 def main() -> int:
     """Write the page."""
-    PAGE.write_text(page())
+    PAGE.write_text(page(), encoding="utf-8")
     return 0
 
 

@@ -84,7 +84,9 @@ def table(names: Iterable[str], counted: dict[str, int]) -> pd.DataFrame:
         if name.endswith(".yaml"):
             numbers = {"yaml": 1}
         elif name.endswith(".py") and top in ("lcc_rl", "tools", "tests"):
-            numbers = measured((ROOT / name).read_text()) | {"cases": counted.get(name, 0)}
+            numbers = measured((ROOT / name).read_text(encoding="utf-8")) | {
+                "cases": counted.get(name, 0)
+            }
         else:
             continue
         rows += [{"part": part, **numbers} for part in dict.fromkeys(parts)]

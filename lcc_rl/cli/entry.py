@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import traceback
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from functools import wraps
 from importlib import import_module
@@ -112,13 +113,25 @@ def start(command: Callable[[], Any]) -> None:
 def run_sorted(command: Callable[[], Any]) -> None:
     """Run a Hydra command whose flags may stand anywhere among the settings."""
     words = ["--help" if word == FULL_HELP else word for word in sys.argv[1:]]
-    with patch.object(sys, "argv", [sys.argv[0], *flags_first(words)]):
+    with (
+        patch.object(sys, "argv", [sys.argv[0], *flags_first(words)]),
+        patch.object(sys.modules["hydra.main"], "get_args_parser", hydra_parser),
+    ):
         sweep(command)
+
+
+def hydra_parser() -> ArgumentParser:
+    """Return Hydra's parser, also where Python (3.14) checks that a help is a text, as one is not.
+
+    Hydra 1.3 writes the help of ``--shell-completion`` only where it is shown.
+    """
+    with patch.object(ArgumentParser, "_check_help", lambda *_: None, create=True):
+        return get_args_parser()
 
 
 def flags_first(words: Sequence[str]) -> list[str]:
     """Return the words of a command line, its flags, as ``-m``, first, variants in lower case."""
-    parser = get_args_parser()
+    parser = hydra_parser()
     parser.allow_abbrev = False  # --experiment is none of Hydra's flags
     known, unknown = parser.parse_known_intermixed_args(list(words))
     if unknown:

@@ -108,5 +108,5 @@ def meaning(entry: str, key: str) -> str:
     if root:
         places = sorted((folder / root).glob("*.yaml"))
     line = re.compile(rf"^\s*(?:# )?{re.escape(last)}: [^#\n]*#\s*(.*)$", re.MULTILINE)
-    found = (line.search(place.read_text()) for place in places)
+    found = (line.search(place.read_text(encoding="utf-8")) for place in places)
     return next((match.group(1) for match in found if match), "")

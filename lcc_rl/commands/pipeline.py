@@ -113,7 +113,7 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
         for name, own in {**trainings, FINAL: final}.items():
             save_config(own, folder / PARTS / name)
         with atomic_path(folder / COMMAND) as temporary:
-            temporary.write_text(command)
+            temporary.write_text(command, encoding="utf-8")
         return _run(cfg, trainings, final, folder, command)
 
 
@@ -272,7 +272,7 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
     target.mkdir(parents=True, exist_ok=True)
     if (target / "checkpoint.pt").exists():
         cfg.resume = folder
-    handler = logging.FileHandler(target / "train.log")
+    handler = logging.FileHandler(target / "train.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("[%(asctime)s][%(levelname)s] %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)

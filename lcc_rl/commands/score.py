@@ -237,7 +237,7 @@ def _run(
     require(bool(found), f"nothing could be played: {why}")
     document = {"name": name, **about(who), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+        temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
     forget(folder)
     tell(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}

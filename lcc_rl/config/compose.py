@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from importlib.resources import files
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,15 @@ NAMES = (
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
+def find_conf() -> None:
+    """Let a clone that hides the installed package find :data:`CONF`, which lies beside it."""
+    beside = Path(__file__).parents[2] / "conf" / "__init__.py"
+    if find_spec(CONF) is None and beside.is_file():
+        spec: Any = spec_from_file_location(CONF, beside)
+        sys.modules[CONF] = module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+
+
 def terms_of_energy(string: Any) -> float:
     """Return how many vehicles' energy counts for an automated one: its own and those behind."""
     plain = OmegaConf.to_container(string) if OmegaConf.is_config(string) else string
@@ -58,6 +69,7 @@ def terms_of_energy(string: Any) -> float:
     return 1.0 + roles.count(HUMAN) / max(roles.count(AUTOMATED), 1)
 
 
+find_conf()
 OmegaConf.register_new_resolver("lcc.either", lambda so, yes, no: yes if so else no, replace=True)
 OmegaConf.register_new_resolver("lcc.pairs", lambda a, b: len(a) * len(b), replace=True)
 OmegaConf.register_new_resolver("lcc.energies", terms_of_energy, replace=True)

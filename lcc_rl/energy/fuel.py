@@ -25,7 +25,7 @@ KILOWATT = 1e3
 @cache
 def coefficients() -> dict[str, dict[str, float]]:
     """Return the published coefficients of every vehicle; those that one lacks are zero."""
-    text = files("lcc_rl.assets").joinpath("energy", FUEL).read_text()
+    text = files("lcc_rl.assets").joinpath("energy", FUEL).read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines())
     return {
         row.pop("vehicle"): {name: float(value or 0.0) for name, value in row.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,10 +36,12 @@ class ArrayEpisodes:
     Attributes:
         terms: names of the terms of the reward.
         observation: the observations, ``[n, entries]``, float32; never written to.
+        films: what records the motion of each place, if anything does.
     """
 
     def __init__(self, env: TransformedEnv) -> None:
         self.env, self.count = env, env.batch_size.numel()
+        self.films: list[Any] = []
         pieces = closure(pieces_of(env), {SEEN, REWARD, TERMINATED, TRUNCATED})
         self.one_step = Step(pieces, env.base_env.horizon)
         totals = [piece for piece in pieces if isinstance(piece, TotalReward)]
@@ -125,6 +127,7 @@ class ArrayEpisodes:
             self.generators[place] = generator
         self.state, self.observation = self.state.copy(), self.observation.copy()
         self.state[places], self.observation[places] = state, seen
+        self._expose(places, begins=True)
         return self.observation
 
     def _given(self, seeds: Tensor, options: Mapping[str, Any]) -> TensorDict:
@@ -141,7 +144,7 @@ class ArrayEpisodes:
             given.set(as_key(name), whole.expand(size).reshape(spec.shape).clone())
         return given
 
-    def step(self, actions: Array) -> Array:
+    def step(self, actions: Any) -> Array:
         """Take every episode a step further, also those that have ended.
 
         Args:
@@ -151,12 +154,17 @@ class ArrayEpisodes:
             ``[n, 3 + terms]``, float32: reward, terminated, truncated and the terms of the reward.
 
         Raises:
-            ConfigError: if the actions have another shape.
+            ConfigError: if the actions have another shape, or are no real numbers.
             Diverged: if an action, an observation or a reward is not a finite number.
         """
-        given = np.ascontiguousarray(actions, np.float32)
-        if given.shape != (self.count, 1):
-            raise ConfigError(f"actions must be {[self.count, 1]}, got {list(given.shape)}")
+        try:
+            given = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            given = np.empty(0, np.object_)
+        if given.shape != (self.count, 1) or given.dtype.kind not in "fiu":
+            wanted = f"actions must be real numbers {[self.count, 1]}"
+            raise ConfigError(f"{wanted}, got {list(given.shape)} {given.dtype}")
+        given = np.ascontiguousarray(given, np.float32)
         self.state, self.observation, results = self.advance(self.state, given)
         if not results[:, -1].all():
             named: dict[Key, Array] = {ACTION: given, SEEN: self.observation}
@@ -164,4 +172,9 @@ class ArrayEpisodes:
             numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
             step = int(self.state[:, self.step_column].max())
             check_numbers(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
+        self._expose(range(self.count), begins=False)
         return results[:, :-1]
+
+    def _expose(self, places: Iterable[int], begins: bool) -> None:
+        for film in [self.films[place] for place in places] if self.films else []:
+            film.expose(begins)

@@ -78,7 +78,7 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
     Raises:
         ConfigError: naming the piece, and the number of entries, shape or type at fault.
     """
-    _attempt(piece, lambda: piece.apply(before, reached))
+    _attempt(piece, lambda: piece.derive(before, reached))
     _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
 
 

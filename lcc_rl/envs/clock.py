@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from numbers import Integral
+from secrets import randbelow
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import AsyncEnvPool, EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import settings
 from lcc_rl.envs.step import tick
@@ -63,12 +64,12 @@ class Clock(EnvBase):
         horizon: steps per episode, after which it is truncated.
         batch_size: shape of the batch of episodes.
         actions: shape of each action after the batch dimensions, by key; entries lie in [−1, 1].
-        seed: seed of the generator that draws the episodes' seeds.
+        seed: seed of the generator that draws the episodes' seeds; None: one is drawn at random.
         device: where the tensors live.
 
     Raises:
         ConfigError: if the horizon is not positive, the batch is empty or no whole numbers, or the
-            seed is none.
+            seed is out of range.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class Clock(EnvBase):
         horizon: int,
         batch_size: Sequence[int] | int = (),
         actions: Mapping[NestedKey, tuple[int, ...]] | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         if horizon < 1:
@@ -111,7 +112,9 @@ class Clock(EnvBase):
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.generator.manual_seed(checked_seed(seed) or 0)
+        seed = checked_seed(seed)
+        # Not from torch's own generator, which is the same in every new process.
+        self.generator.manual_seed(randbelow(LAST_SEED + 1) if seed is None else seed)
 
     def draw_seeds(self) -> torch.Tensor:
         """Draw a seed for a new episode in every place of the batch, ``[*batch, 1]``, int64."""
@@ -146,6 +149,9 @@ def reset_options(env: EnvBase) -> dict[Key, Any]:
 class Traffic(TransformedEnv):
     """A clock and the pieces that move the vehicles, as one environment."""
 
+    # Else environments around it would draw actions for the clock and not for themselves.
+    rand_action = EnvBase.rand_action
+
     def _reset(self, tensordict: TensorDictBase | None = None, **settings: Any) -> TensorDictBase:
         if tensordict is not None:
             self._check_options(tensordict)
@@ -160,6 +166,18 @@ class Traffic(TransformedEnv):
         own = {} if {"mode", "backend", "options"} & set(given) else settings()
         super().compile(warmup=warmup, **{**own, **given})
         return self
+
+    def rand_step(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Take a step by a random action; without a TensorDict, the first of new episodes."""
+        return super().rand_step(self.reset() if tensordict is None else tensordict)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if tensordict.get(SEED, None) is None or tensordict.get(STEP, None) is None:
+            raise ConfigError(
+                "a step begins at what reset or step_mdp returned: the state of the episodes is "
+                f"in the TensorDict, here only {', '.join(map(str, tensordict.keys()))}"
+            )
+        return super()._step(tensordict)
 
     def _moment_keys(self) -> set[Key]:
         """Return the keys of everything that a reset writes."""
@@ -176,7 +194,14 @@ class Traffic(TransformedEnv):
             # Another shape may fit nevertheless: one action would drive every vehicle.
             # Another type would spread to what is observed.
             found, wanted = tensordict.get(key, None), self.full_action_spec[key]
-            if found is None or (found.shape, found.dtype) == (wanted.shape, wanted.dtype):
+            if found is None:
+                continue
+            # A transform may take any size, −1, of several actions in a row.
+            size = [x if y < 0 else y for x, y in zip(found.shape, wanted.shape, strict=False)]
+            if (list(found.shape), found.ndim) == (
+                size,
+                wanted.ndim,
+            ) and found.dtype == wanted.dtype:
                 continue
             expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
@@ -190,7 +215,7 @@ class Traffic(TransformedEnv):
         options = reset_options(self)
         names = ", ".join(".".join(key) for key in options)
         keys = set(map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)))
-        keys -= {as_key(key) for key in self.reset_keys}
+        keys -= {as_key(key) for key in (*self.reset_keys, AsyncEnvPool._env_idx_key)}
         if keys - set(options) and self._moment_keys() <= keys:
             # TorchRL writes the first moment into what it is given; that may be given again.
             keys &= set(options)

@@ -50,7 +50,7 @@ def build_env(
     profiles: Profiles,
     population: Population,
     batch_size: Sequence[int] | int = (),
-    seed: int = 0,
+    seed: int | None = 0,
     device: torch.device | str | None = None,
     nominal: bool = False,
 ) -> TransformedEnv:
@@ -61,7 +61,7 @@ def build_env(
         profiles: speed profiles of the leader.
         population: the human drivers.
         batch_size: episodes side by side.
-        seed: seed of the episodes' seeds.
+        seed: seed of the episodes' seeds; None: one is drawn at random.
         device: where the tensors live.
         nominal: leaders and starts as in an evaluation, without the deviations of training.
 
@@ -73,6 +73,8 @@ def build_env(
     """
     scenario, device = cfg.scenario, device and torch_device(device)
     pieces = build_pieces(cfg, profiles, population, nominal)
+    if (dtype := torch.get_default_dtype()) != torch.float32:  # in which inputs are stored
+        pieces = [piece.to(dtype) for piece in pieces]
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
@@ -263,7 +265,7 @@ def make_env(
     variant: str = "alcc",
     batch_size: Sequence[int] | int = (),
     overrides: Sequence[str] = (),
-    seed: int = 0,
+    seed: int | None = None,
     device: torch.device | str | None = None,
     held_out: bool = False,
     single: bool | None = None,
@@ -274,7 +276,8 @@ def make_env(
         variant: ``"alcc"``, ``"reference"``, ``"idm"`` … (``conf/variant``).
         batch_size: episodes side by side.
         overrides: further command-line overrides, e.g. ``["scenario.horizon=100"]``.
-        seed: seed of the episodes' seeds.
+        seed: seed of the episodes' seeds; None: one is drawn at random, so that the environments
+            of several workers play different episodes. ``env.set_seed`` begins another series.
         device: where the tensors live.
         held_out: play the evaluation profiles instead of the training ones, as an evaluation.
         single: show the entries of the one automated vehicle at the root, see

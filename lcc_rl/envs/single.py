@@ -47,8 +47,9 @@ class SingleAgent(Transform):
         return self._shown(input_spec.clone(), "full_action_spec", ("action",))
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        output_spec = self._shown(output_spec.clone(), "full_observation_spec", ("observation",))
-        return self._shown(output_spec, "full_reward_spec", ("reward", "reward_terms"))
+        seen = ("observation", "reward_terms")
+        output_spec = self._shown(output_spec.clone(), "full_observation_spec", seen)
+        return self._shown(output_spec, "full_reward_spec", ("reward",))
 
     def _shown(self, specs: Composite, part: str, names: tuple[str, ...]) -> Composite:
         spec = specs[part]

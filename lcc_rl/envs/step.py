@@ -1,7 +1,7 @@
 """One step of an environment as a function of plain mappings of tensors.
 
 The TorchRL environment, the collector, the differentiable rollout and the evaluation all advance
-by :func:`tick` and the pieces' :meth:`~lcc_rl.pieces.base.Piece.apply`: a :class:`Step`.
+by :func:`tick` and the pieces' :meth:`~lcc_rl.pieces.base.Piece.derive`: a :class:`Step`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ from tensordict.utils import NestedKey
 from torch import Size as BatchSize
 from torch import Tensor, compiler, device, ones_like, zeros_like
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
 from lcc_rl.envs.finite import ACTION, check_numbers
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
-from lcc_rl.pieces.rewards import REWARD, RewardTerm, TotalReward
+from lcc_rl.pieces.rewards import REWARD, RewardPiece, RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
+PARTIAL = "_step"  # TorchRL's name of the mask of those that take the step
 # If these entries are finite after a step, all others that matter are.
 TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
 
@@ -58,7 +60,7 @@ class Step:
         """
         reached = tick(before[SEED], before[STEP] + 1, self.horizon)
         for piece, detached in self.pieces:
-            piece.apply(before, reached, detached)
+            piece.derive(before, reached, detached)
         return reached
 
     def begin(self, seeds: Tensor) -> State:
@@ -143,18 +145,38 @@ class Pieces(Compose):
         self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        waiting: list[Piece] = []
-        for transform in self.transforms:
-            if isinstance(transform, Piece):
-                waiting.append(transform)
-                continue
-            next_tensordict = _apply(waiting, tensordict, next_tensordict)
-            waiting = []
-            next_tensordict = transform._step(tensordict, next_tensordict)
-        next_tensordict = _apply(waiting, tensordict, next_tensordict)
+        next_tensordict = self._run(len(self.transforms), tensordict, next_tensordict)
         if not compiler.is_compiling():  # a compiled step cannot raise
             self._check_numbers(tensordict, next_tensordict)
         return next_tensordict
+
+    def _run(self, count: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
+        """Apply the first transforms to a step, pieces in one go."""
+        waiting: list[Piece] = []
+        for place, transform in enumerate(self.transforms[:count]):
+            if isinstance(transform, Piece):
+                waiting.append(transform)
+                continue
+            next_td, waiting = _apply(waiting, td, next_td), []
+            again = isinstance(transform, FrameSkipTransform)
+            next_td = self._repeat(place, td, next_td) if again else transform._step(td, next_td)
+        return _apply(waiting, td, next_td)
+
+    def _repeat(self, place: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
+        """Take further steps by the same action, whose rewards add up, until an episode ends.
+
+        TorchRL's own transform steps from the same TensorDict again; here the state is in it.
+        """
+        skip: Any = self.transforms[place]
+        rewards = skip.parent.reward_keys
+        for _ in range(skip.frame_skip - 1):
+            now = td.copy().update(next_td.exclude(*rewards))
+            now.set(PARTIAL, ~next_td.get(DONE).flatten(len(td.batch_size) - 1))
+            reached = self._run(place, now, self.container.base_env._step(now))
+            for key in rewards:
+                reached.set(key, reached.get(key) + next_td.get(key))
+            next_td = reached
+        return next_td
 
     def _check_numbers(self, td: TensorDictBase, next_td: TensorDictBase) -> None:
         """Check that a step was taken by and to numbers.
@@ -215,13 +237,33 @@ def _read(td: TensorDictBase, place: Key = ()) -> State:
     return found
 
 
+def _hold(moves: Tensor, before: State, reached: State, keys: Iterable[Key]) -> None:
+    """Put entries back to what they were, or zero, where an episode stands still in this step."""
+    for key in list(keys):
+        value = reached[key]
+        rows = moves.reshape(*moves.shape, *[1] * (value.ndim - moves.ndim))
+        reached[key] = value.where(rows, before.get(key, zeros_like(value)))
+
+
 def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
     """Apply pieces to two moments; return the second with what they write."""
     if not pieces:
         return next_td
     before, reached = _read(td), _read(next_td)
+    moves = before.get((PARTIAL,))
+    if moves is not None:
+        _hold(moves, before, reached, reached)
     for piece in pieces:
-        piece.apply(before, reached)
+        try:
+            piece.derive(before, reached)
+        except KeyError as error:
+            raise ConfigError(
+                f"{piece.title} reads {error}, which is not in the state that the step begins at: "
+                "transforms must keep it"
+            ) from error
+        if moves is not None and isinstance(piece, StepTransform | RewardPiece):
+            earlier = {} if isinstance(piece, RewardPiece) else before
+            _hold(moves, earlier, reached, piece.targets)
     batch, device = next_td.batch_size, next_td.device
     spaces: dict[str, Any] = {}
     for key, value in reached.items():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -118,19 +119,39 @@ def frames(motion: Motion, title: str) -> Iterator[Figure]:
         line.set(linewidth=1.4, alpha=1.0)
     gaps.set_xlabel("time [s]")
     cursors = [axis.axvline(motion.time[0], color="#b00020", lw=0.8) for axis in (speeds, gaps)]
-    cars = LineCollection([], linewidths=9.0, capstyle="butt")
-    road.add_collection(cars)
-    cars.set_color([*_hues(motion), *([] if motion.leader is None else [INK])])
-    place = _around if motion.circumference else _along
-    place(road, cars, motion, 0)
+    place = _on_road(road, motion)
+    place(0)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # found once: what moves needs no other room
     for moment in moments:
-        place(road, cars, motion, int(moment))
+        place(int(moment))
         for cursor in cursors:
             cursor.set_xdata([motion.time[moment]] * 2)
         speeds.set_title(f"{motion.time[moment]:.1f} s", loc="right", fontsize=9)
         yield figure
+
+
+def road_picture(motion: Motion) -> Any:
+    """Return the road at the last moment of a motion, ``[height, width, 3]``, uint8."""
+    figure = new_figure(8.0, 6.4 if motion.circumference else 1.6)
+    road = figure.subplots()
+    road.set_title(f"{motion.time[-1]:.1f} s", loc="right", fontsize=9)
+    _on_road(road, motion)(len(motion.time) - 1)
+    return _pixels(figure)[..., :3].copy()
+
+
+def _pixels(figure: Figure) -> Any:
+    figure.set_dpi(DPI)
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
+
+
+def _on_road(road: Axes, motion: Motion) -> Callable[[int], None]:
+    """Draw the cars of a motion; return what places them as they are at a moment."""
+    cars = LineCollection([], linewidths=9.0, capstyle="butt")
+    road.add_collection(cars)
+    cars.set_color([*_hues(motion), *([] if motion.leader is None else [INK])])
+    return partial(_around if motion.circumference else _along, road, cars, motion)
 
 
 def _hues(motion: Motion) -> list[str]:
@@ -180,10 +201,7 @@ def _around(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> No
 def _write_gif(motion: Motion, title: str, path: Path) -> None:
     images = []
     for figure in frames(motion, title):
-        figure.set_dpi(DPI)
-        figure.canvas.draw()
-        pixels = np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
-        image = Image.fromarray(pixels).convert("RGB")
+        image = Image.fromarray(_pixels(figure)).convert("RGB")
         images.append(image.quantize(64, Image.Quantize.FASTOCTREE))
     settings = {"duration": 1000 // RATE, "loop": 0, "optimize": True}
     images[0].save(path, "GIF", save_all=True, append_images=images[1:], **settings)

@@ -167,7 +167,7 @@ class Driver:
         """
         reached = dict(measured)
         for piece in self.pieces:
-            piece.apply({**measured, **kept}, reached)
+            piece.derive({**measured, **kept}, reached)
         after = {key: reached[key] for key in self.kept}
         if self.module is None:
             return reached[COMMAND].flatten(), after

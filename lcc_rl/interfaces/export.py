@@ -23,7 +23,7 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.errors import ConfigError, how_to_install, require, unknown_name
 from lcc_rl.evaluation.named import is_policy, rules
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
@@ -253,7 +253,7 @@ def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
         import onnxscript  # noqa: F401 - what torch exports with
     except ImportError as error:
         raise ConfigError(
-            f"{error.name} is not installed; pip install 'lcc_rl[interfaces]', or write a .pt2"
+            f"{error.name} is not installed: {how_to_install('interfaces')}; or write a .pt2"
         ) from error
     registry = logging.getLogger("torch.onnx._internal.exporter._registration")
     registry.setLevel(logging.ERROR)  # that torchvision, of no use here, is missing

@@ -1,7 +1,7 @@
 """Gymnasium environments of strings with one automated vehicle.
 
 ``gymnasium.make("lcc_rl/alcc-v0")``, ``gymnasium.make_vec("lcc_rl/alcc-v0", 64)``: importing this
-module registers them.
+module registers them, also by the name ``"lcc_rl.interfaces.gym:lcc_rl/alcc-v0"``.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.factory import make_env
 from lcc_rl.envs.rowwise import Array
-from lcc_rl.errors import ConfigError, require
+from lcc_rl.errors import ConfigError, require, unknown_name
 
 VARIANTS = ("alcc", "reference", "own_energy")
 TERMS, MASK = "reward_terms", "reset_mask"
 LARGEST = 1e6  # beyond every speed [m/s], gap [m] and time [s] of a string, scaled
+MODES = ["rgb_array"]
 FIRST = np.zeros(1, np.int64)  # the place of the only episode
 
 
@@ -49,11 +50,15 @@ def _episodes(
         ConfigError: naming the setting at fault.
     """
     require(
-        render_mode is None,
-        f"render_mode must be None, got {render_mode!r}: nothing is drawn here; "
-        "lcc-rl animate draws the episodes of a run",
+        render_mode in (None, *MODES), f"render_mode must be None or {MODES}, got {render_mode!r}"
     )
-    return ArrayEpisodes(make_env(variant, count, overrides, held_out=held_out, single=True))
+    env = make_env(variant, count, overrides, held_out=held_out, single=True)
+    episodes = ArrayEpisodes(env)
+    if render_mode is not None:
+        from lcc_rl.interfaces.film import Film  # loads matplotlib
+
+        episodes.films = [Film(episodes, place) for place in range(count)]
+    return episodes
 
 
 def _seeds(seed: Any, count: int) -> list[int | None]:
@@ -101,14 +106,14 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         variant: ``"alcc"``, ``"reference"`` or ``"own_energy"``.
         overrides: further settings, as on the command line: ``["scenario.horizon=100"]``.
         held_out: play the evaluation's leaders instead of the training's.
-        render_mode: None; there is no rendering.
+        render_mode: ``"rgb_array"``: :meth:`render` draws the road; None: nothing is drawn.
 
     Raises:
-        ConfigError: if an override is unknown, there is not just one automated vehicle, or a
-            rendering is asked for.
+        ConfigError: if an override is unknown, there is not just one automated vehicle, or the
+            ``render_mode`` is another.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
+    metadata: dict[str, Any] = {"render_modes": MODES, "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -118,6 +123,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         render_mode: str | None = None,
     ) -> None:
         self.episodes = _episodes(variant, 1, overrides, held_out, render_mode)
+        self.render_mode = render_mode
         self.observation_space, self.action_space = _spaces(self.episodes)
         self.running = False
 
@@ -143,29 +149,39 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         """Play one step."""
         if not self.running:
             raise ResetNeeded("call reset before the first step, and after the last of an episode")
-        results = self.episodes.step(np.asarray(action)[np.newaxis])
+        results = self.episodes.step([action])
         reward, terminated, truncated, *terms = results[0].tolist()
         self.running = not (terminated or truncated)
         info = {TERMS: dict(zip(self.episodes.terms, terms, strict=True))}
         return self.episodes.observation[0], reward, bool(terminated), bool(truncated), info
 
+    def render(self) -> Any:
+        """Return the road at the present moment, ``[height, width, 3]``, uint8."""
+        films = self.episodes.films
+        return films[0].picture() if films else None
+
 
 class CarFollowingVector(VectorEnv[Array, Array, Array]):
-    """Episodes side by side in one batch; those that end begin anew in the same step.
+    """Episodes side by side in one batch.
 
-    Every place plays what a :class:`CarFollowing` of its seed plays. ``info["final_obs"]`` holds
-    the last observations where ``info["_final_obs"]`` is true.
+    Every place plays what a :class:`CarFollowing` of its seed plays. Where an episode ends in
+    the mode ``"SameStep"``, ``info["final_obs"]`` holds the last observations where
+    ``info["_final_obs"]`` is true.
 
     Args:
         num_envs: episodes side by side.
         variant, overrides, held_out, render_mode: see :class:`CarFollowing`.
         max_episode_steps: None; ``scenario.horizon`` is the number of steps.
+        autoreset_mode: when an episode that has ended begins anew, as Gymnasium names it:
+            ``"SameStep"``; ``"NextStep"``: in the next step, whose action and reward do not count;
+            ``"Disabled"``: by ``reset`` with the option ``"reset_mask"``.
 
     Raises:
-        ConfigError: as of :class:`CarFollowing`, or if ``max_episode_steps`` is given.
+        ConfigError: as of :class:`CarFollowing`, if ``max_episode_steps`` is given, or the mode is
+            unknown.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = CarFollowing.metadata  # and the mode, of each vector
 
     def __init__(
         self,
@@ -175,18 +191,26 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         held_out: bool = False,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
         require(
             max_episode_steps is None,
             f"max_episode_steps={max_episode_steps} is no setting of the vector: "
             f'use overrides=["scenario.horizon={max_episode_steps}"]',
         )
+        given = getattr(autoreset_mode, "value", autoreset_mode)
+        if given not in (names := [mode.value for mode in AutoresetMode]):
+            raise unknown_name("autoreset_mode", str(given), names)
+        self.mode = AutoresetMode(given)
+        self.metadata = {**self.metadata, "autoreset_mode": self.mode}
         self.episodes = _episodes(variant, num_envs, overrides, held_out, render_mode)
+        self.render_mode = render_mode
         self.single_observation_space, self.single_action_space = _spaces(self.episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.num_envs = num_envs
         self.running = np.zeros(num_envs, np.bool_)
+        self.ended = self.running.copy()  # those that begin anew in the next step
 
     def reset(
         self,
@@ -214,24 +238,35 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         seeds, places = _seeds(seed, count), np.flatnonzero(mask)
         observation = self.episodes.reset(places, seeds, options)
         super().reset(seed=seeds[0])
-        self.running[places] = True
+        self.running[places], self.ended[places] = True, False
         return observation, {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Play one step of every episode."""
-        if not self.running.all():
-            raise ResetNeeded("call reset before step")
-        results = self.episodes.step(actions)
+        if not (self.running | self.ended).all():
+            ended = np.flatnonzero(~self.running).tolist()
+            raise ResetNeeded(f"call reset before step, by reset_mask in the places {ended}")
+        results, begun = self.episodes.step(actions), self.ended
+        if begun.any():
+            self.episodes.reset(np.flatnonzero(begun))
+            results[begun] = 0.0
         observation = self.episodes.observation
         ends = results[:, 1:3] > 0.0
-        done = ends.any(1)
+        done: Any = ends.any(1)
         info: dict[str, Any] = {
             TERMS: dict(zip(self.episodes.terms, results[:, 3:].T, strict=True))
         }
-        if done.any():
+        same = self.mode == AutoresetMode.SAME_STEP
+        if same and done.any():
             info |= {"final_obs": observation, "_final_obs": done}
             observation = self.episodes.reset(np.flatnonzero(done))
+        self.running = ~done | same
+        self.ended = done & (self.mode == AutoresetMode.NEXT_STEP)
         return observation, results[:, 0], ends[:, 0], ends[:, 1], info
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Return the road of every place, ``[height, width, 3]``, uint8."""
+        return tuple(film.picture() for film in self.episodes.films) or None
 
 
 register()

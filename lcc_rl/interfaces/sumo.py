@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 import torch
 
-from lcc_rl.errors import ConfigError, Diverged
+from lcc_rl.errors import ConfigError, Diverged, how_to_install
 from lcc_rl.interfaces.driver import PRESENT, Driver, Measured, entries
 from lcc_rl.pieces.base import SEED, STEP, State
 
@@ -37,7 +37,7 @@ def load_sumo() -> Any:
         with patch.dict(os.environ, {"LIBSUMO_AS_TRACI": "quiet"}):
             import libsumo
     except ImportError as error:
-        raise ConfigError("libsumo is not installed; pip install 'lcc_rl[sumo]'") from error
+        raise ConfigError(f"libsumo is not installed: {how_to_install('sumo')}") from error
     return libsumo
 
 

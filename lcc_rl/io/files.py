@@ -82,7 +82,7 @@ def _finite(frame: pd.DataFrame, path: str | Path) -> pa.Table:
 def processor() -> str:
     """Return the name of this machine's processor."""
     try:
-        _, found, after = Path("/proc/cpuinfo").read_text().partition("model name")
+        _, found, after = Path("/proc/cpuinfo").read_text(encoding="utf-8").partition("model name")
     except OSError:
         found = ""
     return after.splitlines()[0].lstrip("\t :") if found else platform.processor() or "unknown"

@@ -82,7 +82,7 @@ def amount(size: float) -> str:
 
 def _of_system() -> Iterator[int]:
     with suppress(OSError, ValueError, IndexError):
-        _, _, after = MEMORY.read_text().partition("MemAvailable:")
+        _, _, after = MEMORY.read_text("utf-8").partition("MemAvailable:")
         yield int(after.split()[0]) * 1024
         return
     with suppress(OSError, ValueError, AttributeError):  # no such name, or no such system
@@ -92,7 +92,7 @@ def _of_system() -> Iterator[int]:
 def _of_groups() -> Iterator[int]:
     """Yield what each control group above this process leaves, of version 1 and 2."""
     with suppress(OSError):
-        for line in PROCESS.read_text().splitlines():
+        for line in PROCESS.read_text("utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
             if controllers in ("", "memory"):
                 place = GROUPS / controllers / path.strip("/")
@@ -105,6 +105,6 @@ def _left(folder: Path, limit: str, used: str, reclaimable: str) -> Iterator[int
     """Yield what one group leaves; files that it holds in memory are given up first."""
     # ValueError: "max", no limit.
     with suppress(OSError, ValueError):
-        most, now = (int((folder / name).read_text()) for name in (limit, used))
-        rows = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        most, now = (int((folder / name).read_text("utf-8")) for name in (limit, used))
+        rows = (line.split() for line in (folder / "memory.stat").read_text("utf-8").splitlines())
         yield max(0, most - now + int(dict(rows).get(reclaimable, 0)))

@@ -134,7 +134,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
         shape = (*batch, *self.event_shape)
         return {key: Unbounded(shape=shape, device=device) for key in self.targets}
 
-    def apply(self, before: State, reached: State, detached: bool = False) -> None:
+    def derive(self, before: State, reached: State, detached: bool = False) -> None:
         """Compute the entries written from plain mappings of entries.
 
         Args:
@@ -250,8 +250,8 @@ class StepTransform(Piece):
         shape = (*batch, *self.event_shape)
         return {key: Unbounded(shape=shape, device=device) for key in self.constants}
 
-    def apply(self, before: State, reached: State, detached: bool = False) -> None:
-        super().apply(before, reached, detached)
+    def derive(self, before: State, reached: State, detached: bool = False) -> None:
+        super().derive(before, reached, detached)
         reached.update((key, before[key]) for key in self.constants)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -286,7 +286,7 @@ class StepTransform(Piece):
 
 
 class RewardPiece(Feature):
-    """A feature written to the reward spec: it exists after a step, not at reset.
+    """A feature of a step: at reset it is zero.
 
     Called on stored transitions (TensorDicts with ``"next"``), it reads the next state and
     writes there, as in an environment.
@@ -303,10 +303,7 @@ class RewardPiece(Feature):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        batch, device = tensordict_reset.batch_size, tensordict_reset.device
+        for key, spec in self.written_specs(batch, device).items():
+            tensordict_reset.set(key, batch_innermost(spec.zero()))
         return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        return add_specs(self, reward_spec)

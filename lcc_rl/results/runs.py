@@ -29,7 +29,7 @@ KEPT = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 def save_config(cfg: BaseConfig, folder: Path) -> None:
     """Write the resolved configuration of a run into its folder."""
     with atomic_path(folder / CONFIG) as temporary:
-        temporary.write_text(as_text(cfg))
+        temporary.write_text(as_text(cfg), encoding="utf-8")
 
 
 def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:

@@ -180,7 +180,7 @@ class ProgressReporter:
         state |= {"eta_s": round(remaining, 1)}
         state |= {name: float(f"{value:.6g}") for name, value in values.items()}
         with atomic_path(self.folder / PROGRESS, durable=False) as temporary:
-            temporary.write_text(json.dumps(state))
+            temporary.write_text(json.dumps(state), encoding="utf-8")
 
 
 def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> None:

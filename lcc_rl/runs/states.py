@@ -173,7 +173,7 @@ def record(folder: Path, error: BaseException) -> None:
     if not isinstance(input_error(error) or error, (LccError, OSError)):
         text += "\n" + "".join(traceback.format_exception(error))
     with suppress(ResultsError), atomic_path(folder / ERROR) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8")
 
 
 def described(error: BaseException) -> str:

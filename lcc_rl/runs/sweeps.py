@@ -145,7 +145,7 @@ class SweepCallback(Callback):
             refuse(f"a sweep has at most {MOST_RUNS} runs")
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
-            temporary.write_text(json.dumps(asdict(plan)))
+            temporary.write_text(json.dumps(asdict(plan)), encoding="utf-8")
         words = "sweep of %d runs in %s; watch it with: lcc-rl status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
         if not any(state.state == "running" for state in survey(folder)):

@@ -46,7 +46,9 @@ def test_classes_are_drawn_by_share_and_constant(string) -> None:
         f"scenario.string={string}",
         "energy.shares={midsize: 3, suv: 1, compact: 0, pickup: 0, class8: 0, electric: 0}",
     ]
-    env = lcc_rl.make_env("alcc", 2000, [*overrides, "+energy.roles.automated={electric: 1}"])
+    env = lcc_rl.make_env(
+        "alcc", 2000, [*overrides, "+energy.roles.automated={electric: 1}"], seed=0
+    )
     data = env.rollout(2, break_when_any_done=False)
     kinds = data[CLASS]
     assert (kinds[:, 0] == kinds[:, 1]).all()
@@ -65,7 +67,7 @@ def test_an_episode_has_the_same_vehicles_whoever_drives() -> None:
     seeds = torch.arange(5).unsqueeze(-1)
     kinds = []
     for variant in ("alcc", "idm"):
-        env = lcc_rl.make_env(variant, 5, MIXED, single=False)
+        env = lcc_rl.make_env(variant, 5, MIXED, seed=0, single=False)
         first = env.reset(
             env.state_spec.zero().select(("episode", "seed")).set(("episode", "seed"), seeds)
         )
@@ -75,7 +77,7 @@ def test_an_episode_has_the_same_vehicles_whoever_drives() -> None:
 
 
 def test_power_of_an_environment_is_that_of_the_models() -> None:
-    env = lcc_rl.make_env("alcc", 4, MIXED)
+    env = lcc_rl.make_env("alcc", 4, MIXED, seed=0)
     data = env.rollout(20, break_when_any_done=False)
     fleet = build_energy(load("train", MIXED))
     after = data["next", "vehicles"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -12,6 +14,7 @@ from tensordict import TensorDict
 import lcc_rl
 from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.errors import LccError
+from lcc_rl.figures.animation import COLOURS
 from lcc_rl.pieces.base import SEED
 
 gymnasium = pytest.importorskip("gymnasium", reason="extra interfaces")
@@ -22,6 +25,7 @@ import lcc_rl.interfaces.gym  # noqa: E402
 
 DATA = ["data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
 SHORT = [*DATA, "scenario.horizon=20"]
+RING = "scenario.string=automated human*21"
 STILL = np.zeros((3, 1), np.float32)
 SEEDS, WHOLE = np.array([3, 4, 5]), "seed must be a whole number from 0 to 4294967295, got"
 EVERYWHERE = (-1, 3.0, True, np.True_, "3", 2**32, 2**64)
@@ -47,10 +51,22 @@ def many():
     return gymnasium.make_vec("lcc_rl/alcc-v0", num_envs=3, overrides=SHORT)
 
 
-def test_gymnasium_accepts_it(env) -> None:
+# "module:id" imports the module first: a process that another program started knows the name.
+NAME = "lcc_rl.interfaces.gym:lcc_rl/alcc-v0"
+
+
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
+def test_gymnasium_accepts_it(render_mode) -> None:
+    env = gymnasium.make(NAME, overrides=SHORT, render_mode=render_mode)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(env.unwrapped, skip_render_check=True)
+        check_env(env.unwrapped)
+
+
+def test_a_name_with_its_module_needs_no_import() -> None:
+    code = f"import gymnasium; print(gymnasium.make({NAME!r}, overrides={SHORT}).reset()[0].shape)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert found.stdout.strip() == "(7,)", found.stderr
 
 
 @pytest.mark.parametrize(
@@ -155,8 +171,17 @@ def test_an_action_of_double_precision_changes_no_type(env, many) -> None:
             for place in (0, 1)
             for given, x in BAD_OPTIONS
         ),
-        (lambda one, many: many.step(np.zeros((2, 1))), r"must be \[3, 1\], got \[2, 1\]"),
+        (lambda one, many: many.step(np.zeros((2, 1))), r"numbers \[3, 1\], got \[2, 1\]"),
         (lambda one, many: many.step(STILL + np.nan), "automated.action is nan at step 1"),
+        *(
+            (lambda one, many, given=given: many.step(given), "actions must be real numbers")
+            for given in (STILL + 0j, STILL > 0, STILL.astype(object), STILL.astype(str), None, {})
+        ),
+        *(
+            (lambda one, many, given=given: one.step(given), "actions must be real numbers")
+            for given in (0j, [1j], True, [True], {"action": 0.0}, [None], "0", [0.1, 0.2], 0.1)
+        ),
+        (lambda one, many: many.step([[0.1], [0.2, 0.3], [0.4]]), "actions must be real numbers"),
     ],
 )
 def test_what_cannot_take_effect_is_refused_in_one_line(env, many, call, message) -> None:
@@ -196,8 +221,10 @@ def test_seeds_may_be_whole_numbers_of_numpy(env, many) -> None:
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
-        (gymnasium.make, {"render_mode": "human"}, "render_mode must be None, got 'human'"),
-        (gymnasium.make_vec, {"render_mode": "human"}, "render_mode must be None, got 'human'"),
+        (gymnasium.make, {"render_mode": "ansi"}, "rgb_array.*got 'ansi'"),
+        (gymnasium.make_vec, {"render_mode": "human"}, "rgb_array.*got 'human'"),
+        (gymnasium.make_vec, {"autoreset_mode": "SameStpe"}, "SameStep"),
+        (gymnasium.make_vec, {"autoreset_mode": None}, "SameStep"),
         (gymnasium.make_vec, {"max_episode_steps": 10}, "scenario.horizon=10"),
     ],
 )
@@ -215,11 +242,148 @@ def test_an_episode_that_has_ended_takes_no_further_step(env) -> None:
         env.step(STILL[0])
 
 
-@pytest.mark.slow
+def ending(mode: str, steps: int):
+    """Play a vector whose places end at different steps; a reset of those that ended by hand."""
+    many = gymnasium.make_vec(NAME, num_envs=3, overrides=SHORT, autoreset_mode=mode)
+    many.reset(seed=3)
+    many.reset(options={"reset_mask": np.array([True, False, False])})
+    for _ in range(5):
+        many.step(STILL + 0.2)
+    many.reset(seed=[None, 9, None], options={"reset_mask": np.array([False, True, False])})
+    for _ in range(steps):
+        results = many.step(STILL + 0.2)
+        done = results[2] | results[3]
+        yield many, results, done
+        if mode == "Disabled" and done.any():
+            yield many, (many.reset(options={"reset_mask": done})[0], *results[1:]), None
+
+
+def test_every_autoreset_mode_plays_the_same_episodes() -> None:
+    series = {}
+    for mode, name in (("SameStep", "final_obs"), ("NextStep", ""), ("Disabled", "")):
+        played = [[], [], []]
+        before = np.zeros(3, bool)
+        for many, (seen, rewards, *_, info), done in ending(mode, 48):
+            assert many.metadata["autoreset_mode"].value == mode
+            if done is None:
+                continue  # begun anew by hand
+            last = info.get(name, seen)
+            for place in range(3):
+                if mode == "NextStep" and before[place]:
+                    assert rewards[place] == 0.0
+                    assert not done[place]
+                else:
+                    played[place].append((*last[place], rewards[place]))
+            before = done
+        series[mode] = played
+    for place in range(3):
+        same = np.array(series["SameStep"][place])
+        for mode in ("NextStep", "Disabled"):
+            found = np.array(series[mode][place])
+            np.testing.assert_array_equal(found, same[: len(found)])
+        assert len(same) > len(series["NextStep"][place])
+
+
+def test_disabled_resets_are_asked_for() -> None:
+    many = gymnasium.make_vec(NAME, num_envs=2, overrides=SHORT, autoreset_mode="Disabled")
+    many.reset(seed=0)
+    while not (results := many.step(STILL[:2]))[3].all():
+        pass
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"places \[0, 1\]"):
+        many.step(STILL[:2])
+    assert results[3].all()
+
+
+def test_a_vector_that_crashes_goes_on() -> None:
+    many = gymnasium.make_vec(NAME, num_envs=3, overrides=DATA, autoreset_mode="NextStep")
+    many.reset(seed=0)
+    crashed = sum(many.step(STILL + 1.0)[2].sum() for _ in range(200))
+    assert crashed >= 3
+
+
+def test_the_first_reset_without_a_seed_is_random() -> None:
+    first = [gymnasium.make(NAME, overrides=SHORT).reset()[0] for _ in range(2)]
+    assert not np.array_equal(*first)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "cars"),
+    [
+        (SHORT, {"automated": 1, "human": 1}),
+        ([*SHORT, "scenario.string={size: 4, penetration: 0.25}"], {"automated": 1, "human": 3}),
+        (
+            ["scenario=ring", "drivers=ring", "scenario.horizon=20", RING],
+            {"automated": 1, "human": 21},
+        ),
+    ],
+)
+def test_pictures_show_the_road(overrides, cars) -> None:
+    env = gymnasium.make(NAME, overrides=overrides, render_mode="rgb_array_list")
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(STILL[0] + 0.5)
+    pictures = np.stack(env.render())
+    assert pictures.shape[0] == 6
+    assert pictures.shape[3] == 3
+    assert pictures.dtype == np.uint8
+    assert all(size % 2 == 0 for size in pictures.shape[1:3])  # as films want it
+    film = env.unwrapped.episodes.films[0]
+    assert not np.array_equal(pictures[0], pictures[-1])
+    for role, count in cars.items():
+        colour = np.array([int(COLOURS[role][i : i + 2], 16) for i in (1, 3, 5)])
+        assert (np.abs(pictures[0].astype(int) - colour).sum(-1) < 12).sum() > 20 * count, role
+    assert len(film.moments) == 6
+
+
+def test_a_vector_draws_every_place(many) -> None:
+    drawn = gymnasium.make_vec(NAME, num_envs=2, overrides=SHORT, render_mode="rgb_array")
+    with pytest.raises(LccError, match="call reset before render"):
+        drawn.render()
+    drawn.reset(seed=0)
+    for _ in range(22):
+        drawn.step(STILL[:2])
+    one, two = drawn.render()
+    assert one.shape == two.shape
+    assert not np.array_equal(one, two)
+    assert [len(film.moments) for film in drawn.episodes.films] == [3, 3]
+    assert many.render() is None
+
+
+# -- stable-baselines3 -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sb3():
+    pytest.importorskip("stable_baselines3", reason="extra interfaces")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its own imports
+        import stable_baselines3
+    return stable_baselines3
+
+
+def test_stable_baselines3_accepts_it(sb3) -> None:
+    from stable_baselines3.common.env_checker import check_env as check
+
+    env = gymnasium.make(NAME, overrides=SHORT, render_mode="rgb_array").unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check(env, skip_render_check=False)
+
+
 @pytest.mark.filterwarnings("ignore")
-def test_stable_baselines3_learns_on_it(env) -> None:
-    sb3 = pytest.importorskip("stable_baselines3", reason="extra interfaces")
-    model = sb3.DDPG("MlpPolicy", env, learning_starts=50, seed=0)
-    model.learn(200)
-    action, _ = model.predict(env.reset(seed=0)[0])
-    assert env.action_space.contains(action)
+def test_stable_baselines3_learns_on_it_by_name(sb3) -> None:
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    few = {"overrides": SHORT}
+    for name, kind in (("lcc_rl/alcc-v0", None), (NAME, SubprocVecEnv)):
+        start = {"start_method": "fork"} if kind else {}
+        env = make_vec_env(name, 2, env_kwargs=few, vec_env_cls=kind, vec_env_kwargs=start)
+        model = sb3.PPO("MlpPolicy", env, n_steps=20, batch_size=20, n_epochs=1, device="cpu")
+        model.learn(40)
+        action, _ = model.predict(env.reset())
+        assert action.shape == (2, 1)
+        env.close()
+    assert sb3.PPO("MlpPolicy", NAME, n_steps=20, device="cpu").observation_space.shape == (7,)
+    ddpg = sb3.DDPG("MlpPolicy", NAME, learning_starts=10, seed=0, device="cpu")
+    ddpg.learn(20)

@@ -102,7 +102,9 @@ def _write(folder: Path, runs: int, size: int) -> None:
     for run in range(runs):
         place = folder / f"{run:03d}"
         place.mkdir()
-        (place / "config.yaml").write_text(text.replace("\nseed: 0\n", f"\nseed: {run}\n"))
+        (place / "config.yaml").write_text(
+            text.replace("\nseed: 0\n", f"\nseed: {run}\n"), encoding="utf-8"
+        )
         parts = range(0, size, BLOCK)
         table = (_episodes(min(BLOCK, size - first), draw) for first in parts)
         write_parquet(table, place / "episodes.parquet")

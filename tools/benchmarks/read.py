@@ -68,7 +68,7 @@ def write_copies(path: Path, target: Path, locations: Sequence[str]) -> None:
     header, *lines = content.decode().splitlines()
     if header.count(",") != 17:
         raise DataError(f"{path}: expected an 18-column CSV with a header, got {header[:80]!r}")
-    with gzip.open(target, "wt", compresslevel=1) as file:
+    with gzip.open(target, "wt", compresslevel=1, encoding="utf-8") as file:
         file.write(f"{header},Location\n")
         for place in locations:
             file.writelines(f"{line},{place}\n" for line in lines)

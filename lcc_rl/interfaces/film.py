@@ -1,0 +1,63 @@
+"""Pictures of the road for Gymnasium's ``render_mode="rgb_array"``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lcc_rl.envs.arrays import ArrayEpisodes
+from lcc_rl.envs.step import pieces_of
+from lcc_rl.errors import require
+from lcc_rl.figures.animation import road_picture
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces import Places, StringMotion
+from lcc_rl.results.motion import Motion
+
+
+class Film:
+    """The moments of the present episode in one place of a batch.
+
+    Args:
+        episodes: the batch.
+        place: the place.
+    """
+
+    def __init__(self, episodes: ArrayEpisodes, place: int) -> None:
+        self.episodes, self.place = episodes, place
+        pieces: dict[type, Any] = {type(piece): piece for piece in pieces_of(episodes.env)}
+        self.motion = pieces[StringMotion]
+        self.drawn = pieces[Places].string.drawn
+        self.moments: list[tuple[Any, Any, Any]] = []
+
+    def expose(self, begins: bool) -> None:
+        """Keep the present moment; of an episode that begins, it is the first."""
+        if begins:
+            self.moments.clear()
+        speed, gap = (self._look("vehicles", name) for name in ("speed", "gap"))
+        ahead = speed[-1] if self.motion.string.ring else self._look("leader", "speed")[0]
+        self.moments.append((speed, gap, ahead))
+
+    def picture(self) -> Any:
+        """Return the present moment, ``[height, width, 3]``, uint8."""
+        require(bool(self.moments), "call reset before render")
+        speed, gap, ahead = map(np.asarray, zip(*self.moments, strict=True))
+        string, length = self.motion.string, self.motion.vehicle_length
+        time = np.arange(len(ahead)) * self.motion.time_step
+        front, around = np.cumsum(ahead) * self.motion.time_step, None
+        if string.ring:
+            around = float(gap[0].sum() + length * len(string))
+            front = np.cumsum(speed[:, 0]) * self.motion.time_step + gap[:, 0] + length
+        roles = string.roles
+        if self.drawn:
+            own = set(self._look(AUTOMATED, "index"))
+            others = iter(sorted(roles, key=AUTOMATED.__eq__))
+            roles = tuple(AUTOMATED if i in own else next(others) for i in range(len(string)))
+        leader = None if string.ring else ahead
+        return road_picture(Motion(time, roles, speed, gap, front, leader, length, around))
+
+    def _look(self, *key: str) -> Any:
+        """Return an entry of the present state."""
+        place = self.episodes.keys.index(key)
+        first = sum(self.episodes.sizes[:place])
+        return self.episodes.state[self.place, first : first + self.episodes.sizes[place]].copy()
