@@ -175,7 +175,7 @@ def check_pairs(
     if enough and not (right.any() or span[0] <= every["slope"] <= span[1]):
         raise DataError(f"{words.format(every['slope'])}: are speeds to be smoothed?")
     lines = [Concern(line) for line in (*said(late), *said(strange))]
-    return [*lines, medians(episodes, pairs[told], len(pairs))], bool(right.any())
+    return [*lines, medians(episodes, pairs[told], len(pairs), units)], bool(right.any())
 
 
 def _mistaken(
@@ -211,7 +211,9 @@ def _mistaken(
     return [(pair["row"], near[0][2], f"{words}; {questions}")] if least < log(NEAR) else []
 
 
-def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int) -> str:
+def medians(
+    episodes: pd.DataFrame, told: pd.DataFrame, pairs: int, units: Mapping[str, str]
+) -> str:
     """Return the line by which a user sees whether units and clocks are right.
 
     ``told`` are the rows of :func:`agreement` that tell something, of so many ``pairs``.
@@ -227,6 +229,6 @@ def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int) -> str:
         f"{behind:.2g} s above 1 m/s; {', '.join(said)}"
     )
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
-    if len(stand) < LEAST_STANDING or stand.median() < FAR:
+    if len(stand) < LEAST_STANDING or stand.median() < FAR or "ft" in units.values():
         return line
     return Concern(f"{line}; cars stand {stand.median():.3g} m apart: are all columns in feet?")

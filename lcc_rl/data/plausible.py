@@ -146,7 +146,7 @@ class Plausible(Settings):
         if hard is not None and hard > self.max_hard:
             hint = "are they in km/h, mph or ft/s, or do they need smoothing?"
             if agree:
-                hint = "gaps agree: are both in another unit (feet), or are such starts real?"
+                hint = "gaps agree: are both in another unit, or are such starts real?"
             raise DataError(
                 f"{source}: speeds change by more than {HARD:g} m/s within a second for "
                 f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; {hint}"

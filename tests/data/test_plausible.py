@@ -237,7 +237,7 @@ def test_forgotten_feet_are_refused_where_cars_brake_and_said_where_they_stand(s
     table = EpisodesSource(path=str(shared_data / "i80_pairs.parquet")).load().episodes
     feet = table.assign(**{name: table[name] / 0.3048 for name in [*SPEEDS, "gap_m"]})
     with pytest.raises(
-        DataError, match=r"more than 4 m/s within .* are both in another unit \(feet\)"
+        DataError, match=r"more than 4 m/s within .* gaps agree: are both in another unit, or"
     ):
         judged(feet)
     queue = wavy().assign(gap_m=6.0, **dict.fromkeys(SPEEDS, 0.0))
@@ -245,6 +245,7 @@ def test_forgotten_feet_are_refused_where_cars_brake_and_said_where_they_stand(s
     last = judged(queue.assign(gap_m=6.0 / 0.3048))[-1]
     assert isinstance(last, Concern)
     assert "cars stand 19.7 m apart: are all columns in feet?" in last
+    assert "feet" not in judged(queue.assign(gap_m=6.0 / 0.3048), {"gap": "ft"})[-1]
 
 
 @pytest.mark.parametrize("spell", [csv_text, native_text])
