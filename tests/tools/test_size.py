@@ -55,3 +55,19 @@ def test_the_table_adds_lcc_rl_and_tools(monkeypatch, tmp_path) -> None:
     assert table.loc["tests", "cases"] == 7
     assert table.loc["conf", "yaml"] == 1
     assert table.loc["tools", "%"] == 60.0
+
+
+def test_the_structure_of_a_package(monkeypatch, tmp_path) -> None:
+    modules = {
+        "lcc_rl/base/one.py": "SPEED = 1\n",
+        "lcc_rl/base/two.py": "from lcc_rl.base.one import SPEED\n",
+        "lcc_rl/above/three.py": "from lcc_rl.base import one\nSPEED: int = 2\n_own = 1\n",
+        "lcc_rl/above/four.py": "import lcc_rl.top.five\n_own = 2\n",
+        "lcc_rl/top/five.py": "def f():\n    from lcc_rl.above.four import g\n",
+    }
+    for name, text in modules.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(size, "ROOT", tmp_path)
+    # SPEED stands in two modules; above and top import each other, so they share floor 2.
+    assert list(size.structure(modules).values()) == [1, 2, 1]
