@@ -17,9 +17,6 @@ from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Settings, values
 
-if TYPE_CHECKING:
-    from lcc_rl.agents.loop import TrainingLoop
-
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
@@ -51,7 +48,7 @@ class Agent(Settings, ABC):
     ``policy`` reads ``"observation"`` and writes ``"action"``; ``loop`` trains it.
     """
 
-    loop: ClassVar[type[TrainingLoop[Any]]]
+    loop: ClassVar[Any]  # a class, see lcc_rl.agents.loop.TrainingLoop
 
     if TYPE_CHECKING:  # what setup makes
 

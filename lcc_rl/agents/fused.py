@@ -9,14 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from lcc_rl.agents.off_policy import OffPolicy
 
 Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, the same transposed, biases
 
@@ -118,19 +115,21 @@ class ActorCritic:
         networks: weights and biases of ``"actor"``, a ReLU network before a tanh, and ``"value"``,
             the Q networks, which read observation and action side by side.
         targets: the same of the target networks; without an actor, the actor is its own target.
-        settings: number of Q networks, discount, and the weight of the penalty on the actor's
-            square output before the tanh.
+        critics: number of Q networks.
+        gamma: discount.
+        saturation: weight of the penalty on the actor's square output before the tanh.
     """
 
     def __init__(
         self,
         networks: Mapping[str, Sequence[Tensor]],
         targets: Mapping[str, Sequence[Tensor]],
-        settings: OffPolicy,
+        critics: int,
+        gamma: float,
+        saturation: float,
     ) -> None:
-        self.gamma, self.saturation = settings.gamma, settings.saturation
-        depth, count = len(networks["value"]), settings.critics
-        numbers = range(count) if count > 1 else [None]
+        self.gamma, self.saturation = gamma, saturation
+        depth, numbers = len(networks["value"]), range(critics) if critics > 1 else [None]
         self.actor = Network(networks["actor"][:depth])
         self.target_actor = Network(targets["actor"]) if "actor" in targets else self.actor
         self.critics = [Network(networks["value"], number) for number in numbers]

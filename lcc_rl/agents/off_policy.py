@@ -142,7 +142,8 @@ class OffPolicy(Agent):
             networks["alpha"], rates["alpha"] = [alpha[0]], alpha[1]
         targets = {name: leaves(getattr(loss, f"target_{keys[name]}")) for name in delayed}
         self._join(networks, rates, targets)
-        self.written = ActorCritic(networks, targets, self) if self.fused else None
+        parts = networks, targets, self.critics, self.gamma, self.saturation
+        self.written = ActorCritic(*parts) if self.fused else None
 
     def _join(
         self,

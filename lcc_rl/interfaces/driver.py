@@ -20,7 +20,7 @@ from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.functional.string import entries_ahead
-from lcc_rl.interfaces.export import ExportedPolicy, exported_policy
+from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World

@@ -12,7 +12,8 @@ from helpers import small_env
 import lcc_rl
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.interfaces.export import ExportedPolicy, exported_policy, main
+from lcc_rl.interfaces.export import main
+from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
 from lcc_rl.results.policies import load_policy
 
 

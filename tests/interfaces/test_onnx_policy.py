@@ -27,7 +27,7 @@ from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import driven_by, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.interfaces.driver import Driver, Measured, entries
-from lcc_rl.interfaces.export import ExportedPolicy, Remembering
+from lcc_rl.interfaces.exported import ExportedPolicy, Remembering
 from lcc_rl.interfaces.onnx_policy import OnnxPolicy, Program
 from lcc_rl.pieces import Action, Observation
 from lcc_rl.pieces.base import SEED, STEP
