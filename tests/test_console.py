@@ -151,7 +151,6 @@ def test_commands_run_on_a_newer_python_in_a_clone_that_is_installed_elsewhere()
 @pytest.mark.parametrize(
     ("package", "extra", "use"),
     [
-        ("optuna", "sweeps", lambda: import_module("lcc_rl.runs.search").load_optuna()),
         ("libsumo", "sumo", lambda: import_module("lcc_rl.interfaces.sumo").load_sumo()),
         (
             "onnx",

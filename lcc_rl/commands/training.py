@@ -17,7 +17,7 @@ from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
@@ -144,7 +144,11 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
         agent.policy.state_dict(), cfg, folder / POLICIES / f"{iteration:06d}.pt"
     )
     with build_logger(cfg).opened(folder) as trainer.on_row:
-        trainer.run()
+        try:
+            trainer.run()
+        except Interrupted as error:  # what may be named has to be said again
+            trust = f" trust=[{','.join(cfg.trust)}]" if cfg.trust else ""
+            raise Interrupted(f"{error}{trust}") from error
     weights = agent.policy.state_dict()
     if all(torch.equal(weights[name], value) for name, value in first.items()):
         log.warning(

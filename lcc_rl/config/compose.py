@@ -88,6 +88,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
     Raises:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
+    if isinstance(overrides, str):
+        raise ConfigError(f"expected a list of settings, got the text {overrides!r}")
     return parsed(composed(entry, overrides), entry, overrides)
 
 

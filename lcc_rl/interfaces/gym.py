@@ -166,7 +166,7 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
 
     Every place plays what a :class:`CarFollowing` of its seed plays. Where an episode ends in
     the mode ``"SameStep"``, ``info["final_obs"]`` holds the last observations where
-    ``info["_final_obs"]`` is true.
+    ``info["_final_obs"]`` is true, and ``info["final_info"]`` the terms of the last rewards.
 
     Args:
         num_envs: episodes side by side.
@@ -258,7 +258,9 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         }
         same = self.mode == AutoresetMode.SAME_STEP
         if same and done.any():
+            final = {TERMS: info[TERMS], f"_{TERMS}": done}
             info |= {"final_obs": observation, "_final_obs": done}
+            info |= {"final_info": final, "_final_info": done}
             observation = self.episodes.reset(np.flatnonzero(done))
         self.running = ~done | same
         self.ended = done & (self.mode == AutoresetMode.NEXT_STEP)

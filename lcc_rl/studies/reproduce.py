@@ -1,4 +1,4 @@
-"""Reproduce a paper's study, from trajectories to tables and figures: lcc-rl reproduce alcc.
+"""Reproduce a paper's study, its tables and figures: lcc-rl reproduce alcc.
 
   lcc-rl reproduce alcc                           # embedded stream, 8 seeds
   lcc-rl reproduce alcc data=ngsim data.path=...  # trajectories; any override

@@ -338,3 +338,15 @@ def test_a_training_that_has_not_ended_says_how_it_goes_on(tmp_path) -> None:
     (tmp_path / "checkpoint.pt").touch()
     with pytest.raises(LccError, match=f"{tmp_path}: its training has not ended: .* resume="):
         lcc_rl.compare([tmp_path], overrides=SMALL, folder=tmp_path / "a")
+
+
+def test_what_is_no_policy_file_is_named_with_its_remedy(tmp_path) -> None:
+    (tmp_path / "sweep" / "one").mkdir(parents=True)
+    (tmp_path / "sweep" / "one" / "config.yaml").touch()
+    with pytest.raises(LccError, match="not a run folder: .* it holds the run one"):
+        load_policy(tmp_path / "sweep")
+    (tmp_path / "x.onnx").touch()
+    with pytest.raises(LccError, match=r"x\.onnx is an ONNX program.*compare=\["):
+        load_policy(tmp_path / "x.onnx")
+    with pytest.raises(LccError, match="expected a list of settings, got the text 'seed=1'"):
+        load("train", "seed=1")

@@ -117,6 +117,9 @@ def test_a_place_of_the_vector_plays_what_one_environment_of_its_seed_plays(env,
             assert ("final_obs" in info and info["_final_obs"][place]) == (terminated or truncated)
             if terminated or truncated:
                 np.testing.assert_array_equal(info["final_obs"][place], seen)
+                assert info["_final_info"][place]
+                final = {x: each[place] for x, each in info["final_info"]["reward_terms"].items()}
+                assert final == pytest.approx(own["reward_terms"])
                 seen, _ = env.reset()
             np.testing.assert_array_equal(after[place], seen)
 
