@@ -22,6 +22,7 @@ from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
 from lcc_rl.pieces import ConstantAcceleration, Controller, Law
+from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import Positive
 
 
@@ -343,7 +344,7 @@ def test_a_training_that_has_not_ended_says_how_it_goes_on(tmp_path) -> None:
 def test_what_is_no_policy_file_is_named_with_its_remedy(tmp_path) -> None:
     (tmp_path / "sweep" / "one").mkdir(parents=True)
     (tmp_path / "sweep" / "one" / "config.yaml").touch()
-    with pytest.raises(LccError, match="not a run folder: .* it holds the run one"):
+    with pytest.raises(LccError, match=r"not a run folder: .* it holds the run one"):
         load_policy(tmp_path / "sweep")
     (tmp_path / "x.onnx").touch()
     with pytest.raises(LccError, match=r"x\.onnx is an ONNX program.*compare=\["):
