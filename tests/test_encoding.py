@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator
 
 import pytest
-from pages import ROOT
+from page_blocks import ROOT
 
 FOLDERS = ("lcc_rl", "tools")
 # Calls that open a file, and the place of the mode among their arguments.

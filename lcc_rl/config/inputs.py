@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import inspect
+import sys
+import sysconfig
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from glob import glob
+from importlib.util import resolve_name
 from os.path import expanduser
 from pathlib import Path
 from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import TARGET, find_target, is_node, settings_at
 from lcc_rl.errors import ConfigError, ResultsError
@@ -20,6 +26,8 @@ Inputs = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMES = ("compare", "policy")  # sections that name policies, controllers and classes
 FILTERED, OURS = "_filtered", "lcc_rl."
+PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # of what is installed
+INSTALLED = [Path(sysconfig.get_path(x)) for x in PLACES] + [Path(__file__).parents[1]]
 
 
 def inputs_of(content: Mapping[str, Any]) -> Inputs:
@@ -47,8 +55,10 @@ def inputs_of(content: Mapping[str, Any]) -> Inputs:
                 for path in filter(Path.is_file, _files(last, named, holder, name)):
                     stat = path.stat()
                     digest = _digest(str(path), stat.st_size, stat.st_mtime_ns)
+                    known = found.setdefault(section, {})
                     label = path.name if path.suffix == ".py" else str(path)
-                    found.setdefault(section, {})[label] = digest
+                    same = known.get(label, digest) == digest
+                    known[label if same else str(path)] = digest
     return found
 
 
@@ -71,6 +81,11 @@ def compared_files(name: str) -> Iterator[Path]:
         yield from sorted(path.rglob("policy.pt"))
     elif not path.exists():
         yield from _module(str(path))
+        if HydraConfig.initialized():  # a name may be that of a file of --config-dir
+            for source in HydraConfig.get().runtime.config_sources:
+                file = Path(source.path) / "controller" / f"{path}.yaml"
+                if source.provider == "command-line" and file.is_file():
+                    yield from compared_files(str(file))
     else:
         yield path
         if path.suffix in (".yaml", ".yml"):
@@ -79,10 +94,30 @@ def compared_files(name: str) -> Iterator[Path]:
 
 
 def _module(target: str) -> Iterator[Path]:
-    """Yield the module of a class or function of the user's own; a notebook's has no file."""
+    """Yield the modules of a class or function of the user's own; a notebook's has no file."""
     if "." in target and "/" not in target and not target.startswith(OURS):
         with suppress(ConfigError, TypeError):
-            yield Path(inspect.getfile(inspect.unwrap(find_target(target, TARGET))))
+            module = inspect.getmodule(inspect.unwrap(find_target(target, TARGET)))
+            yield from _own_modules(module, set())
+
+
+def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
+    """Yield the file of a module of the user's own, and those of all that it imports."""
+    path = Path(getattr(module, "__file__", None) or "")
+    if path.suffix != ".py" or path in seen or any(path.is_relative_to(x) for x in INSTALLED):
+        return
+    seen.add(path)
+    yield path
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            with suppress(ImportError):
+                base = resolve_name("." * node.level + (node.module or ""), module.__package__)
+                names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    for name in sorted(names & sys.modules.keys()):
+        yield from _own_modules(sys.modules[name], seen)
 
 
 @lru_cache(maxsize=4096)  # once in a process for each file

@@ -18,7 +18,7 @@ OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mp
 SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
 WINDOW, EVERY, REACH = 2.0, 1.0, 3.0  # changes compared, time between them, longest lag [s]
 # Of changes [s], share explained, relative motion in a window [m]: less is too little to tell.
-LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 15.0, 0.9, 0.15, 100.0
+LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
 GAIN, FLOOR = 6.0, 2e-4  # a lag leaves so much less unexplained; what exact data leave
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: of a bias of speeds, which steady traffic leaves open
 LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
@@ -163,7 +163,8 @@ def check_pairs(
     ]
     late, too_late = [], []
     for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
-        lag = f"{abs(pair['late']):.1f} s {'late' if pair['late'] > 0 else 'early'}"
+        most = " or more" * (abs(pair["late"]) > REACH - FRAME / 2)
+        lag = f"{abs(pair['late']):.1f} s{most} {'late' if pair['late'] > 0 else 'early'}"
         late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
         too_late += late[-1:] * (abs(pair["late"]) > max_lag)
     for line in (*said(wrong), *said(too_late)):
@@ -172,8 +173,10 @@ def check_pairs(
     words = "the gap changes by {:.2f} m where both speeds say 1 m, and no unit fits"
     strange = [(pair["row"], "gap", words.format(pair["slope"])) for pair in odd]
     enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
-    if enough and not (right.any() or span[0] <= every["slope"] <= span[1]):
-        raise DataError(f"{words.format(every['slope'])}: are speeds to be smoothed?")
+    if (enough or told.any()) and not (right.any() or span[0] <= every["slope"] <= span[1]):
+        raise DataError(
+            f"{words.format(every['slope'])}: are times in another unit, or speeds to be smoothed?"
+        )
     lines = [Concern(line) for line in (*said(late), *said(strange))]
     return [*lines, medians(episodes, pairs[told], len(pairs), units)], bool(right.any())
 
@@ -206,9 +209,11 @@ def _mistaken(
         off = max(abs(log(ratio)) for ratio in ratios) if min(ratios) > 0 else inf
         near.append((off, default, signal, question))
     least = min(near)[0]
+    if least >= log(NEAR):  # of what the gap tells, or, in the end, of the ways
+        return _mistaken({**pair, "told": False}, units, max_mismatch) if pair["told"] else []
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
     questions = " or ".join(x[3] for x in near)
-    return [(pair["row"], near[0][2], f"{words}; {questions}")] if least < log(NEAR) else []
+    return [(pair["row"], near[0][2], f"{words}; {questions}")]
 
 
 def medians(

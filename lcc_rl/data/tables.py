@@ -59,9 +59,9 @@ SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
 NAMED = {
     "time": {"ms": "ms|msecs?|milliseconds?", "us": "us|µs|microseconds?", "ns": "ns|nanoseconds?"},
     "speed": {
-        "km/h": "km ?/?h|kmph|kph",
-        "mph": "mph|mi/h",
-        "ft/s": "ft/s|fps",
+        "km/h": "km ?/?h|kmph|kph|(kilomet(re|er)s|km) per h(ou)?r?",
+        "mph": "mph|mi/h|miles? (per|an) hour",
+        "ft/s": "ft/s|fps|(feet|ft) per s(ec(ond)?)?",
         "kn": "kn|kts?|knots?",
     },
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},

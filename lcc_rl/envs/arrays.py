@@ -165,15 +165,19 @@ class ArrayEpisodes:
             wanted = f"actions must be real numbers {[self.count, 1]}"
             raise ConfigError(f"{wanted}, got {list(given.shape)} {given.dtype}")
         given = np.ascontiguousarray(given, np.float32)
+        step = int(self.state[:, self.step_column].max()) + 1
+        if not np.isfinite(given).all():
+            self._check({ACTION: given}, step)
         self.state, self.observation, results = self.advance(self.state, given)
         if not results[:, -1].all():
-            named: dict[Key, Array] = {ACTION: given, SEEN: self.observation}
-            named[REWARD] = results[:, :1]
-            numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
-            step = int(self.state[:, self.step_column].max())
-            check_numbers(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
+            self._check({SEEN: self.observation, REWARD: results[:, :1]}, step)
         self._expose(range(self.count), begins=False)
         return results[:, :-1]
+
+    def _check(self, named: dict[Key, Array], step: int) -> None:
+        """Raise Diverged where an entry is no finite number."""
+        numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
+        check_numbers(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
 
     def _expose(self, places: Iterable[int], begins: bool) -> None:
         for film in [self.films[place] for place in places] if self.films else []:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries, tick
 from lcc_rl.errors import ConfigError, LccError
+from lcc_rl.functional.guard import changed, changes
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
 
@@ -78,7 +79,12 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
     Raises:
         ConfigError: naming the piece, and the number of entries, shape or type at fault.
     """
+    read = {key: (reached if late else before)[key] for late, key in piece.needs}
+    kept = {key: value.clone() for key, value in read.items()}
     _attempt(piece, lambda: piece.derive(before, reached))
+    for key, value in kept.items():  # by way of .data or NumPy a change is not counted
+        if not torch.equal(read[key].nan_to_num(), value.nan_to_num()):
+            raise changed(type(piece).__name__, ".".join(key))
     _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
 
 
@@ -97,7 +103,7 @@ def _kept(piece: Piece) -> dict[str, list[Any]]:
                 parts += value.values()
             elif isinstance(value, (list, set, deque)):
                 parts += value
-            parts += [part._version for part in parts if isinstance(part, Tensor)]
+            parts += changes([part for part in parts if isinstance(part, Tensor)])
             held[f"{path}.{name}" if path else name] = parts
     return held
 

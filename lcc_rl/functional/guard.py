@@ -22,17 +22,22 @@ def unchanged(
     """
     if compiler.is_compiling():
         return function(*values)
-    try:
-        before = [value._version for value in values]
-    except RuntimeError:  # tensors of torch's inference mode do not count their changes
-        return function(*values)
+    before = changes(values)
     found = function(*values)
-    if [value._version for value in values] != before:
-        name = next(
-            x for x, value, n in zip(names, values, before, strict=True) if n != value._version
-        )
-        raise ConfigError(
-            f"{title} changes {name} in place, and so the state of the vehicles; use "
-            "gap.clamp(…) instead of gap.clamp_(…) and the like, or change a clone"
-        )
+    for name, first, last in zip(names, before, changes(values), strict=True):
+        if first != last:
+            raise changed(title, name)
     return found
+
+
+def changes(values: Sequence[Tensor]) -> list[int]:
+    """Return how often each tensor was changed in place; torch's inference mode counts nothing."""
+    return [0 if value.is_inference() else value._version for value in values]
+
+
+def changed(title: str, name: str) -> ConfigError:
+    """Return the error for a class that changes what it reads."""
+    return ConfigError(
+        f"{title} changes {name} in place, and so the state of the vehicles; use "
+        "gap.clamp(…) instead of gap.clamp_(…) and the like, or change a clone"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -178,6 +179,11 @@ def check_row(row: Row, where: str) -> None:
     Raises:
         ConfigError: saying what does not.
     """
+    numbers = [row["score"], *(row[key] for key in SHARE)]
+    numbers += [limit[key] for limit in row["limits"].values() for key in ("bound", "value")]
+    for number in numbers:
+        good = number is None or (isinstance(number, int | float) and isfinite(number))
+        require(good, f"{where}: expected numbers, got {number!r}")
     value, low, high = (row[key] for key in SHARE)
     inside = value is None or low is None or low <= value <= high
     require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
