@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Column, checked, lacking
 from lcc_rl.data.text import cells_of, check_text, parse_text, reading, single_spaces, unended
-from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
+from lcc_rl.data.trajectories import (
+    FOOT,
+    ReadReport,
+    RowIndex,
+    Trajectories,
+    assembled,
+    find,
+)
 from lcc_rl.errors import Concern, DataError
 
 HEADER = (
@@ -130,21 +137,9 @@ def read_ngsim(
             f"{', '.join(rows.report.files)}: no row has Location {location!r}; "
             f"the locations found are {found or 'none'}"
         )
-    samples = _sorted(rows)
-    _check_units(samples, units, rows.report.files)
-    return Trajectories(samples, rows.report)
-
-
-def of_columns(columns: Mapping[str, NDArray], name: str) -> Trajectories:
-    """Return the trajectories of a file in feet that has these columns.
-
-    Args:
-        columns: the official columns, checked.
-        name: what the report calls the file.
-    """
-    rows = _Rows(ReadReport(files=[name]), FOOT)
-    rows.add(_Numbers(name, columns), None)
-    return Trajectories(_sorted(rows), rows.report)
+    trajectories = _sorted(rows)
+    _check_units(trajectories.samples, units, rows.report.files)
+    return trajectories
 
 
 # -- blocks of rows --------------------------------------------------------------------------------
@@ -196,22 +191,6 @@ class _Block:
             return DataError(f"{self.path}: line {line}, column {column.key!r} {words}")
 
         return checked(self.table[column.key], column, fault)
-
-
-class _Numbers(_Block):
-    """Rows that are at hand as numbers."""
-
-    def __init__(self, path: str, columns: Mapping[str, NDArray]) -> None:
-        self.path, self.columns = path, columns
-
-    def __len__(self) -> int:
-        return len(self.columns["Vehicle_ID"])
-
-    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
-        return [""], np.zeros(len(self), dtype=np.int64)
-
-    def values(self, column: Column) -> NDArray[np.float64]:
-        return self.columns[column.key].astype(np.float64)
 
 
 def _blocks(name: str) -> Iterator[_Block]:
@@ -357,22 +336,20 @@ def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray
 # -- sorted samples --------------------------------------------------------------------------------
 
 
-def _sorted(read: _Rows) -> pd.DataFrame:
-    """Samples of all collected rows, sorted, without duplicates, with segments and headways."""
+def _sorted(read: _Rows) -> Trajectories:
+    """All collected rows, sorted, without duplicates, with headways."""
     # A block's part is freed as soon as it is copied.
     columns = {
         name: np.concatenate([chunk.pop(name) for chunk in read.chunks])
         for name in list(read.chunks[0])
     }
     columns["recording"], names = _recordings(read, columns.pop("group"))
-    places = Places(columns["recording"], columns["vehicle"], columns["frame"])
-    key = places.keys(columns["recording"], columns["vehicle"], columns["frame"])
+    index = RowIndex(columns["recording"], columns["vehicle"], columns["frame"])
+    key = index.keys(columns["recording"], columns["vehicle"], columns["frame"])
     order, key = _kept_order(read.report, columns, key)
     for name in list(columns):  # one column at a time, to hold only one extra copy
         columns[name] = columns[name][order]
-    read.report.rows_kept = len(order)
-    segment = _segments(read.report, columns, names, key)
-    _fill_headways(read.report, columns, places, key)
+    _fill_headways(read.report, columns, index, key)
     report = read.report
     report.empty_columns = [name for name in CONSEQUENCES if name not in read.filled]
     for name in report.empty_columns:
@@ -380,12 +357,7 @@ def _sorted(read: _Rows) -> pd.DataFrame:
         report.notes.append(Concern(line) if name == "v_Length" else line)
     if read.blank_classes and "v_Class" in read.filled:
         report.notes.append(f"v_Class is blank in {read.blank_classes:,} rows: class unknown")
-    recording = pd.Categorical.from_codes(columns.pop("recording"), categories=pd.Index(names))
-    vehicle, frame = columns.pop("vehicle"), columns.pop("frame")
-    # Division rounds correctly where the product 0.1·frame does not.
-    time = {"time_s": frame / round(1 / FRAME)}
-    identity = {"recording": recording, "vehicle": vehicle, "frame": frame, "segment": segment}
-    return pd.DataFrame(identity | time | columns, copy=False)
+    return assembled(columns, names, report)
 
 
 def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16], list[str]]:
@@ -424,23 +396,8 @@ def _kept_order(
     return order[~repeated], key[~repeated]
 
 
-def _segments(
-    report: ReadReport, columns: Columns, names: list[str], key: NDArray[np.int64]
-) -> NDArray[np.int32]:
-    """Segment of each sorted row; counts recordings, vehicles and segments."""
-    recording, vehicle = columns["recording"], columns["vehicle"]
-    changes = (vehicle[1:] != vehicle[:-1]) | (recording[1:] != recording[:-1])
-    # Keys of one vehicle's consecutive frames differ by one, but so may two vehicles' keys.
-    segment = np.cumsum(np.append(False, changes | (np.diff(key) != 1)), dtype=np.int32)
-    rows = np.bincount(recording, minlength=len(names))
-    report.recordings = {name: int(count) for name, count in zip(names, rows, strict=True)}
-    report.vehicles = 1 + int(changes.sum())
-    report.segments = int(segment[-1]) + 1
-    return segment
-
-
 def _fill_headways(
-    report: ReadReport, columns: Columns, places: Places, key: NDArray[np.int64]
+    report: ReadReport, columns: Columns, index: RowIndex, key: NDArray[np.int64]
 ) -> None:
     """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
     headway, preceding = columns["space_headway_m"], columns["preceding"]
@@ -448,7 +405,7 @@ def _fill_headways(
     given = follows & (headway != 0)
     headway[~given] = np.nan
     rows = np.flatnonzero(follows & ~given)
-    wanted = places.keys(columns["recording"][rows], preceding[rows], columns["frame"][rows])
+    wanted = index.keys(columns["recording"][rows], preceding[rows], columns["frame"][rows])
     leader = find(wanted, key)
     rows, leader = rows[leader >= 0], leader[leader >= 0]
     position = columns["position_m"]

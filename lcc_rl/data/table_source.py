@@ -21,6 +21,7 @@ from lcc_rl.data.trajectories import (
     UNEVEN,
     ReadReport,
     Trajectories,
+    assembled,
     find_leaders,
     is_hole,
     listed,
@@ -234,7 +235,6 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     step = step_of(steps[together], report.source)
     first = ~together | is_hole(np.where(together, steps, 0.0), step)
     _check_way(rows, together, first, names, report)
-    report.vehicles, report.segments = int((~together).sum()), int(first.sum())
     origin = rows.groupby("recording").time.min().reindex(range(len(names))).to_numpy()
     frames = (rows.time - origin[rows.recording]).to_numpy() / FRAME
     if frames.max() > LAST:
@@ -247,11 +247,8 @@ def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) ->
     if abs(step - FRAME) > UNEVEN * FRAME or np.abs(frames - frame).max() > UNEVEN:
         rows, frame, segment = _interpolated(rows, frames, segment, report)
         report.notes.append(resampled(steps[~first], step))
-    report.rows_kept = len(rows)
-    counts = np.bincount(rows.recording, minlength=len(names))
-    report.recordings = dict(zip(names, map(int, counts), strict=True))
     time = origin[rows.recording] + frame / round(1 / FRAME)
-    return Trajectories(_samples(rows, names, time, frame, segment, report), report)
+    return _samples(rows, names, time, frame, segment, report)
 
 
 def _sorted(rows: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
@@ -380,8 +377,8 @@ def _samples(
     frame: Whole,
     segment: Whole,
     report: ReadReport,
-) -> pd.DataFrame:
-    """The table of :class:`lcc_rl.data.trajectories.Trajectories`, with leaders and headways."""
+) -> Trajectories:
+    """The rows as trajectories, with leaders and headways."""
     columns, zero = {str(name): rows[name].to_numpy() for name in rows}, np.zeros(len(rows))
     leader = columns["leader"] if "leader" in columns else _next_ahead(rows, frame)
     given, gap = "gap" in columns, columns.get("gap", zero)
@@ -397,22 +394,23 @@ def _samples(
     report.headways_unknown = int(((leader > 0) & (ahead < 0)).sum())
     speed, last = columns["speed"], np.append(np.diff(segment) != 0, True)
     rate = np.where(last, 0.0, np.diff(speed, append=speed[-1]) / FRAME)
-    return pd.DataFrame(
+    return assembled(
         {
-            "recording": pd.Categorical.from_codes(columns["recording"], pd.Index(names)),
+            "recording": columns["recording"],
             "vehicle": columns["vehicle"],
-            "frame": frame.astype(np.int32),
-            "segment": segment.astype(np.int32),
+            "frame": frame,
+            "segment": segment,
             "time_s": time,
-            "position_m": position.astype(np.float32),
-            "lane": columns.get("lane", zero).astype(np.int16),
-            "length_m": length.astype(np.float32),
-            "vehicle_class": zero.astype(np.int8),
-            "speed_mps": speed.astype(np.float32),
-            "acceleration_mps2": rate.astype(np.float32),
+            "position_m": position,
+            "lane": columns.get("lane", zero),
+            "length_m": length,
+            "speed_mps": speed,
+            "acceleration_mps2": rate,
             "preceding": leader,
-            "space_headway_m": headway.astype(np.float32),
-        }
+            "space_headway_m": headway,
+        },
+        names,
+        report,
     )
 
 

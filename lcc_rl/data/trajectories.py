@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,21 @@ FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
 HOLE = 1.75  # of the usual step; a longer one is a missing sample
 HOLE_S, MANY = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
 UNEVEN = 0.1  # of a step, by which a regular one may be off
+# Columns of trajectories beside the recording.
+TYPES = {
+    "vehicle": np.int64,
+    "frame": np.int32,
+    "segment": np.int32,
+    "time_s": np.float64,
+    "position_m": np.float32,
+    "lane": np.int16,
+    "length_m": np.float32,
+    "vehicle_class": np.int8,
+    "speed_mps": np.float32,
+    "acceleration_mps2": np.float32,
+    "preceding": np.int64,
+    "space_headway_m": np.float32,
+}
 SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
 
 
@@ -116,6 +132,37 @@ class Trajectories:
     report: ReadReport
 
 
+def assembled(
+    columns: dict[str, NDArray], recordings: Sequence[str], report: ReadReport
+) -> Trajectories:
+    """Return sorted rows as trajectories, and count them in the report.
+
+    Args:
+        columns: recording (a number), vehicle, frame and what else there is of ``TYPES``, and
+            further columns; consumed, since a table may hold millions of rows. Columns that are
+            missing are 0, ``segment`` and ``time_s`` follow from the frames.
+        recordings: names of the recordings.
+        report: completed here.
+    """
+    code, vehicle, frame = columns.pop("recording"), columns["vehicle"], columns["frame"]
+    changes = np.append(True, (np.diff(vehicle) != 0) | (np.diff(code) != 0))
+    if "segment" not in columns:
+        columns["segment"] = np.cumsum(changes | (np.diff(frame, prepend=0) != 1)) - 1
+    if "time_s" not in columns:  # division rounds correctly where the product 0.1·frame does not
+        columns["time_s"] = frame / round(1 / FRAME)
+    report.rows_kept, report.vehicles = len(code), int(changes.sum())
+    report.segments = len(starts_of(columns["segment"]))
+    counts = np.bincount(code, minlength=len(recordings))
+    report.recordings = {name: int(count) for name, count in zip(recordings, counts, strict=True)}
+    samples: dict[str, Any] = {
+        "recording": pd.Categorical.from_codes(code, categories=pd.Index(recordings))
+    }
+    for name, kind in TYPES.items():
+        values = columns.pop(name) if name in columns else np.zeros(len(code))
+        samples[name] = values.astype(kind, copy=False)
+    return Trajectories(pd.DataFrame({**samples, **columns}, copy=False), report)
+
+
 def step_of(steps: NDArray[np.float64], source: str) -> float:
     """Return the usual step, checked before samples are interpolated.
 
@@ -149,7 +196,7 @@ def resampled(steps: NDArray[np.float64], step: float) -> str:
     return f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s"
 
 
-class Places:
+class RowIndex:
     """One number per (recording, vehicle, frame), ascending in that order.
 
     Args:
@@ -193,8 +240,8 @@ def find_leaders(
     Returns:
         Row numbers; −1 where there is no vehicle ahead or it has no row in that frame.
     """
-    places = Places(recording, vehicle, frame)
-    return find(places.keys(recording, preceding, frame), places.keys(recording, vehicle, frame))
+    index = RowIndex(recording, vehicle, frame)
+    return find(index.keys(recording, preceding, frame), index.keys(recording, vehicle, frame))
 
 
 def starts_of(values: NDArray) -> NDArray[np.intp]:
