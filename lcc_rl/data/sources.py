@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from glob import escape, glob, has_magic
 from os.path import expanduser
 from pathlib import Path
@@ -12,11 +13,11 @@ from typing import Literal
 import pandas as pd
 
 import lcc_rl.assets
-from lcc_rl.data.agreement import Place
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
+from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
+from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.tables import SI, Column, Names, check_map
 from lcc_rl.data.text import TEXT_TAKES, file_size
 from lcc_rl.data.trajectories import Trajectories
@@ -101,19 +102,8 @@ class EpisodesSource(Settings):
         named = {**{key: OWN[key] for key in self.units}, **self.columns}
         source += read_as(FIELDS, named, self.units)
         units = units_of(FIELDS, OWN, self.units)
-        return _plausible(self.plausible, episodes, source, lines, place=self._place, units=units)
-
-    def _place(self, episodes: pd.DataFrame) -> Place:
-        """Return what describes a sample by its row and column in the file."""
-        names = {OWN[key]: name for key, name in self.columns.items()}
-
-        def place(number: int, column: str) -> str:
-            row = episodes.iloc[number]
-            label = row["label"] and f"episode {row['label']}, "
-            where = f"{label}recording {row['recording']}, data row {row['row'] + 1}"
-            return f"{where}, column {names.get(column, column)!r}"
-
-        return place
+        place = partial(places, files=files, columns=self.columns)
+        return _plausible(self.plausible, episodes, source, lines, place=place, units=units)
 
 
 def episodes_of(
@@ -121,7 +111,7 @@ def episodes_of(
     criteria: Criteria | None,
     plausible: Plausible | None,
     remedy: str = "",
-    place: Callable[[pd.DataFrame], Place] = pair_place,
+    place: Places = places,
 ) -> LoadedEpisodes:
     """Extract episodes; positions that no file gives are derived from speeds and gaps.
 
@@ -174,11 +164,11 @@ def _plausible(
     source: str,
     lines: list[str],
     remedy: str = "",
-    place: Callable[[pd.DataFrame], Place] = pair_place,
+    place: Places = places,
     units: Mapping[str, str] | None = None,
 ) -> LoadedEpisodes:
     thresholds = limits or Plausible()
-    kept, said = thresholds.select(episodes, source, place(episodes), remedy=remedy, units=units)
+    kept, said = thresholds.select(episodes, source, place, remedy=remedy, units=units)
     return LoadedEpisodes(kept, [*lines, *said])
 
 

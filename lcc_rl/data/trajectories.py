@@ -10,13 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.errors import DataError
-
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
-HOLE = 1.75  # of the usual step; a longer one is a missing sample
-HOLE_S, MANY = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
-UNEVEN = 0.1  # of a step, by which a regular one may be off
 # Columns of trajectories beside the recording.
 TYPES = {
     "vehicle": np.int64,
@@ -32,7 +27,6 @@ TYPES = {
     "preceding": np.int64,
     "space_headway_m": np.float32,
 }
-SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
 
 
 @dataclass
@@ -87,12 +81,16 @@ class ReadReport:
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 
+    def left_out(self) -> list[str]:
+        """A line for each reason to drop rows."""
+        return [f"dropped {count:,} rows: {reason}" for reason, count in self.dropped.items()]
+
     def lines(self) -> list[str]:
         """The report as plain lines."""
         recordings = [f"{name} ({rows:,} rows)" for name, rows in self.recordings.items()]
         return [
             f"read {self.rows_read:,} rows from {listed(self.files)}; kept {self.rows_kept:,}",
-            *(f"dropped {count:,} rows: {reason}" for reason, count in self.dropped.items()),
+            *self.left_out(),
             f"{len(self.recordings)} recording(s): {listed(recordings)}",
             f"{self.vehicles:,} vehicles; missing frames cut their trajectories "
             f"{self.segments - self.vehicles:,} times, into {self.segments:,} segments",
@@ -163,39 +161,6 @@ def assembled(
     return Trajectories(pd.DataFrame({**samples, **columns}, copy=False), report)
 
 
-def step_of(steps: NDArray[np.float64], source: str) -> float:
-    """Return the usual step, checked before samples are interpolated.
-
-    Args:
-        steps: time between consecutive samples of a vehicle [s].
-        source: the file or files, for messages.
-
-    Raises:
-        DataError: if it is too short or too long for seconds.
-    """
-    step = float(np.median(steps))
-    if not SHORTEST <= step < LONGEST:
-        unit = "s" if step < SHORTEST else "ms"
-        raise DataError(
-            f"{source}: samples of a vehicle are {step:g} s apart; expected {SHORTEST:g} to "
-            f"{LONGEST:g} s; is the time in {unit} (data.units.time={unit})?"
-        )
-    return step
-
-
-def is_hole(steps: NDArray[np.float64], usual: NDArray | float) -> NDArray[np.bool_]:
-    """Return which steps [s] are holes, which divide a record; irregular sampling has few."""
-    long = steps > HOLE * usual
-    return long & (steps > HOLE_S) if long.mean() > MANY else long
-
-
-def resampled(steps: NDArray[np.float64], step: float) -> str:
-    """Return the line on samples, usually ``step`` apart, that are interpolated."""
-    odd = int((np.abs(steps - step) > UNEVEN * step).sum())
-    irregular = f", {odd:,} of them irregular," * bool(odd)
-    return f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s"
-
-
 class RowIndex:
     """One number per (recording, vehicle, frame), ascending in that order.
 
@@ -247,44 +212,3 @@ def find_leaders(
 def starts_of(values: NDArray) -> NDArray[np.intp]:
     """First row of each stretch of equal values."""
     return np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
-
-
-def divided(
-    table: pd.DataFrame, wrong: NDArray[np.bool_], begins: NDArray[np.bool_], shortest: float
-) -> pd.DataFrame:
-    """Leave rows out of records, which are divided there.
-
-    Args:
-        table: rows of a record (whole numbers in the column ``episode``) lie together, in order of
-            ``time_s``.
-        wrong: the rows to leave out.
-        begins: rows before which a record is divided, too.
-        shortest: parts of a divided record that are shorter than this go as well [s].
-
-    Returns:
-        The other rows. The first part of a record keeps its number.
-    """
-    episode, time = table["episode"].to_numpy(), table["time_s"].to_numpy(np.float64)
-    first = np.zeros(len(table), dtype=bool)
-    first[starts_of(episode)] = True
-    touched = np.isin(episode, episode[wrong | (begins & ~first)])
-    if not touched.any():
-        return table
-    rows = np.flatnonzero(~wrong)
-    if not len(rows):
-        return table.iloc[:0]
-    starts, lengths = stretches(np.cumsum(first | begins | wrong)[rows])
-    duration = time[rows[starts + lengths - 1]] - time[rows[starts]]
-    keep = ~touched[rows[starts]] | (duration > shortest - 1e-6)
-    numbers = episode[rows[starts]][keep].astype(np.int64)
-    more = pd.Series(numbers).duplicated().to_numpy()
-    numbers[more] = episode.max() + 1 + np.arange(more.sum())
-    kept = table.iloc[rows[np.repeat(keep, lengths)]].reset_index(drop=True)
-    kept["episode"] = np.repeat(numbers, lengths[keep]).astype(episode.dtype)
-    return kept
-
-
-def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First row and number of rows of each stretch of equal values."""
-    starts = starts_of(values)
-    return starts, np.diff(np.append(starts, len(values)))

@@ -179,7 +179,7 @@ def test_the_first_car_of_native_openacc_files_leads(tmp_path) -> None:
     found = DriveLeaders(path=f"{tmp_path}/file*.csv").load(0.1, 100)
     every = (*found.training.names, *found.windows.names)
     assert {name.split("+")[0] for name in every} == {f"file{number}" for number in range(12)}
-    assert any("left out 1 rows with a blank Speed1" in line for line in found.report)
+    assert any("left out 1 rows with a blank cell" in line for line in found.report)
 
 
 # -- recorded traffic and mixtures -----------------------------------------------------------------
