@@ -186,12 +186,15 @@ def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str 
 
 def _check_pairs(table: pd.DataFrame, file: TableFile) -> None:
     """Check that each episode is of one pair."""
+    episode, rows = table["episode"].to_numpy(), np.arange(len(table))
+    first = np.zeros(int(episode.max()) + 1, dtype=np.int64)
+    first[episode[::-1]] = rows[::-1]
     for name in ("recording", "follower_id", "leader_id"):
-        wrong = table[name] != table.groupby("episode")[name].transform("first")
+        values = table[name].to_numpy()
+        wrong = values != values[first[episode]]
         if wrong.any():
-            raise file.fault(
-                int(table["row"][wrong].min()), name, "changes within an episode; expected one pair"
-            )
+            row = int(table["row"].to_numpy()[wrong].min())
+            raise file.fault(row, name, "changes within an episode; expected one pair")
 
 
 def derive_positions(episodes: pd.DataFrame) -> None:

@@ -157,6 +157,8 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
             f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST:g} to "
             f"{LONGEST:g} s; is the time in {unit} ({node}.units.time={unit})?"
         )
+    if not ((steps - step).abs() > UNEVEN * step).any():
+        return np.full(len(samples), step)
     own = steps.groupby(samples["episode"]).transform("median")
     many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY)
     return own.where(many, step).to_numpy()

@@ -2,27 +2,25 @@
 
 Three layouts are read, plain or gzipped, distinguished by their first line: the native headerless
 18 columns separated by white space, the 18-column CSV with header (19 with Location), and the
-25-column export of the public portal. Files are streamed in blocks and only the needed columns
-are kept, in compact types, so that the whole portal export fits in a few gigabytes.
+25-column export of the public portal. Files are read in blocks and only the needed columns are
+kept, in compact types, so that the whole portal export fits in a few gigabytes.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
-from lcc_rl.data.tables import LARGEST_ID, Column, checked, lacking
-from lcc_rl.data.text import cells_of, check_text, parse_text, reading, single_spaces, unended
+from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
 from lcc_rl.data.trajectories import (
     FOOT,
     ReadReport,
@@ -76,6 +74,7 @@ FIELDS: dict[str, tuple[type[np.number], Column]] = {
 }
 NAMES = {own: column.key for own, (_, column) in FIELDS.items()}
 KNOWN = [*NAMES.values(), "Location"]
+SPELLED = {name.replace("_", "").lower(): name for name in KNOWN} | ALIASES
 # What follows from a column that is all zero or blank.
 CONSEQUENCES = {
     "Global_Time": "recordings are told apart by file",
@@ -92,7 +91,6 @@ CAR = (2.0, 12.0)  # m; between them lies the median length of vehicles on any r
 JAM = 3.0  # m; front to front, no two cars are closer in a queue
 EXACT = "exact duplicate (vehicle, frame)"
 CONFLICTING = "conflicting duplicate (vehicle, frame)"
-BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24
 Columns = dict[str, NDArray]
 
 
@@ -120,17 +118,23 @@ def read_ngsim(
         units: what the files are in: ``feet``, as published, or ``metres``.
 
     Raises:
-        DataError: naming the file, the line and the column at fault, or if the vehicles are too
+        DataError: naming the file, the row and the column at fault, or if the vehicles are too
             short or long for these units.
     """
     paths = [path] if isinstance(path, (str, Path)) else path
     rows = _Rows(ReadReport(files=[str(name) for name in paths]), METRES[units])
     wanted = None if location is None else location.strip().lower()
     for name in rows.report.files:
-        for block in _blocks(name):
-            last = block.first_line + block.lines.count(b"\n")
-            rows.report.notes += unended(block.lines, f"{name}: line {last}")
-            rows.add(block, wanted)
+        file = TableFile(name, _official, OFFICIAL)
+        missing = [x.key for _, x in FIELDS.values() if x.required and x.key not in file.header]
+        if missing:
+            raise lacking(name, missing, file.header, "")
+        before = rows.report.rows_read
+        for block in file.blocks([known for known in KNOWN if known in file.header]):
+            rows.add(name, block, wanted)
+        if rows.report.rows_read == before:
+            raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
+        rows.report.notes += file.notes
     if not rows.chunks:
         found = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())
         raise DataError(
@@ -142,129 +146,13 @@ def read_ngsim(
     return trajectories
 
 
-# -- blocks of rows --------------------------------------------------------------------------------
-
-
-@dataclass
-class _Layout:
-    """Number of columns, the place of every known one, and how columns are separated."""
-
-    width: int
-    places: dict[str, int]
-    header: bool
-    separator: str
-
-
-class _Block:
-    """Consecutive rows of a file as text columns, converted and checked on access."""
-
-    def __init__(self, path: str, lines: bytes, first_line: int, layout: _Layout) -> None:
-        self.path, self.lines, self.first_line = path, lines, first_line
-        check_text(lines, f"{path}: a line from {first_line} on")
-        names = {str(place): name for name, place in layout.places.items()}
-        table = parse_text(lines, layout.width, layout.separator, [*names], path, first_line)
-        self.table = table.rename_columns([names[place] for place in table.column_names])
-        self.row = np.arange(len(self))
-
-    def __len__(self) -> int:
-        return int(self.table.num_rows)
-
-    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
-        """Names in the Location column (lower case, '' where blank) and each row's index of it."""
-        if "Location" not in self.table.column_names:
-            return [""], np.zeros(len(self), dtype=np.int64)
-        codes, names = pd.factorize(self.table["Location"].fill_null("").to_numpy())
-        return [str(name).strip().lower() for name in names], codes
-
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep only the rows where ``mask`` holds; messages still name lines of the file."""
-        self.row, self.table = self.row[mask], self.table.filter(pa.array(mask))
-
-    def values(self, column: Column) -> NDArray[np.float64]:
-        """Read a column of numbers; NaN where a cell is blank, or the file has no such column."""
-        if column.key not in self.table.column_names:
-            return np.full(len(self), np.nan)
-
-        def fault(row: int, words: str) -> DataError:
-            lines = enumerate(self.lines.split(b"\n"), self.first_line)  # blank ones hold no row
-            line = [number for number, text in lines if text.strip(b"\r")][self.row[row]]
-            return DataError(f"{self.path}: line {line}, column {column.key!r} {words}")
-
-        return checked(self.table[column.key], column, fault)
-
-
-def _blocks(name: str) -> Iterator[_Block]:
-    """Read a file in blocks of rows, in the order of the file."""
-    layout: _Layout | None = None
-    line, empty = 1, True
-    for raw in _line_chunks(name):
-        lines = raw
-        if layout is None:
-            bare = raw.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
-            if not bare:
-                line += raw.count(b"\n")
-                continue
-            line += raw.count(b"\n") - bare.count(b"\n")
-            layout, lines = _detect(name, bare)
-            line += layout.header
-        if layout.separator == " ":
-            lines = single_spaces(lines)
-        if lines.strip(b"\r\n"):
-            empty = False
-            yield _Block(name, lines, line, layout)
-        line += lines.count(b"\n")
-    if empty:
-        raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
-
-
-def _line_chunks(name: str) -> Iterator[bytes]:
-    """Whole lines of the decompressed file, some megabytes at a time."""
-    rest = b""
-    with reading(name) as file:
-        while data := file.read(BLOCK_BYTES):
-            cut = data.rfind(b"\n") + 1
-            if cut:
-                yield rest + data[:cut]
-            rest = data[cut:] if cut else rest + data
-            if len(rest) > LONGEST_LINE:
-                raise DataError(f"{name}: is not a text table; expected lines of 18 columns")
-    if rest:
-        yield rest
-
-
-def _detect(name: str, lines: bytes) -> tuple[_Layout, bytes]:
-    """Detect the layout from the first line; returns it and the lines that hold rows."""
-    first, _, rest = lines.partition(b"\n")
-    check_text(first, f"{name}:")
-    separator = "," if b"," in first else " "
-    cells = cells_of(single_spaces(first) if separator == " " else first, separator)
-    if cells and re.match(r"\s*-?[0-9.,]+([eE][+-]?[0-9]+)?\s*$", cells[0]):
-        if len(cells) != len(OFFICIAL):
-            raise DataError(
-                f"{name}: the first line has {len(cells)} columns and no header; expected the "
-                f"{len(OFFICIAL)} columns of the native layout"
-            )
-        places = {column: place for place, column in enumerate(OFFICIAL) if column in KNOWN}
-        return _Layout(len(OFFICIAL), places, header=False, separator=separator), lines
-    known = {_folded(column): column for column in KNOWN} | ALIASES
-    places = {}
-    for place, cell in enumerate(cells):
-        column = known.get(_folded(cell))
-        if column in places:
-            raise DataError(f"{name}: the header has column {column!r} twice; expected it once")
-        if column is not None:
-            places[column] = place
-    missing = [c.key for _, c in FIELDS.values() if c.required and c.key not in places]
-    if missing:
-        raise lacking(name, missing, cells, "")
-    return _Layout(len(cells), places, header=True, separator=separator), rest
-
-
-def _folded(cell: str) -> str:
-    return re.sub(r"[\s_]+", "", cell).lower()
-
-
 # -- compact columns -------------------------------------------------------------------------------
+
+
+def _official(name: str) -> str:
+    """The official spelling of a column's name."""
+    folded = re.sub(r"[\s_]+", "", name).lower()
+    return SPELLED.get(folded, name.strip())
 
 
 @dataclass
@@ -291,10 +179,13 @@ class _Rows:
     filled: set[str] = field(default_factory=set)
     blank_classes: int = 0
 
-    def add(self, block: _Block, wanted: str | None) -> None:
+    def add(self, file: str, block: Block, wanted: str | None) -> None:
         """Add the rows of a block; with ``wanted``, those of that location only."""
         self.report.rows_read += len(block)
-        names, places = block.locations()
+        names, places = [""], np.zeros(len(block), dtype=np.int64)
+        if "Location" in block.cells.column_names:
+            places, found = pd.factorize(block.cells["Location"].fill_null("").to_numpy())
+            names = [str(name).strip().lower() for name in found]
         for name, rows in zip(names, np.bincount(places, minlength=len(names)), strict=True):
             self.locations[name] += int(rows)
         if wanted is not None:
@@ -306,7 +197,8 @@ class _Rows:
             return
         columns: Columns = {}
         for own, (kind, column) in FIELDS.items():
-            values = block.values(column)
+            given = column.key in block.cells.column_names
+            values = block.values(column, column.key) if given else np.full(len(block), np.nan)
             if own == "vehicle_class":
                 self.blank_classes += int((~(values >= 0)).sum())
                 values = values.clip(min=0.0)
@@ -320,7 +212,7 @@ class _Rows:
         codes, pairs = pd.factorize(start * len(names) + places)
         groups = []
         for pair, count in zip(pairs.tolist(), np.bincount(codes).tolist(), strict=True):
-            group = Group(block.path, names[pair % len(names)], pair // len(names))
+            group = Group(file, names[pair % len(names)], pair // len(names))
             self.rows_of[group] += count
             groups.append(self.groups.setdefault(group, len(self.groups)))
         self.chunks.append({"group": np.array(groups, dtype=np.int32)[codes]} | columns)

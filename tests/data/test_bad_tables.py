@@ -20,7 +20,7 @@ DRIVES = "drive,time_s,speed_mps\na,0,1\n"
 
 
 def ngsim(**change: object) -> str:
-    """A valid file but for one row: line 4."""
+    """A valid file but for one row, the third."""
     return csv_text([cells(7, 1), cells(7, 2), cells(7, 3, **change), cells(7, 4)])
 
 
@@ -48,12 +48,16 @@ COMMAS = TABLE.to_csv(index=False, sep=";", decimal=",")
 # Reader, content of the file, what is said of it.
 BAD: list[tuple[str, str | bytes, str]] = [
     # Files that are no tables.
-    ("ngsim", "", "is empty"),
+    ("ngsim", "", "not a readable table: empty"),
     ("ngsim", OFFICIAL + "\n", "has no rows"),
     ("ngsim", "<!DOCTYPE html>\n<html>Not found</html>\n", "lacks the column Vehicle_ID"),
     ("ngsim", bytes(range(256)) * 40, "is not UTF-8 text"),
-    ("ngsim", GOOD.encode("utf-16"), "but in UTF-16; save it in UTF-8"),
-    ("ngsim", GOOD.encode() + b"7,1,\xe9" + b",1" * 15 + b"\n", "is not UTF-8 text"),
+    (
+        "ngsim",
+        GOOD.encode("utf-16-le").join([b"\xff\xfe", b"\0\xdc\n\0"]),
+        "but in UTF-16; save it in UTF-8",
+    ),
+    ("ngsim", GOOD.encode() + b"7,\xe9,1" + b",1" * 15 + b"\n", "row 41, column 'Frame_ID' holds"),
     ("ngsim", gzip.compress(GOOD.encode())[:-20], "damaged or cut off"),
     ("table", gzip.compress(csv(TABLE).encode())[:2000], "damaged or cut off"),
     ("table", b"id,t,v,ahead,gap,x\n1,0,\xff,0,1,1\n", "column 'v' holds 'ÿ'"),
@@ -75,13 +79,13 @@ BAD: list[tuple[str, str | bytes, str]] = [
     (
         "ngsim",
         GOOD + "7,21,20,1113",
-        "line 42, the last, has 4 columns; expected 18; is the file cut",
+        "data row 41, the last, has 4 columns; expected 18; is the file cut",
     ),
-    ("ngsim", native_text(pair()) + " 7 21 5\n", "line 41, the last, has 3 columns"),
+    ("ngsim", native_text(pair()) + " 7 21 5\n", "data row 41, the last, has 3 columns"),
     ("ngsim", native_text([row[:17] for row in pair()]), "has 17 columns and no header"),
     ("ngsim", GOOD.replace("v_Vel", "v_Velo"), "lacks the column v_Vel; .*'v_Velo'"),
     ("ngsim", GOOD.replace("v_Width", "V LENGTH"), "has column 'v_Length' twice"),
-    ("ngsim", ngsim(Local_X='"18.0'), "line 4 .*quote|columns; expected 18"),
+    ("ngsim", ngsim(Local_X='"18.0'), "quote|columns; expected 18"),
     ("i-80", portal_text(pair(), "us-101"), r"'i-80'; .*found are us-101 \(40 rows\)"),
     ("table", csv(TABLE.rename(columns={"v": "V"})), r"lacks the column v; .*is it 'V'.*columns="),
     ("table", csv(pd.concat([TABLE, TABLE["v"]], axis=1)), "has column 'v' twice"),
@@ -94,16 +98,24 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("record", "time,speed\n0,1\n1,1\n", "lacks the column time_s, speed_mps; .*leader.columns"),
     ("record", RECORD, "holds 0 samples"),
     # Cells that are blank, words, not finite or out of range.
-    ("ngsim", ngsim(v_Vel="abc"), "line 4, column 'v_Vel' holds 'abc'; expected a number"),
-    ("ngsim", ngsim(Local_Y="NaN"), "line 4, column 'Local_Y' holds nothing; expected a number"),
-    ("ngsim", ngsim(v_Acc="inf"), "line 4, column 'v_Acc' holds 'inf'"),
-    ("ngsim", ngsim(Space_Headway="9" * 40), "line 4, column 'Space_Headway' holds '9999"),
-    ("ngsim", ngsim(Vehicle_ID=""), "line 4, column 'Vehicle_ID' holds nothing; expected a whole"),
+    ("ngsim", ngsim(v_Vel="abc"), "data row 3, column 'v_Vel' holds 'abc'; expected a number"),
+    (
+        "ngsim",
+        ngsim(Local_Y="NaN"),
+        "row 3, column 'Local_Y' holds nothing; expected a number",
+    ),
+    ("ngsim", ngsim(v_Acc="inf"), "data row 3, column 'v_Acc' holds 'inf'"),
+    ("ngsim", ngsim(Space_Headway="9" * 40), "data row 3, column 'Space_Headway' holds '9999"),
+    (
+        "ngsim",
+        ngsim(Vehicle_ID=""),
+        "row 3, column 'Vehicle_ID' holds nothing; expected a whole",
+    ),
     ("ngsim", ngsim(Vehicle_ID="7.5"), "column 'Vehicle_ID' holds '7.5'; expected a whole number"),
-    ("ngsim", ngsim(Vehicle_ID='"1,15"'), "line 4, column 'Vehicle_ID' holds '1,15'"),
-    ("ngsim", ngsim(Frame_ID="-1"), "line 4, column 'Frame_ID' holds '-1'"),
-    ("ngsim", ngsim(Lane_ID="70000"), "line 4, column 'Lane_ID' holds '70000'"),
-    ("ngsim", ngsim(v_Vel="x").replace("\n", "\n\n"), "line 7, column 'v_Vel' holds 'x'"),
+    ("ngsim", ngsim(Vehicle_ID='"1,15"'), "data row 3, column 'Vehicle_ID' holds '1,15'"),
+    ("ngsim", ngsim(Frame_ID="-1"), "data row 3, column 'Frame_ID' holds '-1'"),
+    ("ngsim", ngsim(Lane_ID="70000"), "data row 3, column 'Lane_ID' holds '70000'"),
+    ("ngsim", ngsim(v_Vel="x").replace("\n", "\n\n"), "data row 3, column 'v_Vel' holds 'x'"),
     ("table", table(v="fast"), "data row 501, column 'v' holds 'fast'; expected a number"),
     ("table", COMMAS.replace(";11,", ";1l,", 1), "column 'v' holds '1l,"),
     ("table", csv(TABLE.assign(v="")), "data row 1, column 'v' is blank"),
@@ -183,8 +195,8 @@ def test_of_rows_of_a_moment_the_first_is_kept_and_records_are_sorted(
         ("table", csv(TABLE).replace("\n", "\r\n"), "data row 1200"),
         ("episodes", csv(pairs()), "data row 600"),
         ("openacc", openacc_text(), "data row 400"),
-        ("source", csv_text(pair(range(200))), "line 401"),
-        ("source", native_text(pair(range(200))).rstrip() + "0\n", "line 400"),
+        ("source", csv_text(pair(range(200))), "data row 400"),
+        ("source", native_text(pair(range(200))).rstrip() + "0\n", "data row 400"),
     ],
 )
 def test_a_file_that_ends_within_its_last_cell_is_read_with_a_warning(

@@ -18,7 +18,7 @@ from ngsim_text import (
     portal_text,
 )
 
-from lcc_rl.data import ngsim
+from lcc_rl.data import text
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.trajectories import Trajectories
 
@@ -88,10 +88,10 @@ def test_every_layout_gives_the_same_samples(tmp_path: Path, layout: str) -> Non
 def test_files_larger_than_a_block_lose_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ngsim, "BLOCK_BYTES", 10_000)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 10_000)
     rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
     for content in (csv_text(rows), native_text(rows)):
-        assert len(content) > 5 * ngsim.BLOCK_BYTES
+        assert len(content) > 5 * text.BLOCK_BYTES
         read_back = read(tmp_path, content)
         assert read_back.report.rows_kept == 840
         assert read_back.report.segments == read_back.report.vehicles == 12
