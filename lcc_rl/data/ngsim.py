@@ -27,7 +27,6 @@ from lcc_rl.data.trajectories import (
     RowIndex,
     Trajectories,
     assembled,
-    find,
 )
 from lcc_rl.errors import Concern, DataError
 
@@ -229,7 +228,7 @@ def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray
 
 
 def _sorted(read: _Rows) -> Trajectories:
-    """All collected rows, sorted, without duplicates, with headways."""
+    """All collected rows, sorted, without duplicates."""
     # A block's part is freed as soon as it is copied.
     columns = {
         name: np.concatenate([chunk.pop(name) for chunk in read.chunks])
@@ -238,10 +237,9 @@ def _sorted(read: _Rows) -> Trajectories:
     columns["recording"], names = _recordings(read, columns.pop("group"))
     index = RowIndex(columns["recording"], columns["vehicle"], columns["frame"])
     key = index.keys(columns["recording"], columns["vehicle"], columns["frame"])
-    order, key = _kept_order(read.report, columns, key)
+    order = _kept_order(read.report, columns, key)
     for name in list(columns):  # one column at a time, to hold only one extra copy
         columns[name] = columns[name][order]
-    _fill_headways(read.report, columns, index, key)
     report = read.report
     report.empty_columns = [name for name in CONSEQUENCES if name not in read.filled]
     for name in report.empty_columns:
@@ -266,15 +264,13 @@ def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16
     return np.array([place[named[key]] for key in read.groups], dtype=np.int16)[group], names
 
 
-def _kept_order(
-    report: ReadReport, columns: Columns, key: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Rows to keep in sorted order, and their keys; duplicates are counted by kind."""
+def _kept_order(report: ReadReport, columns: Columns, key: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Rows to keep in sorted order; duplicates are counted by kind."""
     order = np.argsort(key, kind="stable")  # stable: the first in the files stays
     key = key[order]
     repeated = np.append(False, key[1:] == key[:-1])
     if not repeated.any():
-        return order, key
+        return order
     first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(key))))
     again, kept = order[repeated], order[first[repeated]]
     same = np.logical_and.reduce([values[again] == values[kept] for values in columns.values()])
@@ -285,25 +281,7 @@ def _kept_order(
             "rows that disagree on the same vehicle and frame: the first in the files was kept; "
             "the files may mix recordings that Global_Time cannot tell apart"
         )
-    return order[~repeated], key[~repeated]
-
-
-def _fill_headways(
-    report: ReadReport, columns: Columns, index: RowIndex, key: NDArray[np.int64]
-) -> None:
-    """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
-    headway, preceding = columns["space_headway_m"], columns["preceding"]
-    follows = preceding > 0
-    given = follows & (headway != 0)
-    headway[~given] = np.nan
-    rows = np.flatnonzero(follows & ~given)
-    wanted = index.keys(columns["recording"][rows], preceding[rows], columns["frame"][rows])
-    leader = find(wanted, key)
-    rows, leader = rows[leader >= 0], leader[leader >= 0]
-    position = columns["position_m"]
-    headway[rows] = position[leader] - position[rows]
-    report.headways_given, report.headways_derived = int(given.sum()), len(rows)
-    report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
+    return order[~repeated]
 
 
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:

@@ -247,14 +247,11 @@ def _samples(rows: pd.DataFrame, frame: Whole, report: ReadReport) -> Trajectori
     given, gap = "gap" in columns, columns.get("gap", zero)
     if given:  # a vehicle without a gap follows nobody
         leader = np.where(np.isnan(gap), 0, leader)
-    ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
     length = np.nan_to_num(columns.get("length", zero))
-    position = columns.get("position", zero)
-    to_leader = gap + length[ahead] if given else position[ahead] - position
-    headway = np.where(ahead >= 0, to_leader, np.nan)
-    seen = int((ahead >= 0).sum())
-    report.headways_given, report.headways_derived = (seen, 0) if given else (0, seen)
-    report.headways_unknown = int(((leader > 0) & (ahead < 0)).sum())
+    headway = {}
+    if given:
+        ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
+        headway["space_headway_m"] = np.where(ahead >= 0, gap + length[ahead], np.nan)
     speed, segment = columns["speed"], rows["episode"].to_numpy()
     last = np.append(np.diff(segment) != 0, True)
     rate = np.where(last, 0.0, np.diff(speed, append=speed[-1]) / FRAME)
@@ -264,13 +261,13 @@ def _samples(rows: pd.DataFrame, frame: Whole, report: ReadReport) -> Trajectori
             **{name: columns[name] for name in same},
             "frame": frame,
             "segment": segment,
-            "position_m": position,
+            "position_m": columns.get("position", zero),
             "lane": columns.get("lane", zero),
             "length_m": length,
             "speed_mps": speed,
             "acceleration_mps2": rate,
             "preceding": leader,
-            "space_headway_m": headway,
+            **headway,
         },
         [*recording.categories],
         report,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
+KEYS = ("recording", "vehicle", "frame", "preceding")
 # Columns of trajectories beside the recording.
 TYPES = {
     "vehicle": np.int64,
@@ -138,10 +139,12 @@ def assembled(
     Args:
         columns: recording (a number), vehicle, frame and what else there is of ``TYPES``, and
             further columns; consumed, since a table may hold millions of rows. Columns that are
-            missing are 0, ``segment`` and ``time_s`` follow from the frames.
+            missing are 0, ``segment`` and ``time_s`` follow from the frames, and space headways
+            that are blank or 0 from the positions in the frame.
         recordings: names of the recordings.
         report: completed here.
     """
+    _fill_headways(columns, report)
     code, vehicle, frame = columns.pop("recording"), columns["vehicle"], columns["frame"]
     changes = np.append(True, (np.diff(vehicle) != 0) | (np.diff(code) != 0))
     if "segment" not in columns:
@@ -159,6 +162,25 @@ def assembled(
         values = columns.pop(name) if name in columns else np.zeros(len(code))
         samples[name] = values.astype(kind, copy=False)
     return Trajectories(pd.DataFrame({**samples, **columns}, copy=False), report)
+
+
+def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
+    """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
+    code, vehicle, frame, preceding = (columns[name] for name in KEYS)
+    headway = columns.setdefault("space_headway_m", np.zeros(len(code)))
+    follows = preceding > 0
+    given = follows & (headway != 0) & ~np.isnan(headway)
+    headway[~given] = np.nan
+    rows = np.flatnonzero(follows & ~given)
+    if len(rows):
+        index, position = RowIndex(code, vehicle, frame), columns["position_m"]
+        leader = find(
+            index.keys(code[rows], preceding[rows], frame[rows]), index.keys(code, vehicle, frame)
+        )
+        rows, leader = rows[leader >= 0], leader[leader >= 0]
+        headway[rows] = position[leader] - position[rows]
+    report.headways_given, report.headways_derived = int(given.sum()), len(rows)
+    report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
 
 
 class RowIndex:

@@ -21,6 +21,7 @@ from lcc_rl.data.sources import LoadedEpisodes, episodes_of
 from lcc_rl.data.trajectories import (
     FOOT,
     FRAME,
+    KEYS,
     ReadReport,
     Trajectories,
     assembled,
@@ -106,17 +107,13 @@ def as_recorded(samples: pd.DataFrame) -> Trajectories:
     """
     columns = {str(name): samples[name].to_numpy() for name in samples if name != "time_s"}
     columns["recording"], names = pd.factorize(columns["recording"])
-    keys = ("recording", "vehicle", "frame", "preceding")
-    ahead = find_leaders(*(columns[key] for key in keys))
+    ahead = find_leaders(*(columns[key] for key in KEYS))
     position = columns["position_m"]
     columns["space_headway_m"] = np.where(ahead >= 0, position[ahead] - position, np.nan)
     for name in columns:
         if name.endswith(("_m", "_mps", "_mps2")):
             columns[name] = (np.round(columns[name] / FOOT, 3) + 0.0) * FOOT
-    seen, follows = int((ahead >= 0).sum()), int((columns["preceding"] > 0).sum())
-    report = ReadReport(["the stream"], rows_read=len(samples), headways_given=seen)
-    report.headways_unknown = follows - seen
-    return assembled(columns, list(names), report)
+    return assembled(columns, list(names), ReadReport(["the stream"], rows_read=len(samples)))
 
 
 def recording_name(index: int) -> str:
