@@ -13,7 +13,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.data.grid import Places, continuous, on_grid, places, stretches
-from lcc_rl.data.plausible import without_blank
 from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import ReadReport
@@ -70,24 +69,6 @@ MOTION = [name for name in COLUMNS if name.endswith(("_position_m", "_speed_mps"
 ONE_ROW = "is of one row; expected at least two"
 
 
-def read_episodes(path: str | Path) -> pd.DataFrame:
-    """Read a table of pairs from a parquet or CSV file, see :func:`load_episodes`.
-
-    Args:
-        path: file with the columns of ``SCHEMA``, of which those that are not required in
-            ``FIELDS`` may be missing; ``event`` and ``period`` are taken for ``episode`` and
-            ``recording``. Further columns are left out.
-
-    Returns:
-        Columns ``SCHEMA`` in SI: episode, recording, follower_id, leader_id, time_s, follower and
-        leader position (front bumper), speed, leader length and gap (bumper to bumper).
-
-    Raises:
-        DataError: if the file cannot be read or its content is not a valid table.
-    """
-    return load_episodes([str(path)])[0][[*COLUMNS]]
-
-
 def load_episodes(
     paths: Sequence[str],
     columns: Mapping[str, str | None] | None = None,
@@ -96,7 +77,9 @@ def load_episodes(
     """Read tables of pairs: a row per pair and moment, at any rate and with holes.
 
     Args:
-        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`.
+        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`. Columns that are
+            not required in ``FIELDS`` may be missing; ``event`` and ``period`` are taken for
+            ``episode`` and ``recording``.
         columns: what they call the columns, by the keys of ``FIELDS``; others as in ``SCHEMA``.
         units: their units by key; SI for those that are not named.
 
@@ -131,10 +114,10 @@ def _table(
     """Read one file, the ``number``-th."""
     file = TableFile(path)
     names = _names(file, columns)
-    read = file.read(FIELDS, names, units, "data.columns")
+    read = file.read(FIELDS, names, units, "data.columns", MEASURED)
     if not len(read["time"]):
         raise DataError(f"{path}: has no episodes; expected at least one row")
-    read, kept = without_blank(file, read, MEASURED)
+    kept = read.pop("row")
     rows = len(kept)
     notes = list(file.notes)
     labels = read.get("episode", np.zeros(rows, dtype=str))

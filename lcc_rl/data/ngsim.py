@@ -23,6 +23,7 @@ from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
 from lcc_rl.data.trajectories import (
     FOOT,
+    TYPES,
     ReadReport,
     RowIndex,
     Trajectories,
@@ -54,24 +55,21 @@ def _column(name: str, least: float = -1e9, most: float = 1e9, **more: Any) -> C
     return Column(name, least=least, most=most, **more)
 
 
-# Columns of the files by what they are in the samples, with their types.
-FIELDS: dict[str, tuple[type[np.number], Column]] = {
-    "vehicle": (np.int64, _column("Vehicle_ID", 1, LARGEST_ID, whole=True)),
-    "frame": (np.int32, _column("Frame_ID", 0, 2**31 - 1, whole=True)),
-    "position_m": (np.float32, _column("Local_Y")),
-    "lane": (np.int16, _column("Lane_ID", -INT16, INT16, whole=True)),
-    "length_m": (np.float32, _column("v_Length")),
-    "vehicle_class": (np.int8, _column("v_Class", -1, 127, whole=True, blank=True)),
-    "speed_mps": (np.float32, _column("v_Vel")),
-    "acceleration_mps2": (np.float32, _column("v_Acc")),
-    "preceding": (
-        np.int64,
-        _column("Preceding", -LARGEST_ID, LARGEST_ID, whole=True, blank=True),
-    ),
-    "space_headway_m": (np.float32, _column("Space_Headway", blank=True, required=False)),
-    "clock": (np.float64, _column("Global_Time", -1e300, 1e300, blank=True, required=False)),
+# Columns of the files by what they are in the samples.
+FIELDS = {
+    "vehicle": _column("Vehicle_ID", 1, LARGEST_ID, whole=True),
+    "frame": _column("Frame_ID", 0, 2**31 - 1, whole=True),
+    "position_m": _column("Local_Y"),
+    "lane": _column("Lane_ID", -INT16, INT16, whole=True),
+    "length_m": _column("v_Length"),
+    "vehicle_class": _column("v_Class", -1, 127, whole=True, blank=True),
+    "speed_mps": _column("v_Vel"),
+    "acceleration_mps2": _column("v_Acc"),
+    "preceding": _column("Preceding", -LARGEST_ID, LARGEST_ID, whole=True, blank=True),
+    "space_headway_m": _column("Space_Headway", blank=True, required=False),
+    "clock": _column("Global_Time", -1e300, 1e300, blank=True, required=False),
 }
-NAMES = {own: column.key for own, (_, column) in FIELDS.items()}
+NAMES = {own: column.key for own, column in FIELDS.items()}
 KNOWN = [*NAMES.values(), "Location"]
 SPELLED = {name.replace("_", "").lower(): name for name in KNOWN} | ALIASES
 # What follows from a column that is all zero or blank.
@@ -125,7 +123,7 @@ def read_ngsim(
     wanted = None if location is None else location.strip().lower()
     for name in rows.report.files:
         file = TableFile(name, _official, OFFICIAL)
-        missing = [x.key for _, x in FIELDS.values() if x.required and x.key not in file.header]
+        missing = [x.key for x in FIELDS.values() if x.required and x.key not in file.header]
         if missing:
             raise lacking(name, missing, file.header, "")
         before = rows.report.rows_read
@@ -195,7 +193,8 @@ class _Rows:
         if not len(block):
             return
         columns: Columns = {}
-        for own, (kind, column) in FIELDS.items():
+        for own, column in FIELDS.items():
+            kind = TYPES.get(own, np.float64)
             given = column.key in block.cells.column_names
             values = block.values(column, column.key) if given else np.full(len(block), np.nan)
             if own == "vehicle_class":

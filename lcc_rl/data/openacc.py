@@ -68,7 +68,7 @@ def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFr
             "vehicle": np.repeat(numbers, rows),
             "time_s": np.tile(read["Time"], len(numbers)),
             "speed": np.concatenate([read[f"Speed{n}"] for n in numbers]),
-            "row": np.tile(np.arange(rows), len(numbers)),
+            "row": np.tile(read["row"], len(numbers)),
             "gap": np.concatenate([read.get(f"IVS{n - 1}", blank) for n in numbers]),
         }
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -12,7 +12,6 @@ from pydantic import Field
 
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided
-from lcc_rl.data.tables import TableFile
 from lcc_rl.data.trajectories import starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
@@ -175,34 +174,6 @@ class Plausible(Settings):
                 short = (values != 0) & (values < self.min_length)
                 yield name, "holds {:g} m", values, "min_length", short
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
-
-
-def without_blank(
-    file: TableFile, read: dict[str, NDArray], keys: Iterable[str]
-) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
-    """Leave rows out in which one of some columns is blank; the notes of the file count them.
-
-    Args:
-        file: the table.
-        read: its columns.
-        keys: those in which a blank cell costs the row.
-
-    Returns:
-        The columns without these rows, and the numbers of the rows that are left.
-
-    Raises:
-        DataError: if every row has a blank cell.
-    """
-    blank = {key: np.isnan(read[key]) for key in keys if key in read}
-    wrong = np.logical_or.reduce([*blank.values()])
-    if not wrong.any():
-        return read, np.arange(len(wrong))
-    row = int(np.argmax(wrong))
-    first = file.fault(row, next(key for key in blank if blank[key][row]), "is blank")
-    if wrong.all():
-        raise first
-    file.notes.append(f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}")
-    return {key: values[~wrong] for key, values in read.items()}, np.flatnonzero(~wrong)
 
 
 def hard_share(table: pd.DataFrame) -> float | None:

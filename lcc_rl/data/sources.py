@@ -25,7 +25,13 @@ from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import Settings
 
-SHIPPED = Path(lcc_rl.assets.__file__).parent / "recorded"
+ASSETS = Path(lcc_rl.assets.__file__).parent
+# Files of the package by name: recorded platoons and drives, drive cycles.
+SHIPPED = {
+    path.stem: str(path)
+    for kind in ("recorded/*.parquet", "cycles/*.csv")
+    for path in ASSETS.glob(kind)
+}
 
 
 @dataclass(frozen=True)
@@ -172,15 +178,10 @@ def _plausible(
     return LoadedEpisodes(kept, [*lines, *said])
 
 
-def shipped() -> list[str]:
-    """Return the names of the recordings in the package: platoons and drives."""
-    return sorted(path.stem for path in SHIPPED.glob("*.parquet"))
-
-
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
-    The name of a shipped recording is that file. A folder stands for its files.
+    The name of a shipped recording or cycle is that file. A folder stands for its files.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
@@ -188,7 +189,7 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
-        found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
+        found = [SHIPPED.get(name, name)]
         if Path(name).is_dir():
             name = str(Path(escape(name)) / "*")
         if has_magic(name) and not Path(name).exists():

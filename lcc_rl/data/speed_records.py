@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-import lcc_rl.assets
 from lcc_rl.data.grid import continuous, places
-from lcc_rl.data.plausible import Plausible, without_blank
+from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
-from lcc_rl.data.sources import find_files
+from lcc_rl.data.sources import SHIPPED, find_files
 from lcc_rl.data.tables import Column, TableFile
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
-CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
 TIME, SPEED = "time_s", "speed_mps"
 # What a table of drives has, and how the columns are called by default.
 FIELDS = (
@@ -31,11 +29,6 @@ FIELDS = (
 # Columns of the first car of a native OpenACC file; blank cells divide a record.
 NATIVE = (Column("time", "time"), Column("speed", "speed", blank=True))
 COLUMNS: dict[str, str | None] = {"drive": "drive", "time": TIME, "speed": SPEED}
-
-
-def shipped_cycles() -> list[str]:
-    """Return the names of the drive cycles in the package."""
-    return sorted(path.stem for path in CYCLES.glob("*.csv"))
 
 
 def read_speed_record(
@@ -56,13 +49,10 @@ def read_speed_record(
         DataError: naming the file and the row or column at fault, also where a number is not
             malformed but implausible.
     """
-    file = Path(expanduser(path))
-    if not file.suffix and path in shipped_cycles():
-        file = CYCLES / f"{path}.csv"
-    if not file.is_file():
-        raise DataError(
-            f"{path}: no such file, and no shipped cycle ({', '.join(shipped_cycles())})"
-        )
+    file = SHIPPED.get(path, path)
+    if not Path(expanduser(file)).is_file():
+        known = ", ".join(sorted(SHIPPED))
+        raise DataError(f"{path}: no such file, and none of the package ({known})")
     samples, _ = _read(TableFile(file), {**COLUMNS, "drive": None}, plausible, {}, divide=False)
     return samples[TIME].to_numpy(), samples[SPEED].to_numpy()
 
@@ -141,11 +131,12 @@ def _samples(
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
     elif columns["drive"] == COLUMNS["drive"] and columns["drive"] not in table.header:
         columns = {**columns, "drive": None}  # each file is one
-    read = table.read(fields, columns, units, "leader.columns")
+    read = table.read(fields, columns, units, "leader.columns", ["speed"])
     if not len(read["time"]):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
-    read, rows = without_blank(table, read, ["speed"])
-    samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"], "file": 0, "row": rows})
+    samples = pd.DataFrame(
+        {TIME: read["time"], SPEED: read["speed"], "file": 0, "row": read["row"]}
+    )
     samples["recording"] = read.get("drive", stem(table.path))
     samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
     return samples

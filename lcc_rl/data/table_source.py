@@ -13,7 +13,7 @@ from pydantic import Field
 from lcc_rl.data.agreement import LEAST_WAY
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.grid import Places, continuous, on_grid, places
-from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
+from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
@@ -107,12 +107,12 @@ class TableSource(Settings):
         for number, label in enumerate(labels(report.files)):
             name = report.files[number]
             table = TableFile(name)
-            part = table.read(FIELDS, self.columns, self.units, "data.columns")
-            report.rows_read += len(part["time"])
-            part, rows = without_blank(table, part, MEASURED)
-            _report_blank_gaps(table, part, rows)
-            file, recording = np.full(len(rows), number), np.full(len(rows), label)
-            parts.append({"recording": recording, **part, "file": file, "row": rows})
+            part = table.read(FIELDS, self.columns, self.units, "data.columns", MEASURED)
+            report.rows_read += table.count
+            _report_blank_gaps(table, part)
+            rows = len(part["row"])
+            file, recording = np.full(rows, number), np.full(rows, label)
+            parts.append({"recording": recording, **part, "file": file})
             report.notes += table.notes
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         count = len(columns["time"])
@@ -128,13 +128,13 @@ class TableSource(Settings):
         return pd.DataFrame(columns).rename(columns={"time": "time_s"})
 
 
-def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray], rows: Whole) -> None:
+def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
     """Count samples that name a leader but have a blank gap, in the notes of the file."""
     if "gap" not in read or "leader" not in read:
         return
     blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NOBODY)
     if blank.any():
-        first = table.fault(int(rows[np.argmax(blank)]), "gap", "is blank")
+        first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
         table.notes.append(
             f"{int(blank.sum()):,} samples with a leader but a blank gap follow nobody, the first: "
             f"{first}"

@@ -174,6 +174,7 @@ class TableFile:
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
         self.names: dict[str, str] = {}
+        self.count = 0  # rows, once they are read
         self.comma = False  # whether numbers have a decimal comma
         if not self.path.is_file():
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
@@ -190,6 +191,7 @@ class TableFile:
         names: Names,
         units: Mapping[str, str] | None = None,
         option: str = "",
+        measured: Iterable[str] = (),
     ) -> dict[str, NDArray]:
         """Read columns and check every cell.
 
@@ -198,12 +200,14 @@ class TableFile:
             names: what they are called in the file, by key; None for one that there is not.
             units: their units by key; SI for those that are not named.
             option: where the configuration has the names, for messages.
+            measured: keys of the columns in which a blank cell costs the row.
 
         Returns:
-            The columns by key, in SI.
+            The columns by key, in SI, and ``row``, the number of each row in the file, from 0.
 
         Raises:
-            DataError: if a column is missing, or naming the row and column of a cell at fault.
+            DataError: if a column is missing, or naming the row and column of a cell at fault, or
+                if every row has a blank cell.
         """
         self.names = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
         missing = [name for name in self.names.values() if name not in self.header]
@@ -224,7 +228,23 @@ class TableFile:
             for block in self.blocks([*self.names.values()])
         ]
         whole = map(np.concatenate, zip(*parts, strict=True))
-        return {column.key: values for column, values in zip(wanted, whole, strict=True)}
+        read = {column.key: values for column, values in zip(wanted, whole, strict=True)}
+        self.count = len(next(iter(read.values())))
+        return self._measured({**read, "row": np.arange(self.count)}, measured)
+
+    def _measured(self, read: dict[str, NDArray], keys: Iterable[str]) -> dict[str, NDArray]:
+        """Columns without rows in which one of ``keys`` is blank, which the notes count."""
+        blank = {key: np.isnan(read[key]) for key in keys if key in read}
+        wrong = np.logical_or.reduce([np.zeros(self.count, dtype=bool), *blank.values()])
+        if not wrong.any():
+            return read
+        row = int(np.argmax(wrong))
+        first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank")
+        if wrong.all():
+            raise first
+        line = f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
+        self.notes.append(line)
+        return {key: values[~wrong] for key, values in read.items()}
 
     def _scale(self, column: Column, units: Mapping[str, str], option: str) -> float:
         """The size in SI of the unit that a column is read in, unless its name says another."""

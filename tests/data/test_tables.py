@@ -12,7 +12,7 @@ import pytest
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.episodes import SCHEMA, read_episodes, validate_episodes, write_episodes
+from lcc_rl.data.episodes import SCHEMA, validate_episodes, write_episodes
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.smoothing import SavitzkyGolay
@@ -306,18 +306,20 @@ def test_episodes_from_csv_without_positions(tmp_path) -> None:
     assert loaded.episodes["recording"].unique().tolist() == ["pairs"]
     assert any("no positions given" in line for line in loaded.report)
     full = written(tmp_path, whole, "whole.csv.gz")
-    pd.testing.assert_frame_equal(read_episodes(full), whole, check_exact=False, check_dtype=False)
+    pd.testing.assert_frame_equal(
+        EpisodesSource(path=str(full)).load().episodes, whole, check_exact=False, check_dtype=False
+    )
 
 
 def test_a_written_table_reads_back_whatever_its_order_and_names(tmp_path) -> None:
     write_episodes(pairs(), tmp_path / "pairs.parquet")
-    back = read_episodes(tmp_path / "pairs.parquet")
+    back = EpisodesSource(path=str(tmp_path / "pairs.parquet")).load().episodes
     assert {str(name): str(kind) for name, kind in back.dtypes.items()} == SCHEMA
     pd.testing.assert_frame_equal(back, pairs(), check_dtype=False)
     other = pairs()[[*SCHEMA][::-1]].assign(comment="x")
     other = other.rename(columns={"episode": "event", "recording": "period"})
     path = written(tmp_path, other, "other.parquet")
-    pd.testing.assert_frame_equal(read_episodes(path), back)
+    pd.testing.assert_frame_equal(EpisodesSource(path=str(path)).load().episodes, back)
     with pytest.raises(DataError, match="gap_m"):
         write_episodes(pairs().drop(columns="gap_m"), tmp_path / "new.parquet")
     assert not (tmp_path / "new.parquet").exists()
