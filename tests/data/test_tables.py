@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed
 
+from lcc_rl.data import text
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.episodes import SCHEMA, validate_episodes, write_episodes
 from lcc_rl.data.openacc import OpenAccSource
@@ -105,6 +106,22 @@ def test_names_keep_their_commas_and_number_the_vehicles(tmp_path) -> None:
     truth(loaded)
     assert loaded.vehicles == {1: "Audi, A8", 2: "BMW", 3: "Ford"}
     assert "3 vehicles are numbered from 1 by name: Audi, A8, BMW, Ford" in loaded.report
+
+
+@pytest.mark.parametrize("code", ["utf-8", "latin-1", "utf-16"])
+def test_a_file_larger_than_a_block_is_the_same_table(tmp_path, monkeypatch, code) -> None:
+    frame = named().assign(note="–" if code == "utf-16" else "é")
+    settings = {"columns": BY_GAP, "units": {"speed": "km/h", "gap": "ft"}}
+    path = written(tmp_path, frame, sep=";", decimal=",", encoding=code)
+    whole = TableSource(path=path, **settings).load()
+    monkeypatch.setattr(text, "BLOCK_BYTES", 10_001)
+    parts = TableSource(path=path, **settings).load()
+    pd.testing.assert_frame_equal(parts.episodes, whole.episodes, check_exact=True)
+    assert parts.report == whole.report
+    frame = frame.astype(object)
+    frame.loc[2000, "gap"] = "wide"
+    with pytest.raises(DataError, match="data row 2001, column 'gap' holds 'wide'"):
+        TableSource(path=written(tmp_path, frame), **settings).load()
 
 
 @pytest.mark.parametrize(
