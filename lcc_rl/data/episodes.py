@@ -146,14 +146,19 @@ def _table(
     table = continuous(table, "episode", place, report)
     start = table.groupby("episode")["time_s"].transform("min").to_numpy()
     table, _ = on_grid(table, start, MOTION, place, report)
-    codes, table["time_s"] = table["episode"].to_numpy(), table["time_s"].round(6)
-    more = np.arange(codes.max() + 1 - len(numbers)) + numbers.max() + 1
-    table["episode"] = np.append(numbers, more)[codes]
+    table["time_s"] = table["time_s"].round(6)
+    table["episode"] = _numbered(table["episode"].to_numpy(), numbers)
     table = table[[*COLUMNS, "file", "row", "label"]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED)
     return table, [*notes, *(f"{path}: {line}" for line in (*report.left_out(), *report.notes))]
+
+
+def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The file's numbers of episodes counted from 0; parts after holes have further ones."""
+    more = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
+    return np.append(numbers, more)[episode]
 
 
 def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str | None]:
