@@ -5,14 +5,15 @@ from __future__ import annotations
 import gzip
 from collections.abc import Callable
 from functools import cache
+from io import StringIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
 from ngsim_text import csv_text, native_text, portal_text
 from table_text import long_table, openacc_text
 
+from benchmarks.read import write_ngsim
 from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.drivers.tables import load_drivers
@@ -24,10 +25,9 @@ from lcc_rl.synthetic.stream import StreamSource
 def recordings() -> list[list[list[str]]]:
     """Rows of two recordings, in the order of the official columns."""
     stream = StreamSource(recordings=2, platoons=3, vehicles=3, duration_s=(45.0, 60.0))
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "stream.csv"
-        samples = stream.write(path).samples
-        rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    samples = stream.generate().samples
+    write_ngsim(samples, text := StringIO())
+    rows = [line.split(",") for line in text.getvalue().splitlines()[1:]]
     half = int((samples["recording"] == samples["recording"].iloc[0]).sum())
     return [rows[:half], rows[half:]]
 

@@ -19,7 +19,7 @@ def driven_once() -> Iterator[None]:
     known: dict[str, bytes] = {}
 
     def load_once(self: StreamSource) -> LoadedEpisodes:
-        if self.keep or self.drivers:
+        if self.drivers:
             return load(self)
         key = repr(self)
         if key not in known:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from math import exp, inf, log
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.data.grid import Place
 from lcc_rl.data.tables import SI, SPEEDS, UNITS
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import Concern, DataError
@@ -25,7 +26,6 @@ LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
 NEAR, ALIKE = 1.25, 1.05  # a mistake is so near to the coefficients, or as near as another one
 LOUD = 0.3  # lag that is reported [s]
 STANDING, LEAST_STANDING, FAR = 0.5, 300, 15.0  # speed [m/s], samples; gap that may be in feet [m]
-Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
 Floats = NDArray[np.float64]
 
 

@@ -7,7 +7,7 @@ candidates, in a fixed order, and the report counts how many.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -16,8 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.agreement import Place
-from lcc_rl.data.plausible import pair_place
+from lcc_rl.data.grid import ORIGIN, Place, Places, places
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import LARGEST, ConfigError, DataError
 from lcc_rl.settings import NonNegative, Number, Settings
@@ -27,7 +26,6 @@ COLUMNS = (
     *("vehicle", "frame", "segment", "time_s", "position_m", "lane", "length_m", "vehicle_class"),
     *("speed_mps", "preceding", "space_headway_m"),
 )
-PAIR = {"vehicle": "follower_id", "preceding": "leader_id"}
 Mask = NDArray[np.bool_]
 
 
@@ -106,7 +104,7 @@ class ExtractionReport:
 def extract(
     trajectories: Trajectories,
     criteria: Criteria,
-    place: Callable[[pd.DataFrame], Place] = pair_place,
+    place: Places = places,
 ) -> tuple[pd.DataFrame, ExtractionReport]:
     """Extract episodes of car following.
 
@@ -117,18 +115,20 @@ def extract(
 
     Returns:
         The episode table (:data:`lcc_rl.data.episodes.SCHEMA`), numbered from 0 in the order of
-        recording, follower and time; gap_m is the space headway less the leader's length. And a
-        report on what each criterion removed.
+        recording, follower and time, with file and rows where the samples have them; gap_m is the
+        space headway less the leader's length. And a report on what each criterion removed.
 
     Raises:
         DataError: if no vehicle follows another, or a criterion removes the last candidate; it
             names the criterion.
     """
-    samples = {str(name): trajectories.samples[name].to_numpy() for name in COLUMNS}
-    recording = trajectories.samples["recording"].cat
+    table = trajectories.samples
+    known = [*COLUMNS, *(name for name in ORIGIN if name in table)]
+    samples = {str(name): table[name].to_numpy() for name in known}
+    recording = table["recording"].cat
 
     def at(row: int, column: str) -> str:
-        return place(trajectories.samples.iloc[[row]].rename(columns=PAIR))(0, column)
+        return place(table.iloc[[row]])(0, column)
 
     report = ExtractionReport(at)
     follower, leader = _pairs(samples, recording.codes.to_numpy(), criteria, report)
@@ -181,6 +181,9 @@ def _episodes(
         "leader_length_m": samples["length_m"][leader],
         "gap_m": gap,
     }
+    if "row" in samples:
+        episodes |= {"row": samples["row"][follower], "leader_row": samples["row"][leader]}
+        episodes["file"] = samples["file"][follower]
     # The samples have the schema's types; a conversion would copy what may be millions of rows.
     return pd.DataFrame(episodes, copy=False)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,10 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from lcc_rl.data.plausible import without_blank
+from lcc_rl.data.grid import Places, continuous, on_grid, places, stretches
 from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, whole_numbers
 from lcc_rl.data.text import stem
-from lcc_rl.data.trajectories import FRAME, divided, is_hole, resampled, step_of, stretches
+from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 from lcc_rl.io.files import write_parquet
 
@@ -64,27 +65,8 @@ STRICT = (
 )
 ALIASES = {"event": "episode", "period": "recording"}
 DERIVED = "no positions given: those of leaders are the integral of their speeds"
-MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
-REGULAR = 0.01  # of a step, by which one may differ: times in float32 are off by some 10 µs
+MOTION = [name for name in COLUMNS if name.endswith(("_position_m", "_speed_mps", "gap_m"))]
 ONE_ROW = "is of one row; expected at least two"
-
-
-def read_episodes(path: str | Path) -> pd.DataFrame:
-    """Read a table of pairs from a parquet or CSV file, see :func:`load_episodes`.
-
-    Args:
-        path: file with the columns of ``SCHEMA``, of which those that are not required in
-            ``FIELDS`` may be missing; ``event`` and ``period`` are taken for ``episode`` and
-            ``recording``. Further columns are left out.
-
-    Returns:
-        Columns ``SCHEMA`` in SI: episode, recording, follower_id, leader_id, time_s, follower and
-        leader position (front bumper), speed, leader length and gap (bumper to bumper).
-
-    Raises:
-        DataError: if the file cannot be read or its content is not a valid table.
-    """
-    return load_episodes([str(path)])[0][[*COLUMNS]]
 
 
 def load_episodes(
@@ -95,14 +77,16 @@ def load_episodes(
     """Read tables of pairs: a row per pair and moment, at any rate and with holes.
 
     Args:
-        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`.
+        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`. Columns that are
+            not required in ``FIELDS`` may be missing; ``event`` and ``period`` are taken for
+            ``episode`` and ``recording``.
         columns: what they call the columns, by the keys of ``FIELDS``; others as in ``SCHEMA``.
         units: their units by key; SI for those that are not named.
 
     Returns:
-        The columns ``SCHEMA``, samples 0.1 s apart, ``row`` in the file, from 0, and ``label``, the
-        file's name of the episode; and lines on what was read. Holes divide an episode. Speeds and
-        gaps may be negative.
+        The columns ``SCHEMA``, samples 0.1 s apart, ``file`` and ``row`` there, from 0, and
+        ``label``, the file's name of the episode; and lines on what was read. Holes divide an
+        episode. Speeds and gaps may be negative.
 
     Raises:
         DataError: naming file, row and column, if a cell is missing or no number, or rows
@@ -110,8 +94,9 @@ def load_episodes(
     """
     tables: list[pd.DataFrame] = []
     notes: list[str] = []
-    for path in paths:
-        table, lines = _table(path, columns or {}, units or {})
+    place = partial(places, files=paths, columns=columns)
+    for number, path in enumerate(paths):
+        table, lines = _table(path, number, columns or {}, units or {}, place)
         if tables:
             table["episode"] += tables[-1]["episode"].max() + 1 - table["episode"].min()
         tables.append(table)
@@ -120,16 +105,20 @@ def load_episodes(
 
 
 def _table(
-    path: str, columns: Mapping[str, str | None], units: Mapping[str, str]
+    path: str,
+    number: int,
+    columns: Mapping[str, str | None],
+    units: Mapping[str, str],
+    place: Places,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read one file."""
+    """Read one file, the ``number``-th."""
     file = TableFile(path)
     names = _names(file, columns)
-    read = file.read(FIELDS, names, units, "data.columns")
+    read = file.read(FIELDS, names, units, "data.columns", MEASURED)
     if not len(read["time"]):
         raise DataError(f"{path}: has no episodes; expected at least one row")
-    read, places = without_blank(file, read, MEASURED)
-    rows = len(places)
+    kept = read.pop("row")
+    rows = len(kept)
     notes = list(file.notes)
     labels = read.get("episode", np.zeros(rows, dtype=str))
     codes, found = pd.factorize(labels)
@@ -141,7 +130,6 @@ def _table(
         **dict.fromkeys(COLUMNS, np.zeros(rows)),
         "recording": np.full(rows, stem(path)),
         **{OWN[key]: cells for key, cells in read.items()},
-        "episode": numbers[codes],
         "follower_id": read.get("follower_id", follower),
         "leader_id": read.get("leader_id", follower - 1),
     }
@@ -152,12 +140,25 @@ def _table(
         if names.get(name) is None:
             notes.append(words)
     table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
-    table, more = _even(table.assign(row=places, label=labels), file, codes)
-    table = table[[*COLUMNS, "row", "label"]].astype({**SCHEMA, "recording": str})
+    table = table.assign(file=number, row=kept, label=labels, episode=codes)
+    report = ReadReport([path])
+    _check_pairs(table, file)
+    table = continuous(table, "episode", place, report)
+    start = table.groupby("episode")["time_s"].transform("min").to_numpy()
+    table, _ = on_grid(table, start, MOTION, place, report)
+    table["time_s"] = table["time_s"].round(6)
+    table["episode"] = _numbered(table["episode"].to_numpy(), numbers)
+    table = table[[*COLUMNS, "file", "row", "label"]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED)
-    return table, [*notes, *more]
+    return table, [*notes, *(f"{path}: {line}" for line in (*report.left_out(), *report.notes))]
+
+
+def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The file's numbers of episodes counted from 0; parts after holes have further ones."""
+    more = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
+    return np.append(numbers, more)[episode]
 
 
 def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str | None]:
@@ -171,78 +172,17 @@ def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str 
     return names
 
 
-def _even(
-    table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
-) -> tuple[pd.DataFrame, list[str]]:
-    """Rows by episode and time, samples 0.1 s apart; holes divide an episode."""
-    table, notes = _ordered(table, file, order)
-    same = np.append(False, np.diff(table["episode"]) == 0)
+def _check_pairs(table: pd.DataFrame, file: TableFile) -> None:
+    """Check that each episode is of one pair."""
+    episode, rows = table["episode"].to_numpy(), np.arange(len(table))
+    first = np.zeros(int(episode.max()) + 1, dtype=np.int64)
+    first[episode[::-1]] = rows[::-1]
     for name in ("recording", "follower_id", "leader_id"):
-        wrong = same & (table[name] != table[name].shift()).to_numpy()
+        values = table[name].to_numpy()
+        wrong = values != values[first[episode]]
         if wrong.any():
             row = int(table["row"].to_numpy()[wrong].min())
             raise file.fault(row, name, "changes within an episode; expected one pair")
-    if not same.any():
-        raise file.fault(0, "episode" if "episode" in file.names else "time", ONE_ROW)
-    steps = np.diff(table["time_s"], prepend=0.0)
-    step = step_of(steps[same], str(file.path))
-    hole = is_hole(np.where(same, steps, 0.0), step)
-    alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
-    count = table["episode"].nunique()
-    if hole.any() or alone.any():
-        table = divided(table, alone, hole, 0.0)
-        notes.append(
-            f"{file.path}: {int(hole.sum()):,} holes divide its {count:,} episodes into "
-            f"{table['episode'].nunique():,}; {int(alone.sum()):,} samples alone are left out"
-        )
-    inner = steps[same & ~hole]
-    off = np.abs(inner - FRAME).max() if len(inner) else 0.0
-    if off <= REGULAR * FRAME:
-        return table, notes
-    parts = [_resampled(part) for _, part in table.groupby("episode", sort=False)]
-    notes.append(resampled(inner, step))
-    kept = [part for part in parts if len(part) > 1]
-    if not kept:
-        raise DataError(f"{file.path}: no episode lasts {FRAME:g} s; is the time in another unit?")
-    return pd.concat(kept, ignore_index=True), notes
-
-
-def _ordered(
-    table: pd.DataFrame, file: TableFile, order: NDArray[np.int64]
-) -> tuple[pd.DataFrame, list[str]]:
-    """Rows by episode and time; of several of a moment, the first."""
-    notes = []
-    sorted_rows = np.lexsort((table["time_s"], order))  # stable
-    if (np.diff(sorted_rows) != 1).any():
-        notes.append(f"{file.path}: rows are not in order of episode and time: sorted")
-        table = table.iloc[sorted_rows].reset_index(drop=True)
-    again = table.duplicated(["episode", "time_s"]).to_numpy()
-    if not again.any():
-        return table, notes
-    others = again & ~table.duplicated(table.columns.drop("row")).to_numpy()
-    row = int(table["row"].to_numpy()[others if others.any() else again].min())
-    if others.sum() > MOST_TWICE * len(table):
-        words = "repeats a moment of its episode with other values, as do"
-        share = f"{100 * others.mean():.0f} % of the rows"
-        raise file.fault(row, "time", f"{words} {share}; does data.columns name the episode?")
-    first = file.fault(row, "time", "repeats a moment of its episode")
-    notes.append(
-        f"left out {int(again.sum()):,} rows of a moment that an episode has already, "
-        f"{int(others.sum()):,} of them with other values, the first: {first}"
-    )
-    return table[~again].reset_index(drop=True), notes
-
-
-def _resampled(part: pd.DataFrame) -> pd.DataFrame:
-    """An episode on a grid of 0.1 s; monotone between its samples."""
-    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
-
-    time = part["time_s"].to_numpy(np.float64)
-    grid = time[0] + FRAME * np.arange(int((time[-1] - time[0]) / FRAME + 1e-6) + 1)
-    found = part.iloc[np.searchsorted(time, grid + 1e-6, side="right") - 1].reset_index(drop=True)
-    motion = [name for name in found if str(name).endswith(("_position_m", "_speed_mps", "gap_m"))]
-    found[motion] = PchipInterpolator(time, part[motion].to_numpy(np.float64))(grid)
-    return found.assign(time_s=grid)
 
 
 def derive_positions(episodes: pd.DataFrame) -> None:

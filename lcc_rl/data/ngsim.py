@@ -2,28 +2,33 @@
 
 Three layouts are read, plain or gzipped, distinguished by their first line: the native headerless
 18 columns separated by white space, the 18-column CSV with header (19 with Location), and the
-25-column export of the public portal. Files are streamed in blocks and only the needed columns
-are kept, in compact types, so that the whole portal export fits in a few gigabytes.
+25-column export of the public portal. Files are read in blocks and only the needed columns are
+kept, in compact types, so that the whole portal export fits in a few gigabytes.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
-from lcc_rl.data.tables import LARGEST_ID, Column, checked, lacking
-from lcc_rl.data.text import cells_of, check_text, parse_text, reading, single_spaces, unended
-from lcc_rl.data.trajectories import FOOT, FRAME, Places, ReadReport, Trajectories, find
+from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
+from lcc_rl.data.trajectories import (
+    FOOT,
+    TYPES,
+    ReadReport,
+    RowIndex,
+    Trajectories,
+    assembled,
+)
 from lcc_rl.errors import Concern, DataError
 
 HEADER = (
@@ -50,25 +55,23 @@ def _column(name: str, least: float = -1e9, most: float = 1e9, **more: Any) -> C
     return Column(name, least=least, most=most, **more)
 
 
-# Columns of the files by what they are in the samples, with their types.
-FIELDS: dict[str, tuple[type[np.number], Column]] = {
-    "vehicle": (np.int64, _column("Vehicle_ID", 1, LARGEST_ID, whole=True)),
-    "frame": (np.int32, _column("Frame_ID", 0, 2**31 - 1, whole=True)),
-    "position_m": (np.float32, _column("Local_Y")),
-    "lane": (np.int16, _column("Lane_ID", -INT16, INT16, whole=True)),
-    "length_m": (np.float32, _column("v_Length")),
-    "vehicle_class": (np.int8, _column("v_Class", -1, 127, whole=True, blank=True)),
-    "speed_mps": (np.float32, _column("v_Vel")),
-    "acceleration_mps2": (np.float32, _column("v_Acc")),
-    "preceding": (
-        np.int64,
-        _column("Preceding", -LARGEST_ID, LARGEST_ID, whole=True, blank=True),
-    ),
-    "space_headway_m": (np.float32, _column("Space_Headway", blank=True, required=False)),
-    "clock": (np.float64, _column("Global_Time", -1e300, 1e300, blank=True, required=False)),
+# Columns of the files by what they are in the samples.
+FIELDS = {
+    "vehicle": _column("Vehicle_ID", 1, LARGEST_ID, whole=True),
+    "frame": _column("Frame_ID", 0, 2**31 - 1, whole=True),
+    "position_m": _column("Local_Y"),
+    "lane": _column("Lane_ID", -INT16, INT16, whole=True),
+    "length_m": _column("v_Length"),
+    "vehicle_class": _column("v_Class", -1, 127, whole=True, blank=True),
+    "speed_mps": _column("v_Vel"),
+    "acceleration_mps2": _column("v_Acc"),
+    "preceding": _column("Preceding", -LARGEST_ID, LARGEST_ID, whole=True, blank=True),
+    "space_headway_m": _column("Space_Headway", blank=True, required=False),
+    "clock": _column("Global_Time", -1e300, 1e300, blank=True, required=False),
 }
-NAMES = {own: column.key for own, (_, column) in FIELDS.items()}
+NAMES = {own: column.key for own, column in FIELDS.items()}
 KNOWN = [*NAMES.values(), "Location"]
+SPELLED = {name.replace("_", "").lower(): name for name in KNOWN} | ALIASES
 # What follows from a column that is all zero or blank.
 CONSEQUENCES = {
     "Global_Time": "recordings are told apart by file",
@@ -85,7 +88,6 @@ CAR = (2.0, 12.0)  # m; between them lies the median length of vehicles on any r
 JAM = 3.0  # m; front to front, no two cars are closer in a queue
 EXACT = "exact duplicate (vehicle, frame)"
 CONFLICTING = "conflicting duplicate (vehicle, frame)"
-BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24
 Columns = dict[str, NDArray]
 
 
@@ -113,179 +115,41 @@ def read_ngsim(
         units: what the files are in: ``feet``, as published, or ``metres``.
 
     Raises:
-        DataError: naming the file, the line and the column at fault, or if the vehicles are too
+        DataError: naming the file, the row and the column at fault, or if the vehicles are too
             short or long for these units.
     """
     paths = [path] if isinstance(path, (str, Path)) else path
     rows = _Rows(ReadReport(files=[str(name) for name in paths]), METRES[units])
     wanted = None if location is None else location.strip().lower()
     for name in rows.report.files:
-        for block in _blocks(name):
-            last = block.first_line + block.lines.count(b"\n")
-            rows.report.notes += unended(block.lines, f"{name}: line {last}")
-            rows.add(block, wanted)
+        file = TableFile(name, _official, OFFICIAL)
+        missing = [x.key for x in FIELDS.values() if x.required and x.key not in file.header]
+        if missing:
+            raise lacking(name, missing, file.header, "")
+        before = rows.report.rows_read
+        for block in file.blocks([known for known in KNOWN if known in file.header]):
+            rows.add(name, block, wanted)
+        if rows.report.rows_read == before:
+            raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
+        rows.report.notes += file.notes
     if not rows.chunks:
         found = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())
         raise DataError(
             f"{', '.join(rows.report.files)}: no row has Location {location!r}; "
             f"the locations found are {found or 'none'}"
         )
-    samples = _sorted(rows)
-    _check_units(samples, units, rows.report.files)
-    return Trajectories(samples, rows.report)
-
-
-def of_columns(columns: Mapping[str, NDArray], name: str) -> Trajectories:
-    """Return the trajectories of a file in feet that has these columns.
-
-    Args:
-        columns: the official columns, checked.
-        name: what the report calls the file.
-    """
-    rows = _Rows(ReadReport(files=[name]), FOOT)
-    rows.add(_Numbers(name, columns), None)
-    return Trajectories(_sorted(rows), rows.report)
-
-
-# -- blocks of rows --------------------------------------------------------------------------------
-
-
-@dataclass
-class _Layout:
-    """Number of columns, the place of every known one, and how columns are separated."""
-
-    width: int
-    places: dict[str, int]
-    header: bool
-    separator: str
-
-
-class _Block:
-    """Consecutive rows of a file as text columns, converted and checked on access."""
-
-    def __init__(self, path: str, lines: bytes, first_line: int, layout: _Layout) -> None:
-        self.path, self.lines, self.first_line = path, lines, first_line
-        check_text(lines, f"{path}: a line from {first_line} on")
-        names = {str(place): name for name, place in layout.places.items()}
-        table = parse_text(lines, layout.width, layout.separator, [*names], path, first_line)
-        self.table = table.rename_columns([names[place] for place in table.column_names])
-        self.row = np.arange(len(self))
-
-    def __len__(self) -> int:
-        return int(self.table.num_rows)
-
-    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
-        """Names in the Location column (lower case, '' where blank) and each row's index of it."""
-        if "Location" not in self.table.column_names:
-            return [""], np.zeros(len(self), dtype=np.int64)
-        codes, names = pd.factorize(self.table["Location"].fill_null("").to_numpy())
-        return [str(name).strip().lower() for name in names], codes
-
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep only the rows where ``mask`` holds; messages still name lines of the file."""
-        self.row, self.table = self.row[mask], self.table.filter(pa.array(mask))
-
-    def values(self, column: Column) -> NDArray[np.float64]:
-        """Read a column of numbers; NaN where a cell is blank, or the file has no such column."""
-        if column.key not in self.table.column_names:
-            return np.full(len(self), np.nan)
-
-        def fault(row: int, words: str) -> DataError:
-            lines = enumerate(self.lines.split(b"\n"), self.first_line)  # blank ones hold no row
-            line = [number for number, text in lines if text.strip(b"\r")][self.row[row]]
-            return DataError(f"{self.path}: line {line}, column {column.key!r} {words}")
-
-        return checked(self.table[column.key], column, fault)
-
-
-class _Numbers(_Block):
-    """Rows that are at hand as numbers."""
-
-    def __init__(self, path: str, columns: Mapping[str, NDArray]) -> None:
-        self.path, self.columns = path, columns
-
-    def __len__(self) -> int:
-        return len(self.columns["Vehicle_ID"])
-
-    def locations(self) -> tuple[list[str], NDArray[np.int64]]:
-        return [""], np.zeros(len(self), dtype=np.int64)
-
-    def values(self, column: Column) -> NDArray[np.float64]:
-        return self.columns[column.key].astype(np.float64)
-
-
-def _blocks(name: str) -> Iterator[_Block]:
-    """Read a file in blocks of rows, in the order of the file."""
-    layout: _Layout | None = None
-    line, empty = 1, True
-    for raw in _line_chunks(name):
-        lines = raw
-        if layout is None:
-            bare = raw.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
-            if not bare:
-                line += raw.count(b"\n")
-                continue
-            line += raw.count(b"\n") - bare.count(b"\n")
-            layout, lines = _detect(name, bare)
-            line += layout.header
-        if layout.separator == " ":
-            lines = single_spaces(lines)
-        if lines.strip(b"\r\n"):
-            empty = False
-            yield _Block(name, lines, line, layout)
-        line += lines.count(b"\n")
-    if empty:
-        raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
-
-
-def _line_chunks(name: str) -> Iterator[bytes]:
-    """Whole lines of the decompressed file, some megabytes at a time."""
-    rest = b""
-    with reading(name) as file:
-        while data := file.read(BLOCK_BYTES):
-            cut = data.rfind(b"\n") + 1
-            if cut:
-                yield rest + data[:cut]
-            rest = data[cut:] if cut else rest + data
-            if len(rest) > LONGEST_LINE:
-                raise DataError(f"{name}: is not a text table; expected lines of 18 columns")
-    if rest:
-        yield rest
-
-
-def _detect(name: str, lines: bytes) -> tuple[_Layout, bytes]:
-    """Detect the layout from the first line; returns it and the lines that hold rows."""
-    first, _, rest = lines.partition(b"\n")
-    check_text(first, f"{name}:")
-    separator = "," if b"," in first else " "
-    cells = cells_of(single_spaces(first) if separator == " " else first, separator)
-    if cells and re.match(r"\s*-?[0-9.,]+([eE][+-]?[0-9]+)?\s*$", cells[0]):
-        if len(cells) != len(OFFICIAL):
-            raise DataError(
-                f"{name}: the first line has {len(cells)} columns and no header; expected the "
-                f"{len(OFFICIAL)} columns of the native layout"
-            )
-        places = {column: place for place, column in enumerate(OFFICIAL) if column in KNOWN}
-        return _Layout(len(OFFICIAL), places, header=False, separator=separator), lines
-    known = {_folded(column): column for column in KNOWN} | ALIASES
-    places = {}
-    for place, cell in enumerate(cells):
-        column = known.get(_folded(cell))
-        if column in places:
-            raise DataError(f"{name}: the header has column {column!r} twice; expected it once")
-        if column is not None:
-            places[column] = place
-    missing = [c.key for _, c in FIELDS.values() if c.required and c.key not in places]
-    if missing:
-        raise lacking(name, missing, cells, "")
-    return _Layout(len(cells), places, header=True, separator=separator), rest
-
-
-def _folded(cell: str) -> str:
-    return re.sub(r"[\s_]+", "", cell).lower()
+    trajectories = _sorted(rows)
+    _check_units(trajectories.samples, units, rows.report.files)
+    return trajectories
 
 
 # -- compact columns -------------------------------------------------------------------------------
+
+
+def _official(name: str) -> str:
+    """The official spelling of a column's name."""
+    folded = re.sub(r"[\s_]+", "", name).lower()
+    return SPELLED.get(folded, name.strip())
 
 
 @dataclass
@@ -312,10 +176,13 @@ class _Rows:
     filled: set[str] = field(default_factory=set)
     blank_classes: int = 0
 
-    def add(self, block: _Block, wanted: str | None) -> None:
+    def add(self, file: str, block: Block, wanted: str | None) -> None:
         """Add the rows of a block; with ``wanted``, those of that location only."""
         self.report.rows_read += len(block)
-        names, places = block.locations()
+        names, places = [""], np.zeros(len(block), dtype=np.int64)
+        if "Location" in block.cells.column_names:
+            places, found = pd.factorize(block.cells["Location"].fill_null("").to_numpy())
+            names = [str(name).strip().lower() for name in found]
         for name, rows in zip(names, np.bincount(places, minlength=len(names)), strict=True):
             self.locations[name] += int(rows)
         if wanted is not None:
@@ -326,8 +193,10 @@ class _Rows:
         if not len(block):
             return
         columns: Columns = {}
-        for own, (kind, column) in FIELDS.items():
-            values = block.values(column)
+        for own, column in FIELDS.items():
+            kind = TYPES.get(own, np.float64)
+            given = column.key in block.cells.column_names
+            values = block.values(column, column.key) if given else np.full(len(block), np.nan)
             if own == "vehicle_class":
                 self.blank_classes += int((~(values >= 0)).sum())
                 values = values.clip(min=0.0)
@@ -341,7 +210,7 @@ class _Rows:
         codes, pairs = pd.factorize(start * len(names) + places)
         groups = []
         for pair, count in zip(pairs.tolist(), np.bincount(codes).tolist(), strict=True):
-            group = Group(block.path, names[pair % len(names)], pair // len(names))
+            group = Group(file, names[pair % len(names)], pair // len(names))
             self.rows_of[group] += count
             groups.append(self.groups.setdefault(group, len(self.groups)))
         self.chunks.append({"group": np.array(groups, dtype=np.int32)[codes]} | columns)
@@ -357,22 +226,19 @@ def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray
 # -- sorted samples --------------------------------------------------------------------------------
 
 
-def _sorted(read: _Rows) -> pd.DataFrame:
-    """Samples of all collected rows, sorted, without duplicates, with segments and headways."""
+def _sorted(read: _Rows) -> Trajectories:
+    """All collected rows, sorted, without duplicates."""
     # A block's part is freed as soon as it is copied.
     columns = {
         name: np.concatenate([chunk.pop(name) for chunk in read.chunks])
         for name in list(read.chunks[0])
     }
     columns["recording"], names = _recordings(read, columns.pop("group"))
-    places = Places(columns["recording"], columns["vehicle"], columns["frame"])
-    key = places.keys(columns["recording"], columns["vehicle"], columns["frame"])
-    order, key = _kept_order(read.report, columns, key)
+    index = RowIndex(columns["recording"], columns["vehicle"], columns["frame"])
+    key = index.keys(columns["recording"], columns["vehicle"], columns["frame"])
+    order = _kept_order(read.report, columns, key)
     for name in list(columns):  # one column at a time, to hold only one extra copy
         columns[name] = columns[name][order]
-    read.report.rows_kept = len(order)
-    segment = _segments(read.report, columns, names, key)
-    _fill_headways(read.report, columns, places, key)
     report = read.report
     report.empty_columns = [name for name in CONSEQUENCES if name not in read.filled]
     for name in report.empty_columns:
@@ -380,12 +246,7 @@ def _sorted(read: _Rows) -> pd.DataFrame:
         report.notes.append(Concern(line) if name == "v_Length" else line)
     if read.blank_classes and "v_Class" in read.filled:
         report.notes.append(f"v_Class is blank in {read.blank_classes:,} rows: class unknown")
-    recording = pd.Categorical.from_codes(columns.pop("recording"), categories=pd.Index(names))
-    vehicle, frame = columns.pop("vehicle"), columns.pop("frame")
-    # Division rounds correctly where the product 0.1·frame does not.
-    time = {"time_s": frame / round(1 / FRAME)}
-    identity = {"recording": recording, "vehicle": vehicle, "frame": frame, "segment": segment}
-    return pd.DataFrame(identity | time | columns, copy=False)
+    return assembled(columns, names, report)
 
 
 def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16], list[str]]:
@@ -402,15 +263,13 @@ def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16
     return np.array([place[named[key]] for key in read.groups], dtype=np.int16)[group], names
 
 
-def _kept_order(
-    report: ReadReport, columns: Columns, key: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Rows to keep in sorted order, and their keys; duplicates are counted by kind."""
+def _kept_order(report: ReadReport, columns: Columns, key: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Rows to keep in sorted order; duplicates are counted by kind."""
     order = np.argsort(key, kind="stable")  # stable: the first in the files stays
     key = key[order]
     repeated = np.append(False, key[1:] == key[:-1])
     if not repeated.any():
-        return order, key
+        return order
     first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(key))))
     again, kept = order[repeated], order[first[repeated]]
     same = np.logical_and.reduce([values[again] == values[kept] for values in columns.values()])
@@ -421,40 +280,7 @@ def _kept_order(
             "rows that disagree on the same vehicle and frame: the first in the files was kept; "
             "the files may mix recordings that Global_Time cannot tell apart"
         )
-    return order[~repeated], key[~repeated]
-
-
-def _segments(
-    report: ReadReport, columns: Columns, names: list[str], key: NDArray[np.int64]
-) -> NDArray[np.int32]:
-    """Segment of each sorted row; counts recordings, vehicles and segments."""
-    recording, vehicle = columns["recording"], columns["vehicle"]
-    changes = (vehicle[1:] != vehicle[:-1]) | (recording[1:] != recording[:-1])
-    # Keys of one vehicle's consecutive frames differ by one, but so may two vehicles' keys.
-    segment = np.cumsum(np.append(False, changes | (np.diff(key) != 1)), dtype=np.int32)
-    rows = np.bincount(recording, minlength=len(names))
-    report.recordings = {name: int(count) for name, count in zip(names, rows, strict=True)}
-    report.vehicles = 1 + int(changes.sum())
-    report.segments = int(segment[-1]) + 1
-    return segment
-
-
-def _fill_headways(
-    report: ReadReport, columns: Columns, places: Places, key: NDArray[np.int64]
-) -> None:
-    """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
-    headway, preceding = columns["space_headway_m"], columns["preceding"]
-    follows = preceding > 0
-    given = follows & (headway != 0)
-    headway[~given] = np.nan
-    rows = np.flatnonzero(follows & ~given)
-    wanted = places.keys(columns["recording"][rows], preceding[rows], columns["frame"][rows])
-    leader = find(wanted, key)
-    rows, leader = rows[leader >= 0], leader[leader >= 0]
-    position = columns["position_m"]
-    headway[rows] = position[leader] - position[rows]
-    report.headways_given, report.headways_derived = int(given.sum()), len(rows)
-    report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
+    return order[~repeated]
 
 
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.car_following import Criteria
+from lcc_rl.data.grid import places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
 from lcc_rl.data.table_source import labels, to_trajectories
@@ -47,13 +49,15 @@ class OpenAccSource(Settings):
         files = find_files(self.path)
         report = ReadReport(files=files)
         cars = [
-            _cars(TableFile(name), number, self.driver, report) for number, name in enumerate(files)
+            _cars(TableFile(name), self.driver, report).assign(recording=label, file=number)
+            for number, (name, label) in enumerate(zip(files, labels(files), strict=True))
         ]
-        trajectories = to_trajectories(pd.concat(cars), labels(files), report)
-        return episodes_of(trajectories, self.criteria, self.plausible)
+        place = partial(places, files=files)
+        trajectories = to_trajectories(pd.concat(cars, ignore_index=True), place, report)
+        return episodes_of(trajectories, self.criteria, self.plausible, place=place)
 
 
-def _cars(table: TableFile, recording: int, driver: str | None, report: ReadReport) -> pd.DataFrame:
+def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFrame:
     """All cars of a file, one below the other; see :func:`to_trajectories`."""
     numbers, followers, columns = _columns(table)
     read = table.read(columns, {column.key: column.key for column in columns})
@@ -61,11 +65,10 @@ def _cars(table: TableFile, recording: int, driver: str | None, report: ReadRepo
     blank = np.full(rows, np.nan)
     cars = pd.DataFrame(
         {
-            "recording": recording,
             "vehicle": np.repeat(numbers, rows),
-            "time": np.tile(read["Time"], len(numbers)),
+            "time_s": np.tile(read["Time"], len(numbers)),
             "speed": np.concatenate([read[f"Speed{n}"] for n in numbers]),
-            "row": np.tile(np.arange(rows), len(numbers)),
+            "row": np.tile(read["row"], len(numbers)),
             "gap": np.concatenate([read.get(f"IVS{n - 1}", blank) for n in numbers]),
         }
     )

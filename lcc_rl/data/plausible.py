@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -10,9 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.agreement import OF_PAIRS, Place, check_pairs
-from lcc_rl.data.tables import TableFile
-from lcc_rl.data.trajectories import divided, starts_of
+from lcc_rl.data.agreement import OF_PAIRS, check_pairs
+from lcc_rl.data.grid import ORIGIN, Place, Places, divided
+from lcc_rl.data.trajectories import starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
@@ -53,7 +53,7 @@ class Plausible(Settings):
         self,
         table: pd.DataFrame,
         source: str,
-        place: Place,
+        place: Places,
         setting: str = "data.plausible",
         remedy: str = "",
         units: Mapping[str, str] | None = None,
@@ -64,23 +64,22 @@ class Plausible(Settings):
             table: rows of a record (column ``episode``) lie together, in order of time: time_s
                 and, where present, gap_m and columns that end in ``speed_mps`` and ``length_m``.
             source: the file or files, for messages.
-            place: describes a row to the user, by its number and the column at fault.
+            place: makes of a table what describes its rows, see :func:`lcc_rl.data.grid.places`.
             setting: where the configuration has these thresholds.
             remedy: what else a user may do about accelerations.
             units: see :func:`lcc_rl.data.agreement.mistakes`.
 
         Returns:
-            What is left, numbered by :func:`lcc_rl.data.trajectories.divided`, its speeds at least
-            0, and a line for each kind of fault.
+            What is left, numbered by :func:`lcc_rl.data.grid.divided`, its speeds at least 0, and a
+            line for each kind of fault.
 
         Raises:
             DataError: if more than ``max_share`` of the samples, or all, would be left out, or
                 gaps and speeds contradict each other.
         """
         starts = starts_of(table["episode"].to_numpy())
-        wrong, lines, advice = self._outside(table, starts, place, setting, remedy)
-        numbered = table.assign(row=np.arange(len(table)))  # for messages, by the place of a row
-        kept = divided(numbered, wrong, np.zeros_like(wrong), SHORTEST)
+        wrong, lines, advice = self._outside(table, starts, place(table), setting, remedy)
+        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST)
         lost = 1 - len(kept) / len(table)
         if lost > self.max_share or kept.empty:
             raise DataError(
@@ -98,20 +97,16 @@ class Plausible(Settings):
             )
             lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
-
-        def in_table(row: int, column: str) -> str:
-            return place(int(kept["row"].iloc[row]), column)
-
         agree, last = False, list[str]()
         if set(kept.columns) >= OF_PAIRS:
             limits = {"max_mismatch": self.max_mismatch, "max_lag": self.max_lag}
             try:
-                last, agree = check_pairs(kept, in_table, units or {}, **limits)
+                last, agree = check_pairs(kept, place(kept), units or {}, **limits)
             except DataError as error:
                 shown = ", ".join(f"{setting}.{name}={limits[name]:g}" for name in limits)
                 raise DataError(f"{source}: {error} ({shown})") from error
         more_lines += self._check_hard(kept, source, setting, agree)
-        return kept.drop(columns=["row", "label"], errors="ignore"), [*lines, *more_lines, *last]
+        return kept.drop(columns=ORIGIN, errors="ignore"), [*lines, *more_lines, *last]
 
     def _outside(
         self,
@@ -181,34 +176,6 @@ class Plausible(Settings):
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
 
 
-def without_blank(
-    file: TableFile, read: dict[str, NDArray], keys: Iterable[str]
-) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
-    """Leave rows out in which one of some columns is blank; the notes of the file count them.
-
-    Args:
-        file: the table.
-        read: its columns.
-        keys: those in which a blank cell costs the row.
-
-    Returns:
-        The columns without these rows, and the numbers of the rows that are left.
-
-    Raises:
-        DataError: if every row has a blank cell.
-    """
-    blank = {key: np.isnan(read[key]) for key in keys if key in read}
-    wrong = np.logical_or.reduce([*blank.values()])
-    if not wrong.any():
-        return read, np.arange(len(wrong))
-    row = int(np.argmax(wrong))
-    first = file.fault(row, next(key for key in blank if blank[key][row]), "is blank")
-    if wrong.all():
-        raise first
-    file.notes.append(f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}")
-    return {key: values[~wrong] for key, values in read.items()}, np.flatnonzero(~wrong)
-
-
 def hard_share(table: pd.DataFrame) -> float | None:
     """Return the largest share of samples whose speed changes by more than 4 m/s in a second.
 
@@ -246,15 +213,3 @@ def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     least = min(float(table[name].min()) for name in names)
     table = table.assign(**{name: table[name].clip(lower=0.0) for name in names})
     return table, [f"{count:,} speeds below 0, the least {least:.3g} m/s, count as 0"]
-
-
-def pair_place(episodes: pd.DataFrame) -> Place:
-    """Return what describes a sample of an episode table: recording, vehicle, time and column."""
-
-    def place(row: int, column: str) -> str:
-        entry = episodes.iloc[row]
-        role = "leader" if column.startswith("leader") else "follower"
-        where = f"recording {entry['recording']}, vehicle {entry[f'{role}_id']} ({role})"
-        return f"{where}, {entry['time_s']:g} s, column {column!r}"
-
-    return place

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.signal import savgol_filter
 
-from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders, stretches
+from lcc_rl.data.grid import stretches
+from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 

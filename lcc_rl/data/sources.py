@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from glob import escape, glob, has_magic
 from os.path import expanduser
 from pathlib import Path
@@ -12,11 +13,11 @@ from typing import Literal
 import pandas as pd
 
 import lcc_rl.assets
-from lcc_rl.data.agreement import Place
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
+from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Plausible, pair_place
+from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.tables import SI, Column, Names, check_map
 from lcc_rl.data.text import TEXT_TAKES, file_size
 from lcc_rl.data.trajectories import Trajectories
@@ -24,7 +25,13 @@ from lcc_rl.errors import DataError
 from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import Settings
 
-SHIPPED = Path(lcc_rl.assets.__file__).parent / "recorded"
+ASSETS = Path(lcc_rl.assets.__file__).parent
+# Files of the package by name: recorded platoons and drives, drive cycles.
+SHIPPED = {
+    path.stem: str(path)
+    for kind in ("recorded/*.parquet", "cycles/*.csv")
+    for path in ASSETS.glob(kind)
+}
 
 
 @dataclass(frozen=True)
@@ -101,19 +108,8 @@ class EpisodesSource(Settings):
         named = {**{key: OWN[key] for key in self.units}, **self.columns}
         source += read_as(FIELDS, named, self.units)
         units = units_of(FIELDS, OWN, self.units)
-        return _plausible(self.plausible, episodes, source, lines, place=self._place, units=units)
-
-    def _place(self, episodes: pd.DataFrame) -> Place:
-        """Return what describes a sample by its row and column in the file."""
-        names = {OWN[key]: name for key, name in self.columns.items()}
-
-        def place(number: int, column: str) -> str:
-            row = episodes.iloc[number]
-            label = row["label"] and f"episode {row['label']}, "
-            where = f"{label}recording {row['recording']}, data row {row['row'] + 1}"
-            return f"{where}, column {names.get(column, column)!r}"
-
-        return place
+        place = partial(places, files=files, columns=self.columns)
+        return _plausible(self.plausible, episodes, source, lines, place=place, units=units)
 
 
 def episodes_of(
@@ -121,7 +117,7 @@ def episodes_of(
     criteria: Criteria | None,
     plausible: Plausible | None,
     remedy: str = "",
-    place: Callable[[pd.DataFrame], Place] = pair_place,
+    place: Places = places,
 ) -> LoadedEpisodes:
     """Extract episodes; positions that no file gives are derived from speeds and gaps.
 
@@ -174,23 +170,18 @@ def _plausible(
     source: str,
     lines: list[str],
     remedy: str = "",
-    place: Callable[[pd.DataFrame], Place] = pair_place,
+    place: Places = places,
     units: Mapping[str, str] | None = None,
 ) -> LoadedEpisodes:
     thresholds = limits or Plausible()
-    kept, said = thresholds.select(episodes, source, place(episodes), remedy=remedy, units=units)
+    kept, said = thresholds.select(episodes, source, place, remedy=remedy, units=units)
     return LoadedEpisodes(kept, [*lines, *said])
-
-
-def shipped() -> list[str]:
-    """Return the names of the recordings in the package: platoons and drives."""
-    return sorted(path.stem for path in SHIPPED.glob("*.parquet"))
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
-    The name of a shipped recording is that file. A folder stands for its files.
+    The name of a shipped recording or cycle is that file. A folder stands for its files.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
@@ -198,7 +189,7 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
-        found = [str(SHIPPED / f"{name}.parquet") if name in shipped() else name]
+        found = [SHIPPED.get(name, name)]
         if Path(name).is_dir():
             name = str(Path(escape(name)) / "*")
         if has_magic(name) and not Path(name).exists():

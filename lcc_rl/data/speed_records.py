@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from os.path import expanduser
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-import lcc_rl.assets
+from lcc_rl.data.grid import continuous, places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
-from lcc_rl.data.sources import find_files
+from lcc_rl.data.sources import SHIPPED, find_files
 from lcc_rl.data.tables import Column, TableFile
 from lcc_rl.data.text import stem
-from lcc_rl.data.trajectories import divided, is_hole
+from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
-CYCLES = Path(lcc_rl.assets.__file__).parent / "cycles"
 TIME, SPEED = "time_s", "speed_mps"
 # What a table of drives has, and how the columns are called by default.
 FIELDS = (
@@ -30,11 +29,6 @@ FIELDS = (
 # Columns of the first car of a native OpenACC file; blank cells divide a record.
 NATIVE = (Column("time", "time"), Column("speed", "speed", blank=True))
 COLUMNS: dict[str, str | None] = {"drive": "drive", "time": TIME, "speed": SPEED}
-
-
-def shipped_cycles() -> list[str]:
-    """Return the names of the drive cycles in the package."""
-    return sorted(path.stem for path in CYCLES.glob("*.csv"))
 
 
 def read_speed_record(
@@ -55,13 +49,10 @@ def read_speed_record(
         DataError: naming the file and the row or column at fault, also where a number is not
             malformed but implausible.
     """
-    file = Path(expanduser(path))
-    if not file.suffix and path in shipped_cycles():
-        file = CYCLES / f"{path}.csv"
-    if not file.is_file():
-        raise DataError(
-            f"{path}: no such file, and no shipped cycle ({', '.join(shipped_cycles())})"
-        )
+    file = SHIPPED.get(path, path)
+    if not Path(expanduser(file)).is_file():
+        known = ", ".join(sorted(SHIPPED))
+        raise DataError(f"{path}: no such file, and none of the package ({known})")
     samples, _ = _read(TableFile(file), {**COLUMNS, "drive": None}, plausible, {}, divide=False)
     return samples[TIME].to_numpy(), samples[SPEED].to_numpy()
 
@@ -113,38 +104,26 @@ def _read(
     divide: bool = True,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Name, drive, time and speed of the plausible samples of one file, and the report."""
-    samples = _samples(table, columns, units)
-    step = samples.groupby("episode")[TIME].diff()
-    usual = step.groupby(samples["episode"]).transform("median")
-    for wrong, words in (
-        (step <= 0, "does not follow the time before it in its record"),
-        (usual.isna(), "is the only sample of its record; expected at least 2"),
-    ):
-        if wrong.any():
-            raise table.fault(int(samples["row"][wrong].min()), "time", words)
-    samples, said = _divided(samples, divide & is_hole(step.to_numpy(), usual.to_numpy()), table)
-
-    def place(number: int, column: str) -> str:
-        own = {TIME: table.names["time"], SPEED: table.names["speed"]}[column]
-        sample = samples.iloc[number]
-        return f"data row {sample['row'] + 1} ({sample['drive']}), column {own!r}"
-
+    samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
+    place = partial(places, files=report.files, columns=table.names)
+    samples = continuous(samples, "drive", place, report, divide)
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible"
     )
+    kept["drive"] = kept.pop("recording")
     parts = kept.groupby("drive")["episode"].transform("nunique") > 1
     start = kept.groupby("episode")[TIME].transform("min").map("+{:g}s".format)
     kept["name"] = kept["drive"].where(~parts, kept["drive"] + start)
     line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
-    return kept, [line, *table.notes, *said, *lines]
+    return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
 def _samples(
     table: TableFile, columns: Mapping[str, str | None], units: Mapping[str, str]
 ) -> pd.DataFrame:
-    """Name, drive, time and speed of every row, by record, and the record's number as episode."""
+    """Drive, as recording, time and speed of every row that has a speed."""
     fields: Sequence[Column] = FIELDS
     if table.preamble:
         fields = FIELDS if columns["drive"] is None else NATIVE
@@ -152,35 +131,12 @@ def _samples(
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
     elif columns["drive"] == COLUMNS["drive"] and columns["drive"] not in table.header:
         columns = {**columns, "drive": None}  # each file is one
-    read = table.read(fields, columns, units, "leader.columns")
-    samples = pd.DataFrame({TIME: read["time"], SPEED: read["speed"]})
-    samples["drive"] = samples["name"] = read.get("drive", stem(table.path))
-    samples["row"] = samples.index
-    if samples.empty:
+    read = table.read(fields, columns, units, "leader.columns", ["speed"])
+    if not len(read["time"]):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
-    samples = samples.sort_values("name", kind="stable", ignore_index=True)
-    samples["episode"] = samples["name"].ne(samples["name"].shift()).cumsum()
-    return samples
-
-
-def _divided(
-    samples: pd.DataFrame, hole: NDArray[np.bool_], table: TableFile
-) -> tuple[pd.DataFrame, list[str]]:
-    """Divide records at holes and at blank cells, which are left out; with a line that says so."""
-    blank = samples[SPEED].isna().to_numpy()
-    begins = np.append(True, (samples["episode"].diff() != 0).to_numpy()[1:]) | hole | blank
-    part = np.cumsum(begins)
-    alone = ~blank & (np.bincount(part, ~blank)[part] < 2)
-    kept, speed = divided(samples, blank | alone, hole, 0.0), table.names["speed"]
-    if kept.empty:
-        raise DataError(
-            f"{table.path}: column {table.names['speed']!r} has no two samples in a row"
-        )
-    if kept is samples:
-        return samples, []
-    line = (
-        f"left out {len(samples) - len(kept):,} rows with a blank {speed} or alone; "
-        f"with {int(hole.sum()):,} holes they divide the {samples['episode'].nunique():,} records "
-        f"into {kept['episode'].nunique():,}"
+    samples = pd.DataFrame(
+        {TIME: read["time"], SPEED: read["speed"], "file": 0, "row": read["row"]}
     )
-    return kept, [line]
+    samples["recording"] = read.get("drive", stem(table.path))
+    samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
+    return samples

@@ -10,23 +10,20 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.data.agreement import LEAST_WAY, Place
+from lcc_rl.data.agreement import LEAST_WAY
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.plausible import SMOOTHING, Plausible, without_blank
+from lcc_rl.data.grid import Places, continuous, on_grid, places
+from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
     FRAME,
-    UNEVEN,
     ReadReport,
     Trajectories,
+    assembled,
     find_leaders,
-    is_hole,
     listed,
-    resampled,
-    step_of,
-    stretches,
 )
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive, Settings
@@ -45,13 +42,9 @@ FIELDS = (
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
 NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
 MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
-LAST = 2**31 - 1  # frame
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
 JUMP = 10.0  # m between samples, more than driven: positions begin anew
-EXACT, ALONE = "exact duplicate (vehicle, time)", "stretch without a sample on the time grid"
-Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 class TableSource(Settings):
@@ -98,24 +91,28 @@ class TableSource(Settings):
         """
         how = FIELDS, self.columns, self.units
         report = ReadReport(find_files(self.path), read_as(*how), units_of(*how))
-        rows, recordings = self._rows(report)
-        trajectories = to_trajectories(rows, recordings, report)
+        rows = self._rows(report)
+        names = {**self.columns, "preceding": self.columns.get("leader")}
+        names["gap"] = names.get("gap") or names.get("position")
+        place = partial(places, files=report.files, columns=names, vehicles=report.names)
+        trajectories = to_trajectories(rows, place, report)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
-        place = place_in(rows, recordings, report, self.columns)
         return episodes_of(trajectories, self.criteria, self.plausible, remedy, place)
 
-    def _rows(self, report: ReadReport) -> tuple[pd.DataFrame, list[str]]:
-        """Rows of all files in SI, and the names of the recordings."""
+    def _rows(self, report: ReadReport) -> pd.DataFrame:
+        """Rows of all files in SI."""
         parts = []
-        for name, label in zip(report.files, labels(report.files), strict=True):
+        for number, label in enumerate(labels(report.files)):
+            name = report.files[number]
             table = TableFile(name)
-            part = table.read(FIELDS, self.columns, self.units, "data.columns")
-            report.rows_read += len(part["time"])
-            part, rows = without_blank(table, part, MEASURED)
-            _report_blank_gaps(table, part, rows)
-            parts.append({"recording": np.full(len(rows), label), **part, "row": rows})
+            part = table.read(FIELDS, self.columns, self.units, "data.columns", MEASURED)
+            report.rows_read += table.count
+            _report_blank_gaps(table, part)
+            rows = len(part["row"])
+            file, recording = np.full(rows, number), np.full(rows, label)
+            parts.append({"recording": recording, **part, "file": file})
             report.notes += table.notes
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         count = len(columns["time"])
@@ -128,53 +125,16 @@ class TableSource(Settings):
             columns["length"] = np.where(length > 0, length, self.vehicle_length)
         if "lane" in columns:
             columns["lane"] = np.unique(columns["lane"], return_inverse=True)[1]
-        names, columns["recording"] = np.unique(columns["recording"], return_inverse=True)
-        return pd.DataFrame(columns), names.tolist()
+        return pd.DataFrame(columns).rename(columns={"time": "time_s"})
 
 
-def place_in(
-    rows: pd.DataFrame,
-    recordings: Sequence[str],
-    report: ReadReport,
-    columns: Mapping[str, str | None],
-) -> Callable[[pd.DataFrame], Place]:
-    """Return what describes samples of episodes by the nearest rows of the table they are from.
-
-    Args:
-        rows: see :func:`to_trajectories`.
-        recordings: their names.
-        report: the files, and the names of numbered vehicles.
-        columns: what the table calls its columns, by key.
-    """
-
-    files = dict(zip(labels(report.files), report.files, strict=True))
-
-    def of(episodes: pd.DataFrame, sample: int, column: str) -> str:
-        entry = episodes.iloc[sample]
-        number = entry["leader_id" if column.startswith("leader") else "follower_id"]
-        name, recording = report.names.get(number, number), entry["recording"]
-        own = rows[(rows.recording == recordings.index(recording)) & (rows.vehicle == number)]
-        row = own.row[(own.time - entry["time_s"]).abs().idxmin()]
-        keys = ("speed", "length", "gap", "time", "lane", "preceding")
-        key = next(key for key in keys if key in column)
-        if key == "preceding":
-            key = "leader"
-        if key == "gap" and not columns.get(key):
-            key = "position"
-        file = files.get(recording, listed(report.files))
-        place = f"{file}: recording {recording}, data row {row + 1}, vehicle {name}"
-        return f"{place}, column {(columns.get(key) or key)!r}"
-
-    return lambda episodes: partial(of, episodes)
-
-
-def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray], rows: Whole) -> None:
+def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
     """Count samples that name a leader but have a blank gap, in the notes of the file."""
     if "gap" not in read or "leader" not in read:
         return
     blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NOBODY)
     if blank.any():
-        first = table.fault(int(rows[np.argmax(blank)]), "gap", "is blank")
+        first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
         table.notes.append(
             f"{int(blank.sum()):,} samples with a leader but a blank gap follow nobody, the first: "
             f"{first}"
@@ -210,78 +170,50 @@ def _vehicles(
     return {"vehicle": numbers, "leader": leaders}
 
 
-def to_trajectories(rows: pd.DataFrame, names: list[str], report: ReadReport) -> Trajectories:
+def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Trajectories:
     """Bring rows into the shape that episodes are extracted from.
 
     Args:
-        rows: one per vehicle and moment, in any order and in SI: recording (a number), vehicle
-            (positive), time, speed, row (number in the file, from 0) and, where known, leader (0
+        rows: one per vehicle and moment, in any order and in SI: recording (its name), vehicle
+            (positive), time_s, speed, file and row (numbers from 0) and, where known, leader (0
             for none), position (front bumper, along the road), lane (a number), gap (bumper to
             bumper; NaN for none), length (NaN or 0 for not given).
-        names: of the recordings.
+        place: makes of a table what describes its rows.
         report: completed here.
 
     Raises:
         DataError: if rows contradict each other, times are uneven, or speeds and positions do not
             agree; it names file, row and column.
     """
-    files = ", ".join(report.files)
-    rows = _once(_sorted(rows, report), names, report)
-    together = rows[["recording", "vehicle"]].diff().eq(0).all(axis=1).to_numpy()
-    steps = rows.time.diff().to_numpy()
-    if not together.any():
-        raise DataError(f"{files}: no vehicle has two samples; expected trajectories")
-    step = step_of(steps[together], report.source)
-    first = ~together | is_hole(np.where(together, steps, 0.0), step)
-    _check_way(rows, together, first, names, report)
-    report.vehicles, report.segments = int((~together).sum()), int(first.sum())
-    origin = rows.groupby("recording").time.min().reindex(range(len(names))).to_numpy()
-    frames = (rows.time - origin[rows.recording]).to_numpy() / FRAME
-    if frames.max() > LAST:
-        row = int(np.argmax(frames > LAST))
-        raise DataError(
-            f"{_place(rows, row, names, report)} is {FRAME * frames[row]:g} s after the first; is "
-            "the time in another unit?"
-        )
-    frame, segment = np.rint(frames).astype(np.int64), np.cumsum(first) - 1
-    if abs(step - FRAME) > UNEVEN * FRAME or np.abs(frames - frame).max() > UNEVEN:
-        rows, frame, segment = _interpolated(rows, frames, segment, report)
-        report.notes.append(resampled(steps[~first], step))
-    report.rows_kept = len(rows)
-    counts = np.bincount(rows.recording, minlength=len(names))
-    report.recordings = dict(zip(names, map(int, counts), strict=True))
-    time = origin[rows.recording] + frame / round(1 / FRAME)
-    return Trajectories(_samples(rows, names, time, frame, segment, report), report)
+    rows["recording"] = pd.Categorical(rows["recording"])
+    rows["episode"] = rows.groupby(["recording", "vehicle"], observed=True).ngroup()
+    rows = continuous(rows, "vehicle", place, report)
+    _check_way(rows, place, report)
+    origin = rows.groupby("recording", observed=True)["time_s"].transform("min").to_numpy()
+    motion = [name for name in ("speed", "position") if name in rows]
+    rows, frame = on_grid(rows, origin, motion, place, report)
+    return _samples(rows, frame, report)
 
 
-def _sorted(rows: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
-    """Rows in order of recording, vehicle and time."""
-    order = np.lexsort((rows.row, rows.time, rows.vehicle, rows.recording))
-    if not np.array_equal(order, np.lexsort((rows.row, rows.vehicle, rows.recording))):
-        report.notes.append("rows of a vehicle are not in order of time: sorted")
-    return rows.iloc[order].reset_index(drop=True)
-
-
-def _check_way(
-    rows: pd.DataFrame, together: Mask, first: Mask, names: list[str], report: ReadReport
-) -> None:
+def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
     """Check that positions and speeds tell of the same way: direction and units.
 
     Where some vehicles agree, the worst is named: it hides among many, and spoils a mean of few.
     """
     if "position" not in rows:
         return
-    driven = (rows.speed + rows.speed.shift()) / 2 * rows.time.diff()
-    ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(pd.Series(first), 0.0)
+    first = rows.episode.diff() != 0
+    vehicle = (rows.vehicle.diff() != 0) | (rows.recording.cat.codes.diff() != 0)
+    driven = (rows.speed + rows.speed.shift()) / 2 * rows.time_s.diff()
+    ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(first, 0.0)
     jumps = (ways.way - ways.driven).abs() > JUMP
-    each = ways.groupby(np.cumsum(~together)).sum()
+    each = ways.groupby(vehicle.cumsum()).sum()
     far = each.max(axis=1) >= LEAST_WAY
     off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
     worst = int(np.argmax(off * far))
-    row = int(np.flatnonzero(~together)[worst])
-    place = f"recording {names[rows.recording[row]]}, from data row {rows.row[row] + 1}"
+    where = place(rows)(int(np.flatnonzero(vehicle)[worst]), "")
     found = [
-        (f"vehicle {_name(rows, row, report)} ({place}) drives", "its", each.iloc[worst]),
+        (f"the vehicle from {where}, on drives", "its", each.iloc[worst]),
         ("the vehicles drive", "their", each.sum()),
     ]
     for who, whose, (way, driven) in (
@@ -293,7 +225,7 @@ def _check_way(
             low, high = (share * smooth.driven for share in AGREE)
             most = jumps.any() and smooth.driven > ways.driven.sum() / 2
             if most and low <= smooth.way <= high:
-                at = _place(rows, int(np.argmax(jumps)), names, report)
+                at = place(rows)(int(np.argmax(jumps)), "")
                 hint = (
                     f"positions jump {int(jumps.sum()):,} times, the first at {at}: do they begin "
                     "anew by lane or link? Give positions along the road, or leader and gap instead"
@@ -306,113 +238,39 @@ def _check_way(
             )
 
 
-def _interpolated(
-    rows: pd.DataFrame, place: Floats, segment: Whole, report: ReadReport
-) -> tuple[pd.DataFrame, Whole, Whole]:
-    """Rows on the common grid of frames; a leader is that of both samples beside it."""
-    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
-
-    smooth = [name for name in ("speed", "position") if name in rows]
-    table = rows[smooth].to_numpy()
-    starts, lengths = stretches(segment)
-    frames, before, values = [], [], []
-    for start, end in zip(starts, starts + lengths, strict=True):
-        grid = np.arange(np.ceil(place[start] - 1e-6), np.floor(place[end - 1] + 1e-6) + 1)
-        if end - start < 2 or not len(grid):
-            report.drop(ALONE, int(end - start))
-            continue
-        at = place[start:end]
-        values.append(PchipInterpolator(at, table[start:end])(grid.clip(at[0], at[-1])))
-        before.append(start + np.searchsorted(at, grid + 1e-6, side="right") - 1)
-        frames.append(grid.astype(np.int64))
-    if not frames:
-        raise DataError(f"{', '.join(report.files)}: no vehicle has two samples in a row")
-    frame, first = np.concatenate(frames), np.maximum(np.concatenate(before), 0)
-    after = np.minimum(first + 1, len(rows) - 1)
-    inside = (segment[after] == segment[first]) & (after > first)
-    span = np.where(inside, place[after] - place[first], 1.0)
-    weight = np.where(inside, ((frame - place[first]) / span).clip(0.0, 1.0), 0.0)
-    weight[weight < 1e-5] = 0.0
-    found, following = (rows.iloc[index].reset_index(drop=True) for index in (first, after))
-    found[smooth] = np.concatenate(values)
-    if "leader" in rows:
-        found["leader"] = found.leader.where((weight == 0) | (following.leader == found.leader), 0)
-    if "gap" in rows:
-        mixed = (1 - weight) * found.gap + weight * following.gap
-        found["gap"] = found.gap.where(weight == 0, mixed)
-    return found, frame, segment[first]
-
-
-def _place(rows: pd.DataFrame, row: int, names: list[str], report: ReadReport) -> str:
-    """Where a row is, for messages."""
-    files, recording = ", ".join(report.files), names[rows.recording[row]]
-    return f"{files}: recording {recording}, data row {rows.row[row] + 1}"
-
-
-def _name(rows: pd.DataFrame, row: int, report: ReadReport) -> str | int:
-    """The vehicle of a row, for messages."""
-    return report.names.get(rows.vehicle[row], rows.vehicle[row])
-
-
-def _once(rows: pd.DataFrame, names: list[str], report: ReadReport) -> pd.DataFrame:
-    """Return one row per vehicle and moment of sorted rows.
-
-    Raises:
-        DataError: if two rows of a vehicle and moment differ.
-    """
-    again = rows.duplicated(["recording", "vehicle", "time"])
-    differ = (again & ~rows.duplicated(rows.columns.drop("row"))).to_numpy()
-    if differ.any():
-        row = int(np.argmax(differ))
-        raise DataError(
-            f"{_place(rows, row, names, report)} and data row {rows.row[row - 1] + 1} differ, but "
-            f"are of one vehicle ({_name(rows, row, report)}) at one time ({rows.time[row]:g} s); "
-            "expected one row"
-        )
-    report.drop(EXACT, int(again.sum()))
-    return rows[~again].reset_index(drop=True)
-
-
-def _samples(
-    rows: pd.DataFrame,
-    names: list[str],
-    time: Floats,
-    frame: Whole,
-    segment: Whole,
-    report: ReadReport,
-) -> pd.DataFrame:
-    """The table of :class:`lcc_rl.data.trajectories.Trajectories`, with leaders and headways."""
+def _samples(rows: pd.DataFrame, frame: Whole, report: ReadReport) -> Trajectories:
+    """The rows as trajectories, with leaders and headways."""
+    recording = rows["recording"].cat
+    rows = rows.assign(recording=recording.codes)
     columns, zero = {str(name): rows[name].to_numpy() for name in rows}, np.zeros(len(rows))
     leader = columns["leader"] if "leader" in columns else _next_ahead(rows, frame)
     given, gap = "gap" in columns, columns.get("gap", zero)
     if given:  # a vehicle without a gap follows nobody
         leader = np.where(np.isnan(gap), 0, leader)
-    ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
     length = np.nan_to_num(columns.get("length", zero))
-    position = columns.get("position", zero)
-    to_leader = gap + length[ahead] if given else position[ahead] - position
-    headway = np.where(ahead >= 0, to_leader, np.nan)
-    seen = int((ahead >= 0).sum())
-    report.headways_given, report.headways_derived = (seen, 0) if given else (0, seen)
-    report.headways_unknown = int(((leader > 0) & (ahead < 0)).sum())
-    speed, last = columns["speed"], np.append(np.diff(segment) != 0, True)
+    headway = {}
+    if given:
+        ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
+        headway["space_headway_m"] = np.where(ahead >= 0, gap + length[ahead], np.nan)
+    speed, segment = columns["speed"], rows["episode"].to_numpy()
+    last = np.append(np.diff(segment) != 0, True)
     rate = np.where(last, 0.0, np.diff(speed, append=speed[-1]) / FRAME)
-    return pd.DataFrame(
+    same = ("recording", "vehicle", "time_s", "file", "row")
+    return assembled(
         {
-            "recording": pd.Categorical.from_codes(columns["recording"], pd.Index(names)),
-            "vehicle": columns["vehicle"],
-            "frame": frame.astype(np.int32),
-            "segment": segment.astype(np.int32),
-            "time_s": time,
-            "position_m": position.astype(np.float32),
-            "lane": columns.get("lane", zero).astype(np.int16),
-            "length_m": length.astype(np.float32),
-            "vehicle_class": zero.astype(np.int8),
-            "speed_mps": speed.astype(np.float32),
-            "acceleration_mps2": rate.astype(np.float32),
+            **{name: columns[name] for name in same},
+            "frame": frame,
+            "segment": segment,
+            "position_m": columns.get("position", zero),
+            "lane": columns.get("lane", zero),
+            "length_m": length,
+            "speed_mps": speed,
+            "acceleration_mps2": rate,
             "preceding": leader,
-            "space_headway_m": headway.astype(np.float32),
-        }
+            **headway,
+        },
+        [*recording.categories],
+        report,
     )
 
 

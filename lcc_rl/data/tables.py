@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import chain
 from os.path import expanduser  # that of pathlib raises for an unknown user
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,11 @@ from numpy.typing import NDArray
 from lcc_rl.data.text import (
     SEPARATORS,
     TEXT_TAKES,
-    as_utf8,
     cells_of,
     file_size,
+    line_chunks,
     parse_text,
     preamble,
-    reading,
     separator_of,
     single_spaces,
     unended,
@@ -149,7 +149,7 @@ def named_unit(name: str, quantity: str) -> str | None:
 
 
 class TableFile:
-    """Table in a file; its columns are read when asked.
+    """Table in a file; its columns are read when asked, once.
 
     The separator of text is the one that divides the header and the row after it alike: comma,
     semicolon, tab, bar or spaces. With semicolons, numbers may have a decimal comma. ``preamble``
@@ -157,26 +157,33 @@ class TableFile:
 
     Args:
         path: a .csv file or the like, gzipped or not, or a .parquet file.
+        spelled: makes of a name in the header that of a column.
+        bare: names of the columns of text without a header.
 
     Raises:
         DataError: if the file is missing, damaged or no table.
-        ConfigError: if it does not fit into memory.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        spelled: Callable[[str], str] = str.strip,
+        bare: Sequence[str] = (),
+    ) -> None:
         self.path = Path(expanduser(path))
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
+        self.names: dict[str, str] = {}
+        self.count = 0  # rows, once they are read
         self.comma = False  # whether numbers have a decimal comma
         if not self.path.is_file():
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
         self.parquet = self.path.suffix in PARQUET
         if self.parquet:
-            require_memory({f"reading {self.path}": PARQUET_TAKES * self.path.stat().st_size})
             with _readable(self.path):
                 self.header = [*pq.read_schema(self.path).names]
         else:
-            self._open_text()
+            self._open_text(spelled, bare)
 
     def read(
         self,
@@ -184,6 +191,7 @@ class TableFile:
         names: Names,
         units: Mapping[str, str] | None = None,
         option: str = "",
+        measured: Iterable[str] = (),
     ) -> dict[str, NDArray]:
         """Read columns and check every cell.
 
@@ -192,82 +200,159 @@ class TableFile:
             names: what they are called in the file, by key; None for one that there is not.
             units: their units by key; SI for those that are not named.
             option: where the configuration has the names, for messages.
+            measured: keys of the columns in which a blank cell costs the row.
 
         Returns:
-            The columns by key, in SI.
+            The columns by key, in SI, and ``row``, the number of each row in the file, from 0.
 
         Raises:
-            DataError: if a column is missing, or naming the row and column of a cell at fault.
+            DataError: if a column is missing, or naming the row and column of a cell at fault, or
+                if every row has a blank cell.
         """
         self.names = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
         missing = [name for name in self.names.values() if name not in self.header]
         if missing:
             raise lacking(str(self.path), missing, self.header, option)
-        for name in self.names.values():
+        takes = PARQUET_TAKES if self.parquet else TEXT_TAKES
+        require_memory({f"reading {self.path}": takes * file_size(self.path)})
+        wanted = {
+            column: self._scale(column, units or {}, option)
+            for column in columns
+            if column.key in self.names
+        }
+        parts = [
+            [
+                block.values(column, self.names[column.key], scale)
+                for column, scale in wanted.items()
+            ]
+            for block in self.blocks([*self.names.values()])
+        ]
+        whole = map(np.concatenate, zip(*parts, strict=True))
+        read = {column.key: values for column, values in zip(wanted, whole, strict=True)}
+        self.count = len(next(iter(read.values())))
+        return self._measured({**read, "row": np.arange(self.count)}, measured)
+
+    def _measured(self, read: dict[str, NDArray], keys: Iterable[str]) -> dict[str, NDArray]:
+        """Columns without rows in which one of ``keys`` is blank, which the notes count."""
+        blank = {key: np.isnan(read[key]) for key in keys if key in read}
+        wrong = np.logical_or.reduce([np.zeros(self.count, dtype=bool), *blank.values()])
+        if not wrong.any():
+            return read
+        row = int(np.argmax(wrong))
+        first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank")
+        if wrong.all():
+            raise first
+        line = f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
+        self.notes.append(line)
+        return {key: values[~wrong] for key, values in read.items()}
+
+    def _scale(self, column: Column, units: Mapping[str, str], option: str) -> float:
+        """The size in SI of the unit that a column is read in, unless its name says another."""
+        unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
+        scale = (unit and unit_size(column.quantity, unit)) or 1.0
+        said = named_unit(name, column.quantity)
+        if option and said and UNITS[column.quantity][said] != scale:
+            where = f"{option.removesuffix('columns')}units.{column.key}={said}"
+            raise DataError(
+                f"{self.path}: the name of column {name!r} says {said}, and it is read in "
+                f"{unit}; set {where}, or give the column another name"
+            )
+        return scale
+
+    def blocks(self, names: Sequence[str]) -> Iterator[Block]:
+        """Yield the rows in blocks, of text some megabytes each; at least one, if without rows.
+
+        Args:
+            names: the columns wanted, as in the header.
+        """
+        for name in names:
             if self.header.count(name) > 1:
                 raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
-        cells = (self._parquet_cells if self.parquet else self._text_cells)([*self.names.values()])
-        read = {}
-        for column in columns:
-            if column.key in self.names:
-                unit = (units or {}).get(column.key, SI.get(column.quantity, ""))
-                scale = (unit and unit_size(column.quantity, unit)) or 1.0
-
-                def fault(row: int, words: str, key: str = column.key) -> DataError:
-                    return self.fault(row, key, words)
-
-                name = self.names[column.key]
-                said = named_unit(name, column.quantity)
-                if option and said and UNITS[column.quantity][said] != scale:
-                    where = f"{option.removesuffix('columns')}units.{column.key}={said}"
-                    raise DataError(
-                        f"{self.path}: the name of column {name!r} says {said}, and it is read in "
-                        f"{unit}; set {where}, or give the column another name"
-                    )
-                read[column.key] = checked(cells[name], column, fault, scale, self.comma)
-        return read
+        if self.parquet:
+            yield Block(self, self._parquet(names))
+            return
+        places, row = {str(self.header.index(name)): name for name in names}, 0
+        for lines in self.lines:
+            if self.separator == " ":
+                lines = single_spaces(lines)
+            if not lines.strip():
+                continue
+            width, source = len(self.header), str(self.path)
+            table = parse_text(lines, width, self.separator, [*places], source, row)
+            yield Block(self, table.rename_columns([places[x] for x in table.column_names]), row)
+            row += table.num_rows
+            self.notes += unended(lines, f"{self.path}: data row {row}")
+        if not row:
+            yield Block(self, pa.table({name: pa.array([], pa.string()) for name in names}))
 
     def fault(self, row: int, key: str, words: str) -> DataError:
         """Return the error about a cell."""
         name = self.names.get(key, key)
         return DataError(f"{self.path}: data row {row + 1}, column {name!r} {words}")
 
-    def _parquet_cells(self, names: list[str]) -> Mapping[str, pa.ChunkedArray]:
+    def _parquet(self, names: Sequence[str]) -> pa.Table:
         with _readable(self.path):
-            table = pq.read_table(self.path, columns=names)
+            table = pq.read_table(self.path, columns=[*names])
             table.validate(full=True)  # damaged text would fail only when used
-        return {name: table[name] for name in names}
+        return table
 
-    def _open_text(self) -> None:
-        require_memory({f"reading {self.path}": TEXT_TAKES * file_size(self.path)})
-        with reading(self.path) as file:
-            content, self.notes = as_utf8(file.read(), str(self.path))
-        content = content.removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n")
-        self.preamble, content = preamble(content)
+    def _open_text(self, spelled: Callable[[str], str], bare: Sequence[str]) -> None:
+        chunks = line_chunks(self.path, self.notes)
+        content = next(chunks, b"").removeprefix(b"\xef\xbb\xbf")
+        self.preamble, content = preamble(re.sub(rb"\A([ \t]*\r?\n)+", b"", content))
         self.separator = separator_of(content)
+        first, _, rows = content.partition(b"\n")
         if self.separator == " ":
-            content = single_spaces(content)
-        first, _, self.rows = content.partition(b"\n")
-        self.header = [name.strip() for name in cells_of(first, self.separator)]
+            first = single_spaces(first)
+        self.header = [spelled(name) for name in cells_of(first, self.separator)]
         if not self.header:
             raise DataError(f"{self.path}: not a readable table: empty, or names no columns")
-        cells = cells_of(self.rows.partition(b"\n")[0], self.separator)
+        if bare and re.match(NUMBER, self.header[0].replace(",", "")):
+            if len(self.header) != len(bare):
+                raise DataError(
+                    f"{self.path}: the first line has {len(self.header)} columns and no header; "
+                    f"expected the {len(bare)} columns of the native layout"
+                )
+            self.header, rows = [*bare], content
+        self.lines = chain([rows], chunks)
+        cells = cells_of(rows.partition(b"\n")[0], self.separator)
         if len(cells) == len(self.header) + 1 and not cells[-1].strip():
             self.header.append("")  # rows end in a separator
         if self.separator != ",":
             words = f"columns are separated by {SEPARATORS[self.separator]}"
             self.notes.append(f"{self.path}: {words}")
-        self.comma = self.separator == ";" and b"," in self.rows and b"." not in self.rows
+        self.comma = self.separator == ";" and b"," in rows and b"." not in rows
         if self.comma:
             self.notes.append(f"{self.path}: numbers have a decimal comma")
 
-    def _text_cells(self, names: list[str]) -> Mapping[str, pa.ChunkedArray]:
-        if not self.rows.strip():
-            return {name: pa.chunked_array([], pa.string()) for name in names}
-        places = {str(self.header.index(name)): name for name in names}
-        table = parse_text(self.rows, len(self.header), self.separator, [*places], str(self.path))
-        self.notes += unended(self.rows, f"{self.path}: data row {table.num_rows}")
-        return {name: table[place] for place, name in places.items()}
+
+class Block:
+    """Consecutive rows of a table; cells are converted and checked when asked for.
+
+    Args:
+        file: the table.
+        cells: as they were read, by the names in the header.
+        before: rows before these in the file.
+    """
+
+    def __init__(self, file: TableFile, cells: pa.Table, before: int = 0) -> None:
+        self.file, self.cells = file, cells
+        self.row = before + np.arange(len(self))
+
+    def __len__(self) -> int:
+        return int(self.cells.num_rows)
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Keep only the rows where ``mask`` holds; messages still name rows of the file."""
+        self.row, self.cells = self.row[mask], self.cells.filter(pa.array(mask))
+
+    def values(self, column: Column, name: str, scale: float = 1.0) -> NDArray:
+        """Return the values of a column in SI, see :func:`checked`."""
+
+        def fault(row: int, words: str) -> DataError:
+            return self.file.fault(int(self.row[row]), column.key, words)
+
+        return checked(self.cells[name], column, fault, scale, self.file.comma)
 
 
 def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:

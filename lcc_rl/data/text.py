@@ -6,11 +6,12 @@ import csv
 import gzip
 import re
 import zlib
+from codecs import EncodedFile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader, RawIOBase
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.csv as pa_csv
@@ -21,6 +22,7 @@ from lcc_rl.io.memory import available, require_memory
 BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
+BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # read at once
 TEXT_TAKES = 3  # bytes of memory that reading a byte of text takes
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 # What files are that are no table in UTF-8, by their first bytes, and the remedy.
@@ -35,7 +37,7 @@ OTHERS = {
 
 
 @contextmanager
-def reading(name: str | Path) -> Iterator[IO[bytes]]:
+def reading(name: str | Path) -> Iterator[BufferedReader]:
     """Open a plain or gzipped file, distinguished by its first bytes.
 
     Raises:
@@ -61,7 +63,7 @@ class _Unpacked(RawIOBase):
         ConfigError: once more was unpacked than could be parsed in the memory that was free.
     """
 
-    def __init__(self, file: IO[bytes], name: str | Path) -> None:
+    def __init__(self, file: BufferedReader, name: str | Path) -> None:
         self.file, self.name = gzip.GzipFile(fileobj=file), name
         self.size, self.free = 0, available()
 
@@ -88,22 +90,44 @@ def is_text(content: bytes) -> bool:
         return False
 
 
-def check_text(content: bytes, place: str) -> None:
-    """Raise a DataError that says what bytes are, and the remedy, if they are not UTF-8 text."""
-    if not is_text(content):
+def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
+    """Yield whole lines of a file as UTF-8, some megabytes at a time.
+
+    Args:
+        path: the file, in UTF-8, UTF-16 or else Latin-1.
+        notes: where a line says so if it is not in UTF-8.
+
+    Raises:
+        DataError: if it cannot be read, or is no text.
+    """
+    rest = b""
+    with reading(path) as file:
+        wide = file.peek(2)[:2] in UTF16
+        source: Any = EncodedFile(file, "utf-8", "utf-16") if wide else file
+        notes += [f"{path}: is not UTF-8 and was read as UTF-16"] * wide
+        try:
+            while data := source.read(BLOCK_BYTES):
+                lines, end, rest = (rest + data).rpartition(b"\n")
+                if end:
+                    yield _as_utf8(lines + end, path, notes)
+                if len(rest) > LONGEST_LINE:
+                    raise DataError(f"{path}: is not a text table; expected lines")
+        except UnicodeError:
+            raise DataError(f"{path}: is not UTF-8 text{OTHERS[UTF16[0]]}") from None
+    if rest:
+        yield _as_utf8(rest, path, notes)
+
+
+def _as_utf8(content: bytes, path: Path, notes: list[str]) -> bytes:
+    """Text as UTF-8, also where it is Latin-1."""
+    if is_text(content):
+        return content
+    if content.startswith((b"\0", *OTHERS)) or b"\0" in content:
         kinds = (kind for start, kind in OTHERS.items() if content.startswith(start))
-        raise DataError(f"{place} is not UTF-8 text{next(kinds, '; expected a table')}")
-
-
-def as_utf8(content: bytes, source: str) -> tuple[bytes, list[str]]:
-    """Return the text of a file as UTF-8, and a line if it was UTF-16 or else Latin-1."""
-    code = "UTF-16" if content.startswith(UTF16) else "Latin-1"
-    other = content.startswith((b"\0", *OTHERS)) and code == "Latin-1"
-    with suppress(UnicodeDecodeError):
-        if not (other or is_text(content)) and "\0" not in (text := content.decode(code)):
-            return text.encode(), [f"{source}: is not UTF-8 and was read as {code}"]
-    check_text(content, f"{source}:")
-    return content, []
+        raise DataError(f"{path}: is not UTF-8 text{next(kinds, '; expected a table')}")
+    line = f"{path}: is not UTF-8 and was read as Latin-1"
+    notes += [line] * (line not in notes)
+    return content.decode("Latin-1").encode()
 
 
 def single_spaces(lines: bytes) -> bytes:
@@ -159,7 +183,7 @@ def stem(file: str | Path) -> str:
 
 
 def parse_text(
-    rows: bytes, width: int, separator: str, places: Sequence[str], source: str, first: int = 0
+    rows: bytes, width: int, separator: str, places: Sequence[str], source: str, before: int
 ) -> pa.Table:
     """Parse rows of text into columns of text, each named by its place, from 0.
 
@@ -169,7 +193,7 @@ def parse_text(
         separator: between columns.
         places: those wanted.
         source: the file, for messages.
-        first: number of the first line in the file; 0 to count data rows.
+        before: data rows before these in the file.
 
     Raises:
         DataError: if a row has more or fewer columns, or a quote is not closed.
@@ -198,13 +222,13 @@ def parse_text(
         )
     except pa.ArrowException as error:
         if odd:
-            raise _odd_row(odd[0], rows, width, source, first) from error
+            raise _odd_row(odd[0], rows, width, source, before) from error
         reason = str(error).splitlines()[0]
         raise DataError(f"{source}: not a readable table: {reason}") from error
     # An unclosed quote merges lines without an error.
     count = rows.count(b"\n") + (not rows.endswith(b"\n"))
     if table.num_rows != count and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):
-        place = f", from line {first} on" if first else ""
+        place = f", from data row {before + 1} on" if before else ""
         raise DataError(f"{source}: a quote is not closed, or a line end is stray{place}")
     return table
 
@@ -223,12 +247,14 @@ def unended(rows: bytes, place: str) -> list[Concern]:
     ]
 
 
-def _odd_row(row: pa_csv.InvalidRow, rows: bytes, width: int, source: str, first: int) -> DataError:
+def _odd_row(
+    row: pa_csv.InvalidRow, rows: bytes, width: int, source: str, before: int
+) -> DataError:
     """Return the error for a row of another number of columns."""
     text, held = row.text.encode(), row.actual_columns
-    lines = [line.rstrip(b"\r") for line in rows.rstrip(b"\r\n").split(b"\n")]
+    lines = re.findall(rb"[^\r\n]+", rows)  # blank ones hold no row
     number = lines.index(text) if text in lines else 0
-    place = f"line {number + first}" if first else f"data row {number + 1}"
+    place = f"data row {before + number + 1}"
     last = number == len(lines) - 1 and held < width
     place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
     return DataError(f"{source}: {place} has {held} columns; expected {width}{cut}")

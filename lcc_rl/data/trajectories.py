@@ -4,19 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.errors import DataError
-
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
-HOLE = 1.75  # of the usual step; a longer one is a missing sample
-HOLE_S, MANY = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
-UNEVEN = 0.1  # of a step, by which a regular one may be off
-SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
+KEYS = ("recording", "vehicle", "frame", "preceding")
+# Columns of trajectories beside the recording.
+TYPES = {
+    "vehicle": np.int64,
+    "frame": np.int32,
+    "segment": np.int32,
+    "time_s": np.float64,
+    "position_m": np.float32,
+    "lane": np.int16,
+    "length_m": np.float32,
+    "vehicle_class": np.int8,
+    "speed_mps": np.float32,
+    "acceleration_mps2": np.float32,
+    "preceding": np.int64,
+    "space_headway_m": np.float32,
+}
 
 
 @dataclass
@@ -71,12 +82,16 @@ class ReadReport:
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 
+    def left_out(self) -> list[str]:
+        """A line for each reason to drop rows."""
+        return [f"dropped {count:,} rows: {reason}" for reason, count in self.dropped.items()]
+
     def lines(self) -> list[str]:
         """The report as plain lines."""
         recordings = [f"{name} ({rows:,} rows)" for name, rows in self.recordings.items()]
         return [
             f"read {self.rows_read:,} rows from {listed(self.files)}; kept {self.rows_kept:,}",
-            *(f"dropped {count:,} rows: {reason}" for reason, count in self.dropped.items()),
+            *self.left_out(),
             f"{len(self.recordings)} recording(s): {listed(recordings)}",
             f"{self.vehicles:,} vehicles; missing frames cut their trajectories "
             f"{self.segments - self.vehicles:,} times, into {self.segments:,} segments",
@@ -116,40 +131,59 @@ class Trajectories:
     report: ReadReport
 
 
-def step_of(steps: NDArray[np.float64], source: str) -> float:
-    """Return the usual step, checked before samples are interpolated.
+def assembled(
+    columns: dict[str, NDArray], recordings: Sequence[str], report: ReadReport
+) -> Trajectories:
+    """Return sorted rows as trajectories, and count them in the report.
 
     Args:
-        steps: time between consecutive samples of a vehicle [s].
-        source: the file or files, for messages.
-
-    Raises:
-        DataError: if it is too short or too long for seconds.
+        columns: recording (a number), vehicle, frame and what else there is of ``TYPES``, and
+            further columns; consumed, since a table may hold millions of rows. Columns that are
+            missing are 0, ``segment`` and ``time_s`` follow from the frames, and space headways
+            that are blank or 0 from the positions in the frame.
+        recordings: names of the recordings.
+        report: completed here.
     """
-    step = float(np.median(steps))
-    if not SHORTEST <= step < LONGEST:
-        unit = "s" if step < SHORTEST else "ms"
-        raise DataError(
-            f"{source}: samples of a vehicle are {step:g} s apart; expected {SHORTEST:g} to "
-            f"{LONGEST:g} s; is the time in {unit} (data.units.time={unit})?"
+    _fill_headways(columns, report)
+    code, vehicle, frame = columns.pop("recording"), columns["vehicle"], columns["frame"]
+    changes = np.append(True, (np.diff(vehicle) != 0) | (np.diff(code) != 0))
+    if "segment" not in columns:
+        columns["segment"] = np.cumsum(changes | (np.diff(frame, prepend=0) != 1)) - 1
+    if "time_s" not in columns:  # division rounds correctly where the product 0.1·frame does not
+        columns["time_s"] = frame / round(1 / FRAME)
+    report.rows_kept, report.vehicles = len(code), int(changes.sum())
+    report.segments = len(starts_of(columns["segment"]))
+    counts = np.bincount(code, minlength=len(recordings))
+    report.recordings = {name: int(count) for name, count in zip(recordings, counts, strict=True)}
+    samples: dict[str, Any] = {
+        "recording": pd.Categorical.from_codes(code, categories=pd.Index(recordings))
+    }
+    for name, kind in TYPES.items():
+        values = columns.pop(name) if name in columns else np.zeros(len(code))
+        samples[name] = values.astype(kind, copy=False)
+    return Trajectories(pd.DataFrame({**samples, **columns}, copy=False), report)
+
+
+def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
+    """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
+    code, vehicle, frame, preceding = (columns[name] for name in KEYS)
+    headway = columns.setdefault("space_headway_m", np.zeros(len(code)))
+    follows = preceding > 0
+    given = follows & (headway != 0) & ~np.isnan(headway)
+    headway[~given] = np.nan
+    rows = np.flatnonzero(follows & ~given)
+    if len(rows):
+        index, position = RowIndex(code, vehicle, frame), columns["position_m"]
+        leader = find(
+            index.keys(code[rows], preceding[rows], frame[rows]), index.keys(code, vehicle, frame)
         )
-    return step
+        rows, leader = rows[leader >= 0], leader[leader >= 0]
+        headway[rows] = position[leader] - position[rows]
+    report.headways_given, report.headways_derived = int(given.sum()), len(rows)
+    report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
 
 
-def is_hole(steps: NDArray[np.float64], usual: NDArray | float) -> NDArray[np.bool_]:
-    """Return which steps [s] are holes, which divide a record; irregular sampling has few."""
-    long = steps > HOLE * usual
-    return long & (steps > HOLE_S) if long.mean() > MANY else long
-
-
-def resampled(steps: NDArray[np.float64], step: float) -> str:
-    """Return the line on samples, usually ``step`` apart, that are interpolated."""
-    odd = int((np.abs(steps - step) > UNEVEN * step).sum())
-    irregular = f", {odd:,} of them irregular," * bool(odd)
-    return f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s"
-
-
-class Places:
+class RowIndex:
     """One number per (recording, vehicle, frame), ascending in that order.
 
     Args:
@@ -193,51 +227,10 @@ def find_leaders(
     Returns:
         Row numbers; −1 where there is no vehicle ahead or it has no row in that frame.
     """
-    places = Places(recording, vehicle, frame)
-    return find(places.keys(recording, preceding, frame), places.keys(recording, vehicle, frame))
+    index = RowIndex(recording, vehicle, frame)
+    return find(index.keys(recording, preceding, frame), index.keys(recording, vehicle, frame))
 
 
 def starts_of(values: NDArray) -> NDArray[np.intp]:
     """First row of each stretch of equal values."""
     return np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
-
-
-def divided(
-    table: pd.DataFrame, wrong: NDArray[np.bool_], begins: NDArray[np.bool_], shortest: float
-) -> pd.DataFrame:
-    """Leave rows out of records, which are divided there.
-
-    Args:
-        table: rows of a record (whole numbers in the column ``episode``) lie together, in order of
-            ``time_s``.
-        wrong: the rows to leave out.
-        begins: rows before which a record is divided, too.
-        shortest: parts of a divided record that are shorter than this go as well [s].
-
-    Returns:
-        The other rows. The first part of a record keeps its number.
-    """
-    episode, time = table["episode"].to_numpy(), table["time_s"].to_numpy(np.float64)
-    first = np.zeros(len(table), dtype=bool)
-    first[starts_of(episode)] = True
-    touched = np.isin(episode, episode[wrong | (begins & ~first)])
-    if not touched.any():
-        return table
-    rows = np.flatnonzero(~wrong)
-    if not len(rows):
-        return table.iloc[:0]
-    starts, lengths = stretches(np.cumsum(first | begins | wrong)[rows])
-    duration = time[rows[starts + lengths - 1]] - time[rows[starts]]
-    keep = ~touched[rows[starts]] | (duration > shortest - 1e-6)
-    numbers = episode[rows[starts]][keep].astype(np.int64)
-    more = pd.Series(numbers).duplicated().to_numpy()
-    numbers[more] = episode.max() + 1 + np.arange(more.sum())
-    kept = table.iloc[rows[np.repeat(keep, lengths)]].reset_index(drop=True)
-    kept["episode"] = np.repeat(numbers, lengths[keep]).astype(episode.dtype)
-    return kept
-
-
-def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First row and number of rows of each stretch of equal values."""
-    starts = starts_of(values)
-    return starts, np.diff(np.append(starts, len(values)))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.data.episodes import ALIASES
-from lcc_rl.data.plausible import pair_place
+from lcc_rl.data.grid import places
 from lcc_rl.errors import Concern, DataError
 from lcc_rl.settings import NonNegative, Settings
 
@@ -211,7 +211,7 @@ def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, lis
     length = time.groupby(part).transform("max") - time.groupby(part).transform("min")
     longest = part[length == length.groupby(episode).transform("max")].groupby(episode).min()
     kept = frame[part == episode.map(longest)]
-    where = pair_place(frame)(int(np.argmax(low)), "gap_m")
+    where = places(frame)(int(np.argmax(low)), "gap_m")
     line = (
         f"{episode[low].nunique()} of {episode.nunique()} episodes cut where the gap is below "
         f"{selection.min_gap_m:g} m, the first: {where}; their longest part is used"

@@ -33,9 +33,9 @@ class Stream:
     """A synthetic stream.
 
     Args:
-        samples: one row per vehicle and frame in SI units, with the columns that
-            :func:`lcc_rl.data.ngsim_writer.write_ngsim` needs, and time_s. Positions are of the
-            front bumper; acceleration is the backward difference of speed.
+        samples: one row per vehicle and frame in SI units: recording, vehicle, frame, position_m
+            (front bumper), lane, length_m, vehicle_class, speed_mps, acceleration_mps2 (backward
+            difference of speed), preceding and time_s.
         truth: one row per IDM driver: recording, vehicle, preceding, and its parameters
             desired_speed_mps, time_gap_s, acceleration_mps2, deceleration_mps2, min_gap_m.
     """

@@ -2,21 +2,14 @@
 
 A lane of IDM drivers drawn from the calibrated I-80 population drives in platoons behind
 stochastic stop-and-go leaders (:class:`lcc_rl.synthetic.stop_and_go.StopAndGo`). The stream has the
-columns and the rounding of the official NGSIM layout, in which it can be written, and passes the
-same extraction and calibration as the real files. Unlike there, the parameters of every driver are
-known.
+columns and the rounding of NGSIM files and passes the same extraction and calibration. Unlike
+there, the parameters of every driver are known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import field, replace
 from datetime import UTC, datetime, timedelta
-from filecmp import cmp
-from os.path import expanduser
-from pathlib import Path
-from shutil import copyfile
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
@@ -24,14 +17,18 @@ import pandas as pd
 from pydantic import Field, InstanceOf
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.ngsim import of_columns
-from lcc_rl.data.ngsim_writer import official_columns, write_ngsim
 from lcc_rl.data.sources import LoadedEpisodes, episodes_of
-from lcc_rl.data.trajectories import FRAME
+from lcc_rl.data.trajectories import (
+    FOOT,
+    FRAME,
+    KEYS,
+    ReadReport,
+    Trajectories,
+    assembled,
+    find_leaders,
+)
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.errors import LARGEST_SIZE, LAST_SEED, ConfigError
-from lcc_rl.io.atomic import atomic_path
-from lcc_rl.io.files import write_parquet
 from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import Count, Settings, Share, given_as
 from lcc_rl.synthetic.lane import Stream, drive_platoons
@@ -64,8 +61,7 @@ class StreamSource(Settings):
     drivers: InstanceOf[DriverPopulation] | None = None  # None: the shipped I-80 drivers
     # What counts as car following; the default is that of real files.
     criteria: given_as(Criteria) = field(default_factory=Criteria)  # type: ignore[valid-type]
-    # A new .csv or .csv.gz file to write the stream to, never over another; None: no file.
-    keep: Annotated[str, Field(pattern=r"\.csv(\.gz)?$")] | None = None
+    keep: None = None  # no file is written; the hashes of runs hold this setting
 
     def settled(self) -> None:
         low, high = self.duration_s
@@ -91,64 +87,33 @@ class StreamSource(Settings):
         samples = pd.concat([one.samples for one in made], ignore_index=True)
         return Stream(samples, pd.concat([one.truth for one in made], ignore_index=True))
 
-    def write(self, path: str | Path) -> Stream:
-        """Generate the stream and write it in the official NGSIM layout.
-
-        The parameters of the drivers are written beside the file: ``stream_truth.parquet`` for
-        ``stream.csv``.
-            ResultsError: if a file cannot be written.
-        """
-        stream = self.generate()
-        write_stream(stream, path)
-        return stream
-
     def load(self) -> LoadedEpisodes:
-        """Generate the stream and extract the car-following episodes that its file would have.
+        """Generate the stream and extract its car-following episodes.
 
         Raises:
             DataError: if no pair meets the criteria.
-            ConfigError: if ``keep`` names a file that holds something else.
-            ResultsError: if the file cannot be written.
         """
-        stream = self.generate()
-        if self.keep is not None:
-            with TemporaryDirectory(prefix="lcc_rl_stream_") as folder:
-                kept = Path(expanduser(self.keep))
-                path = Path(folder) / kept.name
-                write_stream(stream, path)
-                keep_files({path: kept, truth_path(path): truth_path(kept)})
-        trajectories = of_columns(official_columns(stream.samples), "the stream")
-        loaded = episodes_of(trajectories, self.criteria, None)
+        loaded = episodes_of(as_recorded(self.generate().samples), self.criteria, None)
         size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"
         line = f"synthetic stream: {size} vehicles, seed {self.seed}"
         return replace(loaded, report=[line, *loaded.report])
 
 
-def write_stream(stream: Stream, path: str | Path) -> None:
-    """Write a stream, and beside it the parameters of its drivers."""
-    write_ngsim(stream.samples, path)
-    write_parquet(stream.truth, truth_path(path))
+def as_recorded(samples: pd.DataFrame) -> Trajectories:
+    """Return samples with the rounding of NGSIM files: three decimals of a foot, in float32.
 
-
-def keep_files(files: Mapping[Path, Path]) -> None:
-    """Copy files to where nothing stands, or the same already does.
-
-    Raises:
-        ConfigError: if one of the places holds something else; then none is written.
+    Args:
+        samples: see :class:`lcc_rl.synthetic.lane.Stream`; recordings in order of their names.
     """
-    new = {made: place for made, place in files.items() if not place.exists()}
-    for made, place in files.items():
-        if made not in new and not (place.is_file() and cmp(made, place, shallow=False)):
-            raise ConfigError(f"data.keep: {place} exists and holds something else; name a new one")
-    for made, place in new.items():
-        with atomic_path(place) as temporary:
-            copyfile(made, temporary)
-
-
-def truth_path(path: str | Path) -> Path:
-    """Path of the true parameters of a stream file's drivers."""
-    path = Path(path)
-    return path.with_name(f"{path.name.removesuffix('.gz').removesuffix('.csv')}_truth.parquet")
+    columns = {str(name): samples[name].to_numpy() for name in samples if name != "time_s"}
+    columns["recording"], names = pd.factorize(columns["recording"])
+    ahead = find_leaders(*(columns[key] for key in KEYS))
+    position = columns["position_m"]
+    columns["space_headway_m"] = np.where(ahead >= 0, position[ahead] - position, np.nan)
+    for name in columns:
+        if name.endswith(("_m", "_mps", "_mps2")):
+            columns[name] = (np.round(columns[name] / FOOT, 3) + 0.0) * FOOT
+    return assembled(columns, list(names), ReadReport(["the stream"], rows_read=len(samples)))
 
 
 def recording_name(index: int) -> str:

@@ -46,7 +46,7 @@ REFUSED = {
     "calibrate --seed 3": "--seed",
     "calibrate experiment=smoke": "this command has no option 'experiment'",
     "train data=ngsim data.path=nowhere.csv": "nowhere.csv",
-    "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: cannot be read",
+    "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: no such file",
     "train data=ngsim data.path=[]": "no file is named",
     "train resume=nowhere": "nowhere",
     "evaluate variant=alcc policy=nowhere": "nowhere",

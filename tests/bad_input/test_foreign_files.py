@@ -13,18 +13,17 @@ import pandas as pd
 import pytest
 import torch
 import yaml
-from commands import content, run_command, tiny
+from commands import run_command, tiny
 from helpers import POPULATION, wavy_profiles
 
 from lcc_rl.agents.factory import build_agent, make_trainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.commands import evaluation, training
 from lcc_rl.data.sources import NgsimSource
-from lcc_rl.errors import ConfigError, DataError, LccError, ResultsError
+from lcc_rl.errors import DataError, LccError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import load_config
-from lcc_rl.synthetic.stream import StreamSource
 
 
 @pytest.fixture(scope="module")
@@ -113,16 +112,6 @@ def test_ones_own_module_can_be_trusted_by_name_but_not_by_the_folder(
     assert load_config(run, ["comforts"]).trust == ["comforts"]
     with pytest.raises(ResultsError, match=r"trust=\[comforts\]"):
         load_config(run, ["other"])
-
-
-def test_keep_never_overwrites(tmp_path) -> None:
-    path, small = tmp_path / "stream.csv", {"recordings": 1, "platoons": 2, "vehicles": 3}
-    for _ in range(2):  # the same again is fine
-        StreamSource(**small, keep=str(path)).load()
-    before = content(tmp_path)
-    with pytest.raises(ConfigError, match=r"data\.keep: .*stream\.csv exists and holds something"):
-        StreamSource(**small, seed=1, keep=str(path)).load()
-    assert content(tmp_path) == before
 
 
 # -- weights ---------------------------------------------------------------------------------------

@@ -10,8 +10,9 @@ import pytest
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.car_following import Criteria, ExtractionReport, extract
-from lcc_rl.data.episodes import SCHEMA, read_episodes, validate_episodes
+from lcc_rl.data.episodes import SCHEMA, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.errors import ConfigError, DataError
 
 FOOT = 0.3048
@@ -175,7 +176,7 @@ def identified(group: tuple[int, pd.DataFrame]) -> tuple[tuple[float, float], pd
 
 def test_all_real_pairs_are_recovered(shared_data: Path) -> None:
     found, _ = extract(read_ngsim(shared_data / "i80_pairs_ngsim_layout.csv.gz"), Criteria())
-    truth = read_episodes(shared_data / "i80_pairs.parquet")
+    truth = EpisodesSource(path=str(shared_data / "i80_pairs.parquet")).load().episodes
     assert found["episode"].nunique() == truth["episode"].nunique() == 264
     # Ids differ; a pair is identified by its first time and position, which no two pairs share.
     expected = dict(map(identified, truth.groupby("episode")))

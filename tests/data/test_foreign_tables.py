@@ -113,7 +113,8 @@ def test_positions_that_begin_anew_are_no_other_unit(tmp_path, step) -> None:
     frame["x"] %= 150.0  # a link, or a ring
     source = TableSource(path=written(tmp_path, frame), columns={**BY_GAP, "position": "x"})
     with pytest.raises(
-        DataError, match=r"positions jump \d+ times, the first at .*data row \d+: do they begin"
+        DataError,
+        match=r"positions jump \d+ times, the first at .*data row \d+, vehicle 1: do they begin",
     ):
         source.load()
 

@@ -24,8 +24,8 @@ from lcc_rl.data.leaders import (
     stretch,
 )
 from lcc_rl.data.profiles import Split, join, leader_profiles
-from lcc_rl.data.sources import NgsimSource
-from lcc_rl.data.speed_records import read_speed_record, shipped_cycles
+from lcc_rl.data.sources import SHIPPED, NgsimSource
+from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.random import choose, stream_id
@@ -63,7 +63,7 @@ def test_shipped_cycles_are_the_published_ones() -> None:
     # Duration [s] and distance [km] as the regulations print them.
     published = {"udds": (1369, 11.99), "us06": (600, 12.89), "hwfet": (765, 16.51)}
     published["wltc_3b"] = (1800, 23.27)
-    assert shipped_cycles() == sorted(published)
+    assert sorted(SHIPPED) == sorted([*published, "drives", "platoons"])
     for name, (duration, kilometres) in published.items():
         time, own = read_speed_record(name)
         assert time[-1] == duration
@@ -109,7 +109,7 @@ def test_the_papers_own_protocol(tmp_path) -> None:
 
 IMPOSSIBLE = {
     "path is required": {"training": {"a": {}}},
-    "no shipped cycle": {"training": {"a": {"path": "uds"}}},
+    "none of the package .*us06": {"training": {"a": {"path": "uds"}}},
     "covers 0–600 s, not the stretch": {"cases": {"case_1": {"path": "us06", "start_s": 595.0}}},
     r"case_1\.followers": {"cases": {"case_1": {"path": "us06", "followers": 0}}},
     "scale must be greater": {"training": {"a": {"path": "us06", "scale": 0.0}}},
@@ -179,7 +179,7 @@ def test_the_first_car_of_native_openacc_files_leads(tmp_path) -> None:
     found = DriveLeaders(path=f"{tmp_path}/file*.csv").load(0.1, 100)
     every = (*found.training.names, *found.windows.names)
     assert {name.split("+")[0] for name in every} == {f"file{number}" for number in range(12)}
-    assert any("left out 1 rows with a blank Speed1" in line for line in found.report)
+    assert any("left out 1 rows with a blank cell" in line for line in found.report)
 
 
 # -- recorded traffic and mixtures -----------------------------------------------------------------

@@ -18,9 +18,8 @@ from ngsim_text import (
     portal_text,
 )
 
-from lcc_rl.data import ngsim
+from lcc_rl.data import text
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.ngsim_writer import write_ngsim
 from lcc_rl.data.trajectories import Trajectories
 
 FOOT = 0.3048
@@ -89,10 +88,10 @@ def test_every_layout_gives_the_same_samples(tmp_path: Path, layout: str) -> Non
 def test_files_larger_than_a_block_lose_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ngsim, "BLOCK_BYTES", 10_000)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 10_000)
     rows = [cells(vehicle, k) for vehicle in range(1, 13) for k in range(70)]
     for content in (csv_text(rows), native_text(rows)):
-        assert len(content) > 5 * ngsim.BLOCK_BYTES
+        assert len(content) > 5 * text.BLOCK_BYTES
         read_back = read(tmp_path, content)
         assert read_back.report.rows_kept == 840
         assert read_back.report.segments == read_back.report.vehicles == 12
@@ -181,18 +180,6 @@ def mixed() -> str:
 def test_locations_are_recordings_of_their_own(tmp_path: Path) -> None:
     time = "2005-04-13T22:58:55Z"
     assert read(tmp_path, mixed()).report.recordings == {f"i-80@{time}": 10, f"us-101@{time}": 6}
-
-
-def test_written_layout_is_the_official_one(tmp_path: Path) -> None:
-    samples = read(tmp_path, csv_text(pair(range(2)))).samples.drop(columns="space_headway_m")
-    samples.loc[0, "speed_mps"] = 0
-    write_ngsim(samples, tmp_path / "out.csv")
-    lines = (tmp_path / "out.csv").read_text().splitlines()
-    assert lines[0] == OFFICIAL
-    start = 1113433135000  # the name of the recording tells whole seconds
-    assert lines[1] == f"7,0,2,{start},18,0,0,0,15,6.4,2,0,-1.5,2,9,0,60,9999.99"
-    assert lines[2] == f"7,1,2,{start + 100},18,10,0,0,15,6.4,2,100,-1.5,2,9,0,60,0.6"
-    assert lines[3] == f"9,0,2,{start},18,60,0,0,15,6.4,2,100,-1.5,2,0,7,0,0"
 
 
 def test_real_pairs(shared_data: Path) -> None:

@@ -9,12 +9,14 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TextIO
 
 import numpy as np
 import pandas as pd
 
 from benchmarks.harness import Row, rates, rows_of, stream
-from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.ngsim import OFFICIAL, read_ngsim
+from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import DataError
 
 # The kernel's mark of this very process: ru_maxrss may begin at that of the one that started it.
@@ -46,7 +48,7 @@ def read(options: Namespace) -> list[Row]:
     with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder:
         path, fourfold = Path(folder, "stream.csv.gz"), Path(folder, "fourfold.csv.gz")
         if options.ngsim is None:
-            stream(options.quick).write(path)
+            write_ngsim(stream(options.quick).generate().samples, path)
         path = Path(options.ngsim or path)
         runs = {"read_ngsim": lambda: read_ngsim(path), "pandas": lambda: pd.read_csv(path)}
         count = read_ngsim(path).report.rows_read
@@ -59,6 +61,20 @@ def read(options: Namespace) -> list[Row]:
             "… 4 × the rows": peak_memory(READER, str(fourfold), ""),
         }
     return rows + rows_of(memory, "MiB", {name: [PEAK] for name in memory if name != PEAK})
+
+
+def write_ngsim(samples: pd.DataFrame, path: Path | TextIO) -> None:
+    """Write samples of a synthetic stream as an 18-column NGSIM file; unused columns are 0."""
+    start = pd.to_datetime(samples["recording"]).dt.tz_localize(None)
+    clock = start.to_numpy("datetime64[ms]").astype("int64") + 100 * samples["frame"]
+    whole = {"Vehicle_ID": "vehicle", "Frame_ID": "frame", "v_Class": "vehicle_class"}
+    whole |= {"Lane_ID": "lane", "Preceding": "preceding"}
+    feet = {"Local_Y": "position_m", "v_Length": "length_m", "v_Vel": "speed_mps"}
+    feet |= {"v_Acc": "acceleration_mps2"}
+    columns = {name: samples[own] for name, own in whole.items()} | {"Global_Time": clock}
+    columns |= {name: samples[own] / FOOT for name, own in feet.items()}
+    table = pd.DataFrame({name: columns.get(name, 0) for name in OFFICIAL})
+    table.to_csv(path, index=False, float_format="%.3f")
 
 
 def write_copies(path: Path, target: Path, locations: Sequence[str]) -> None:

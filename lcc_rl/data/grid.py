@@ -1,0 +1,292 @@
+"""One grid for every table: rows by record and time, divided at holes, every 0.1 s.
+
+A record holds the rows of a vehicle, a pair or a drive; its number stands in the column
+``episode``. Rows carry the number of their file (``file``) and of their row there (``row``), so
+that :func:`places` describes a sample of any table to the user.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
+from lcc_rl.errors import DataError
+
+HOLE = 1.75  # of the usual step; a longer one is a missing sample
+HOLE_S, MANY = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
+UNEVEN = 0.1  # of a step; one that is further off is irregular
+REGULAR = 0.01  # of 0.1 s, by which samples may be off the grid: times in float32 are by 10 µs
+SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
+MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
+LAST = 2**31 - 1  # frame
+ORIGIN = ["file", "row", "leader_row", "label"]  # columns that only describe where a row is from
+Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
+Places = Callable[[pd.DataFrame], Place]
+Floats = NDArray[np.float64]
+Whole = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def places(
+    table: pd.DataFrame,
+    files: Sequence[str] = (),
+    columns: Mapping[str, str | None] | None = None,
+    vehicles: Mapping[int, str] | None = None,
+) -> Place:
+    """Return what describes a sample: its file, recording, episode, row, vehicle and column.
+
+    What the table does not know is left out. Without a row, the time stands for it.
+
+    Args:
+        table: of vehicles, pairs or drives.
+        files: by the numbers in its column ``file``.
+        columns: what the files call their columns, by key.
+        vehicles: names of numbered vehicles.
+
+    Examples:
+        >>> table = pd.DataFrame({"recording": ["i-80"], "vehicle": [7], "time_s": [0.3]})
+        >>> places(table)(0, "gap_m")
+        "recording i-80, vehicle 7 (follower), 0.3 s, column 'gap_m'"
+    """
+    named = columns or {}
+
+    def place(row: int, column: str = "") -> str:
+        known = table.iloc[row].to_dict()
+        role = "leader" if column.startswith("leader") else "follower"
+        at = known.get("row" if role == "follower" else "leader_row", known.get("row"))
+        vehicle = known.get(f"{role}_id", known.get("vehicle"))
+        key = re.sub("_(m|s|mps)$", "", column)
+        own = named.get(key) or named.get(re.sub("^(leader|follower)_", "", key)) or column
+        words = [f"recording {known['recording']}" if "recording" in known else ""]
+        words.append(f"episode {known['label']}" if known.get("label") else "")
+        words.append("" if at is None else f"data row {at + 1}")
+        if vehicle is not None and "label" not in known:
+            name = (vehicles or {}).get(vehicle, vehicle)
+            words.append(f"vehicle {name}" + f" ({role})" * (at is None))
+        words.append(f"{known['time_s']:g} s" if at is None else "")
+        words.append(f"column {own!r}" if column else "")
+        file = f"{files[known['file']]}: " if files and "file" in known else ""
+        return file + ", ".join(filter(None, words))
+
+    return place
+
+
+# -- records ---------------------------------------------------------------------------------------
+
+
+def continuous(
+    samples: pd.DataFrame, what: str, place: Places, report: ReadReport, divide: bool = True
+) -> pd.DataFrame:
+    """Sort records by time, keep the first row of a moment, and divide records at holes.
+
+    Args:
+        samples: rows in any order: ``episode`` (number of the record, from 0), ``time_s``, ``row``
+            and what else there is.
+        what: key of the column that tells records apart: vehicle, episode or drive.
+        place: makes of a table what describes its rows.
+        report: counts what is left out.
+        divide: whether holes divide a record.
+
+    Returns:
+        The rows in order; a record of several parts has several numbers.
+
+    Raises:
+        DataError: if too many rows of a moment differ, or no record has two samples.
+    """
+    samples = _first_of_moments(_sorted(samples, report), what, place, report)
+    same = np.append(False, np.diff(samples["episode"]) == 0)
+    if not same.any():
+        raise DataError(f"{report.source}: no {what} has two samples: {place(samples)(0, what)}")
+    usual = _usual_steps(samples, same, what, report.source)
+    steps = np.diff(samples["time_s"], prepend=0.0)
+    hole = is_hole(np.where(same, steps, 0.0), usual) & divide
+    alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
+    if not (hole.any() or alone.any()):
+        return samples
+    count = samples["episode"].nunique()
+    parts = divided(samples, alone, hole, 0.0)
+    report.drop("alone between holes", int(alone.sum()))
+    if parts.empty:
+        raise DataError(f"{report.source}: no {what} has two samples in a row")
+    found = f"{count:,} {what}s into {parts['episode'].nunique():,}"
+    report.notes += [f"{int(hole.sum()):,} holes divide {found}"] * bool(hole.any())
+    return parts
+
+
+def _sorted(samples: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
+    """Rows by record and time."""
+    record, later = samples["episode"].diff(), samples["time_s"].diff() >= 0
+    if ((record > 0) | ((record == 0) & later)).iloc[1:].all():
+        return samples
+    order = np.lexsort((samples["time_s"], samples["episode"]))  # stable
+    if not np.array_equal(order, np.argsort(samples["episode"], kind="stable")):
+        report.notes.append("rows of a record are not in order of time: sorted")
+    return samples.iloc[order].reset_index(drop=True)
+
+
+def _first_of_moments(
+    samples: pd.DataFrame, what: str, place: Places, report: ReadReport
+) -> pd.DataFrame:
+    """One row for each moment of sorted records."""
+    again = samples.duplicated(["episode", "time_s"]).to_numpy()
+    if not again.any():
+        return samples
+    said = samples.columns.drop(["file", "row"], errors="ignore")
+    others = again & ~samples.duplicated(said).to_numpy()
+    rows = np.flatnonzero(others if others.any() else again)
+    where = place(samples)(int(rows[samples["row"].to_numpy()[rows].argmin()]), "time_s")
+    if others.sum() > MOST_TWICE * len(samples):
+        raise DataError(
+            f"{where} repeats a moment of its {what} with other values, as do "
+            f"{100 * others.mean():.0f} % of the rows; does a column name the {what}?"
+        )
+    words = f"rows of a moment that their {what} has already, {int(others.sum()):,} of them with"
+    report.drop(f"{words} other values, the first: {where}", int(again.sum()))
+    return samples[~again].reset_index(drop=True)
+
+
+def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> Floats:
+    """Usual time between samples of each row's record [s]; ``same``: as that of the row before."""
+    steps = samples["time_s"].diff().where(same)
+    step = float(steps.median())
+    if not SHORTEST <= step < LONGEST:
+        unit, node = "s" if step < SHORTEST else "ms", "leader" if what == "drive" else "data"
+        raise DataError(
+            f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST:g} to "
+            f"{LONGEST:g} s; is the time in {unit} ({node}.units.time={unit})?"
+        )
+    if not ((steps - step).abs() > UNEVEN * step).any():
+        return np.full(len(samples), step)
+    own = steps.groupby(samples["episode"]).transform("median")
+    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY)
+    return own.where(many, step).to_numpy()
+
+
+def is_hole(steps: Floats, usual: Floats) -> Mask:
+    """Return which steps [s] are holes, which divide a record; irregular sampling has few."""
+    long = steps > HOLE * usual
+    return long & (steps > HOLE_S) if long.mean() > MANY else long
+
+
+def divided(table: pd.DataFrame, wrong: Mask, begins: Mask, shortest: float) -> pd.DataFrame:
+    """Leave rows out of records, which are divided there.
+
+    Args:
+        table: rows of a record (whole numbers in the column ``episode``) lie together, in order of
+            ``time_s``.
+        wrong: the rows to leave out.
+        begins: rows before which a record is divided, too.
+        shortest: parts of a divided record that are shorter than this go as well [s].
+
+    Returns:
+        The other rows. The first part of a record keeps its number.
+    """
+    episode, time = table["episode"].to_numpy(), table["time_s"].to_numpy(np.float64)
+    first = np.zeros(len(table), dtype=bool)
+    first[starts_of(episode)] = True
+    touched = np.isin(episode, episode[wrong | (begins & ~first)])
+    if not touched.any():
+        return table
+    rows = np.flatnonzero(~wrong)
+    if not len(rows):
+        return table.iloc[:0]
+    starts, lengths = stretches(np.cumsum(first | begins | wrong)[rows])
+    duration = time[rows[starts + lengths - 1]] - time[rows[starts]]
+    keep = ~touched[rows[starts]] | (duration > shortest - 1e-6)
+    numbers = episode[rows[starts]][keep].astype(np.int64)
+    more = pd.Series(numbers).duplicated().to_numpy()
+    numbers[more] = episode.max() + 1 + np.arange(more.sum())
+    kept = table.iloc[rows[np.repeat(keep, lengths)]].reset_index(drop=True)
+    kept["episode"] = np.repeat(numbers, lengths[keep]).astype(episode.dtype)
+    return kept
+
+
+def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First row and number of rows of each stretch of equal values."""
+    starts = starts_of(values)
+    return starts, np.diff(np.append(starts, len(values)))
+
+
+# -- every 0.1 s -----------------------------------------------------------------------------------
+
+
+def on_grid(
+    samples: pd.DataFrame, origin: Floats, smooth: Sequence[str], place: Places, report: ReadReport
+) -> tuple[pd.DataFrame, Whole]:
+    """Bring continuous records to samples 0.1 s apart.
+
+    Columns of motion are interpolated monotonically (PCHIP), ``gap`` linearly and only where both
+    samples beside a moment have one; a ``leader`` is that of both. Other columns are those of the
+    sample before.
+
+    Args:
+        samples: see :func:`continuous`.
+        origin: time of frame 0, of each row [s].
+        smooth: the columns of motion.
+        place: makes of a table what describes its rows.
+        report: counts what is left out.
+
+    Returns:
+        The samples, their ``time_s`` that of a frame, and the frame of each.
+    """
+    at = ((samples["time_s"] - origin) / FRAME).to_numpy()
+    if at.max() > LAST:
+        row = int(np.argmax(at > LAST))
+        raise DataError(
+            f"{place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; is the time in "
+            "another unit?"
+        )
+    frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
+    steps = np.diff(samples["time_s"])[np.diff(episode) == 0]
+    step = float(np.median(steps))
+    samples = samples.assign(origin=origin)
+    if abs(step - FRAME) > UNEVEN * FRAME or np.abs(at - frame).max() > REGULAR:
+        odd = int((np.abs(steps - step) > UNEVEN * step).sum())
+        irregular = f", {odd:,} of them irregular," * bool(odd)
+        report.notes.append(f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s")
+        samples, frame = _interpolated(samples, at, [*smooth], report)
+    samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
+    return samples, frame
+
+
+def _interpolated(
+    samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
+) -> tuple[pd.DataFrame, Whole]:
+    """Samples at the whole frames within each record; ``at`` are the frames of the samples."""
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
+    table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
+    frames, before, values = [], [], []
+    for start, length in zip(*stretches(episode), strict=True):
+        own = at[start : start + length]
+        grid = np.arange(np.ceil(own[0] - 1e-6), np.floor(own[-1] + 1e-6) + 1)
+        if len(grid) < 2:
+            report.drop("stretch without two samples on the time grid", int(length))
+            continue
+        motion = PchipInterpolator(own, table[start : start + length])
+        values.append(motion(grid.clip(own[0], own[-1])))
+        before.append(start + np.searchsorted(own, grid + 1e-6, side="right") - 1)
+        frames.append(grid.astype(np.int64))
+    if not frames:
+        raise DataError(
+            f"{report.source}: no record lasts {FRAME:g} s; is the time in another unit?"
+        )
+    frame, first = np.concatenate(frames), np.maximum(np.concatenate(before), 0)
+    after = np.minimum(first + 1, len(samples) - 1)
+    inside = (episode[after] == episode[first]) & (after > first)
+    span = np.where(inside, at[after] - at[first], 1.0)
+    weight = np.where(inside, ((frame - at[first]) / span).clip(0.0, 1.0), 0.0)
+    weight[weight < 1e-5] = 0.0
+    found, following = (samples.iloc[index].reset_index(drop=True) for index in (first, after))
+    found[smooth] = np.concatenate(values)
+    if "leader" in samples:
+        found["leader"] = found.leader.where((weight == 0) | (following.leader == found.leader), 0)
+    if "gap" in samples:
+        mixed = (1 - weight) * found.gap + weight * following.gap
+        found["gap"] = found.gap.where(weight == 0, mixed)
+    return found, frame
