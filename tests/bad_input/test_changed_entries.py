@@ -25,6 +25,15 @@ class Greedy(Controller):
         return 0.1 * (gap.clamp_(min=20.0) - 20.0) + 0.5 * relative_speed
 
 
+class Hidden(Greedy):
+    """Changes what it reads by way of NumPy, which no counter of torch sees."""
+
+    def command(self, gap, relative_speed):
+        seen = gap.detach().numpy()
+        seen += 1.0
+        return 0.1 * (gap - 20.0) + 0.5 * relative_speed
+
+
 class Remembering(Controller):
     reads = ("self.gap",)
     remembers = ("count",)
@@ -87,6 +96,7 @@ CONTROLLER = "scenario.controllers.automated"
 LAW = f"{{_target_: lcc_rl.pieces.Law, law: {HERE}.nearer}}"
 CASES = [  # the class at fault, what it changes, and the option that uses it
     ("Greedy", "vehicles.gap", f"{CONTROLLER}={{_target_: {HERE}.Greedy}}"),
+    ("Hidden", "vehicles.gap", f"{CONTROLLER}={{_target_: {HERE}.Hidden}}"),
     ("Remembering", "automated.count", f"{CONTROLLER}={{_target_: {HERE}.Remembering}}"),
     (f"{HERE}.nearer", "vehicles.gap", f"{CONTROLLER}={LAW}"),
     ("Hasty", "vehicles.gap", f"scenario.controllers.human._target_={HERE}.Hasty"),

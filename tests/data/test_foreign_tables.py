@@ -34,6 +34,8 @@ def written(folder: Path, frame: pd.DataFrame, name: str = "my.csv", **options: 
         ("SpeedKph", "speed", "km/h"),
         ("speed_km_h_filtered", "speed", "km/h"),
         ("wind knots", "speed", "kn"),
+        ("speed miles per hour", "speed", "mph"),
+        ("Speed [kilometres per hour]", "speed", "km/h"),
         ("v_fps", "speed", "ft/s"),
         ("gap (ft)", "length", "ft"),
         ("SpaceFeet", "length", "ft"),

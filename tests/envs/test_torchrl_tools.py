@@ -471,3 +471,9 @@ WRAPPERS = {
 
 def test_wrappers_not_tried_exist() -> None:
     assert all(hasattr(envs, name) for name in WRAPPERS)
+
+
+def test_an_environment_is_built_and_played_in_inference_mode() -> None:
+    with torch.inference_mode():
+        env = small_env("alcc", 2)
+        assert env.rollout(3).shape == (2, 3)

@@ -193,6 +193,7 @@ def test_what_cannot_take_effect_is_refused_in_one_line(env, many, call, message
     with pytest.raises(LccError, match=message) as error:
         call(env, many)
     assert "\n" not in str(error.value)
+    assert np.isfinite(many.step(STILL)[0]).all()  # a refused step changed nothing
 
 
 @pytest.mark.parametrize(

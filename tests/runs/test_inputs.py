@@ -14,7 +14,11 @@ from lcc_rl.config import identity, load
 from lcc_rl.drivers.tables import load_drivers
 from lcc_rl.io.files import write_parquet
 
-OWN = "from lcc_rl.pieces import RewardTerm\nclass Term(RewardTerm):\n    table: str = ''\n"
+OWN = """import own_helper
+from lcc_rl.pieces import RewardTerm
+class Term(RewardTerm):
+    table: str = ''
+"""
 TERM = "+reward.terms.own={_target_: own_term.Term, table: t.txt}"
 # What is typed after the command, and the file that it reads.
 READ = {
@@ -33,6 +37,7 @@ READ = {
     "compare=[own_term.Term]": "own_term.py",
     TERM: "t.txt",
     f"{TERM} ": "own_term.py",
+    f"{TERM}  ": "own_helper.py",
 }
 
 
@@ -42,6 +47,8 @@ def place(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "own_term", raising=False)
+    monkeypatch.delitem(sys.modules, "own_helper", raising=False)
+    (tmp_path / "own_helper.py").write_text("WEIGHT = 1\n")
     (tmp_path / "own_term.py").write_text(OWN)
     return tmp_path
 
@@ -101,3 +108,21 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
 def test_what_a_run_reads_is_no_setting() -> None:
     with pytest.raises(Exception, match="inputs: a run notes itself which files it reads"):
         load("train", ["inputs={}"])
+
+
+def test_a_file_of_config_dir_is_an_input(place) -> None:
+    own = place / "own" / "controller" / "slow.yaml"
+    own.parent.mkdir(parents=True)
+    kept = []
+    for accel in (0.1, 0.2):
+        own.write_text(f"_target_: lcc_rl.pieces.ConstantAcceleration\nacceleration: {accel}\n")
+        words = (
+            "compare=[slow]",
+            "evaluation.baselines=[]",
+            f"hydra.run.dir=run{accel}",
+            *NO_AGENT,
+        )
+        command = ("lcc_rl.cli.evaluate", "variant=idm", *words, "--config-dir", "own")
+        run_command(*command, cwd=place, check=True)
+        kept.append(made_by(place / f"run{accel}" / "episodes.parquet"))
+    assert kept[0] != kept[1]
