@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, style
+from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.cells import markdown_row
 from lcc_rl.results.fronts import (
     DISTANCE,
@@ -21,7 +22,6 @@ from lcc_rl.results.fronts import (
     saved,
     saved_at_flow,
 )
-from lcc_rl.results.intervals import Estimate
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}

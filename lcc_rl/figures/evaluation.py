@@ -34,9 +34,9 @@ from lcc_rl.figures.drawing import (
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.cells import column_cells, signed
 from lcc_rl.results.headline import several
-from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.means import Means
 from lcc_rl.results.motion import telling
 from lcc_rl.results.names import FILTERED, in_words

@@ -18,8 +18,8 @@ from lcc_rl.figures.drawing import (
     paper,
     style,
 )
+from lcc_rl.results.bootstrap import band
 from lcc_rl.results.headline import several
-from lcc_rl.results.intervals import band
 from lcc_rl.results.names import in_words
 
 WINDOW = 10  # iterations of the rolling mean

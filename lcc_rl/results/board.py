@@ -11,9 +11,9 @@ from rich.table import Table
 
 from lcc_rl.errors import require
 from lcc_rl.results import headline
+from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.cells import markdown_row, signed
 from lcc_rl.results.headline import Shown, saved
-from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.names import in_words
 from lcc_rl.results.savings import DRIVE
 from lcc_rl.results.scores import FLOW, FLOW_LOST, NAMED, PER_DISTANCE, Task, keeps, limited

@@ -14,8 +14,8 @@ from rich.text import Text
 
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import unknown_name
+from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.cells import MISSING, column_cells
-from lcc_rl.results.intervals import LEAST_DRIVES
 from lcc_rl.results.names import HUMAN, NETWORK, in_words
 from lcc_rl.results.savings import KEYS
 from lcc_rl.results.tables import PATH, PER_KM, ROWS, strategies_side_by_side

@@ -9,8 +9,8 @@ from typing import Self
 import pandas as pd
 
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.headline import counted, several
-from lcc_rl.results.intervals import Estimate
 from lcc_rl.results.runs import EPISODES
 from lcc_rl.results.savings import WAYS, savings
 

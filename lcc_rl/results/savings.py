@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.intervals import Estimate, saving, share_saved
+from lcc_rl.results.bootstrap import NOTHING, Estimate, saving, share_saved
 
 KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
@@ -19,7 +19,6 @@ UNTRAINED = (
     *("direct", "idm", "human", "recorded", "constant_filtered", RULE),
     *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
-NOTHING = Estimate(np.nan)
 WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
 # Prefix of a saving, and of which energy: the path's, which leaves out what the motion stores
 # and with it what ending slower saves; and as drawn (A2).
@@ -90,7 +89,7 @@ def savings(
 
     Returns:
         The share with its interval over windows or drives, and seeds
-        (:func:`lcc_rl.results.intervals.saving`), on the windows that both were evaluated on; NaN
+        (:func:`lcc_rl.results.bootstrap.estimate`), on the windows that both were evaluated on; NaN
         if one of them is missing.
     """
     chosen = episodes[episodes["strategy"].isin([strategy, baseline])]

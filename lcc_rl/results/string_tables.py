@@ -7,7 +7,7 @@ import pandas as pd
 from rich.console import Group
 
 from lcc_rl.errors import unknown_name
-from lcc_rl.results import intervals
+from lcc_rl.results import bootstrap
 from lcc_rl.results.headline import Shown
 from lcc_rl.results.names import in_words
 from lcc_rl.results.tables import strategies_side_by_side
@@ -54,7 +54,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         spread = rows[f"{name}_squares"].sum() / frames - mean**2
         row[f"{name}_sum_{label}"] = per_run(f"{name}_sum").mean()
         row[f"{name}_std_{label}"] = float(np.sqrt(max(spread, 0.0)))
-    row |= intervals.mean(per_run("reward")).columns("reward")
+    row |= bootstrap.mean(per_run("reward")).columns("reward")
     row["min_gap_m"] = rows["min_gap_m"].min()
     row["max_gap_error_m"] = rows["max_gap_error_m"].max()
     row["collisions"] = int(rows["collided"].sum())

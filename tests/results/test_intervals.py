@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lcc_rl.results.bootstrap import crossed, mean, saving, share_saved
 from lcc_rl.results.fronts import (
     DISTANCE,
     ENERGY,
@@ -18,7 +19,6 @@ from lcc_rl.results.fronts import (
     saved_at_flow,
     saving_at,
 )
-from lcc_rl.results.intervals import crossed, mean, saving, share_saved
 from lcc_rl.results.savings import per_window, savings
 
 NETWORK, RULE = ("alcc", "network"), ("alcc", "idm")

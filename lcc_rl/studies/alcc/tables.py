@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from lcc_rl.results.bootstrap import mean, share_saved
 from lcc_rl.results.cells import MISSING, heading
-from lcc_rl.results.intervals import mean, share_saved
 from lcc_rl.results.savings import (
     BASELINES,
     KINDS,

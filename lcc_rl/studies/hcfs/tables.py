@@ -11,7 +11,7 @@ import torch
 from lcc_rl.data.leaders import WHOLE
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.functional.hcfs import PlatoonReward
-from lcc_rl.results import intervals
+from lcc_rl.results import bootstrap
 from lcc_rl.results.savings import DRIVE
 from lcc_rl.results.string_tables import COUNTS, case_table
 
@@ -104,9 +104,9 @@ def per_seed(episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward
     )
 
 
-def crossed(runs: pd.DataFrame) -> intervals.Estimate:
+def crossed(runs: pd.DataFrame) -> bootstrap.Estimate:
     """Return the mean of a table of :func:`per_seed` with its interval over drives and seeds."""
-    return intervals.crossed(runs, drives=_drives(runs))
+    return bootstrap.crossed(runs, drives=_drives(runs))
 
 
 def _drives(runs: pd.DataFrame) -> list[object]:
@@ -143,7 +143,7 @@ def win_rates(
         row |= crossed(difference).columns("reward_gain")
         # Rewards are negative: the share of the loss that is saved.
         both = -own[shared], -other[shared]
-        gain = intervals.saving(*both, paired=True, drives=_drives(own))
+        gain = bootstrap.saving(*both, paired=True, drives=_drives(own))
         row |= gain.columns("gain_pct", 100.0)
         rows.append(row | {"seeds_ahead": int((difference.mean() > 0).sum())})
     return pd.DataFrame(rows)
@@ -245,7 +245,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
         }
         for name, energy in spent.items():
             own = group[group["strategy"] == name]
-            saved = intervals.saving(energy, spent[strategies[0]], drives=_drives(energy))
+            saved = bootstrap.saving(energy, spent[strategies[0]], drives=_drives(energy))
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
             row: dict[str, object] = {"leaders": source, "strategy": NAMES[name]}
             row |= crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
