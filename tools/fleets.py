@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, style
 from lcc_rl.results.bootstrap import Estimate
-from lcc_rl.results.cells import markdown_row
 from lcc_rl.results.fronts import (
     DISTANCE,
     FLEET,
@@ -22,6 +21,7 @@ from lcc_rl.results.fronts import (
     saved,
     saved_at_flow,
 )
+from lcc_rl.results.render import markdown_row
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}

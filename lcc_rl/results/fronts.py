@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import Estimate, Side, estimate, share_saved
-from lcc_rl.results.savings import DRIVE
+from lcc_rl.results.windows import DRIVE
 
 KINDS = ["variant", "policy"]
 ENERGY, SHARE = "total_path_energy_kj", "share_time_gap_long_moving"

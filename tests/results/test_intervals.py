@@ -19,7 +19,7 @@ from lcc_rl.results.fronts import (
     saved_at_flow,
     saving_at,
 )
-from lcc_rl.results.savings import per_window, savings
+from lcc_rl.results.windows import savings, windows_of
 
 NETWORK, RULE = ("alcc", "network"), ("alcc", "idm")
 
@@ -103,9 +103,7 @@ def test_rows_and_their_means_by_window_save_alike() -> None:
     }
     one = pd.DataFrame(table | {"energy": np.random.default_rng(0).uniform(1.0, 2.0, len(places))})
     frame = pd.concat([one.assign(strategy="alcc"), one.assign(strategy="idm", energy=2.0)])
-    whole, windows = (
-        savings(x, "energy", "alcc", "idm") for x in (frame, per_window(frame, "energy"))
-    )
+    whole, windows = (savings(x, "energy", "alcc", "idm") for x in (frame, windows_of(frame)))
     assert whole == windows
     assert np.isfinite(whole.low)
 

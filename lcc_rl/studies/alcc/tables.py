@@ -1,6 +1,6 @@
 """Tables of energy, safety and learning in the ALCC study, with 95 % intervals.
 
-Their arguments are windows of :class:`lcc_rl.results.means.Means`, every strategy on the same
+Their arguments are windows of :class:`lcc_rl.results.windows.Means`, every strategy on the same
 windows and drivers. Intervals of savings are over windows and seeds, all others over seeds only.
 """
 
@@ -9,21 +9,20 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.bootstrap import mean, share_saved
-from lcc_rl.results.cells import MISSING, heading
-from lcc_rl.results.savings import (
-    BASELINES,
-    KINDS,
-    NOTHING,
-    UNTRAINED,
-    per_seed,
-    savings,
-    stratified,
-)
+from lcc_rl.results.bootstrap import NOTHING, mean, share_saved
+from lcc_rl.results.names import heading
+from lcc_rl.results.render import MISSING
+from lcc_rl.results.report import UNTRAINED
+from lcc_rl.results.windows import LEADER, SOURCE, by_source, per_seed, savings
 
 PATH = "total_path_energy_kj"
 PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
+BASELINES = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
 COMPARED = (*BASELINES, "own_energy")
+# Prefix of a saving, and of which energy: the path's, which excludes what the motion stores and so
+# what ending slower saves; and as drawn (A2).
+KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
+TERCILES = ("lower", "middle", "upper")
 LONG, MOVING = "long_time_gap_pct", "long_time_gap_above_1_mps_pct"
 SHARES = {
     "unsafe_ttc_pct": "share_ttc_unsafe",
@@ -74,7 +73,7 @@ def headline(windows: pd.DataFrame) -> pd.DataFrame:
 def strata(windows: pd.DataFrame) -> pd.DataFrame:
     """Savings of path energy in the terciles of windows by what their leader does.
 
-    Rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained strategy
+    Rows of :func:`stratified` for ``alcc``, or every trained strategy
     without it, against each baseline.
     """
     names = [name for name in per_seed(windows, PATH) if name not in UNTRAINED]
@@ -87,6 +86,40 @@ def strata(windows: pd.DataFrame) -> pd.DataFrame:
     table = pd.concat(parts, ignore_index=True)
     table["by"] = table["by"].map(heading)
     return table[["strategy", "against", *table.columns.drop(["strategy", "against"])]]
+
+
+def stratified(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.DataFrame:
+    """Return savings in the terciles of windows by their leader, and in each source of leaders.
+
+    Args:
+        episodes: windows of an evaluation.
+        column: the energy.
+        strategy: the strategy that saves.
+        baseline: the strategy that it is compared with.
+
+    Returns:
+        One row per measure and tercile, the lowest first: its windows, the range of the measure
+        and the share saved [%] with its interval; and one per source, if there are several, by
+        its name in the column ``tercile``, without a range.
+    """
+    strata: list[tuple[str, str, object, object, pd.DataFrame]] = []
+    if SOURCE in episodes:
+        strata += [(SOURCE, name, np.nan, np.nan, rows) for name, rows in by_source(episodes)]
+    for measure in LEADER:
+        windows = episodes.groupby("profile_id")[measure].first().sort_values()
+        parts = np.array_split(np.arange(len(windows)), len(TERCILES))
+        for name, part in zip(TERCILES, (windows.iloc[chosen] for chosen in parts), strict=True):
+            if len(part):
+                inside = episodes[episodes["profile_id"].isin(part.index)]
+                strata.append((measure, name, part.iloc[0], part.iloc[-1], inside))
+    return pd.DataFrame(
+        [
+            {"by": measure, "tercile": name, "windows": inside["profile_id"].nunique()}
+            | {"least": least, "most": most}
+            | savings(inside, column, strategy, baseline).columns("saving_pct", 100.0)
+            for measure, name, least, most, inside in strata
+        ]
+    )
 
 
 def _seeds(rows: pd.DataFrame) -> str:

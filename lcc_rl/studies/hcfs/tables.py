@@ -12,8 +12,8 @@ from lcc_rl.data.leaders import WHOLE
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import bootstrap
-from lcc_rl.results.savings import DRIVE
-from lcc_rl.results.string_tables import COUNTS, case_table
+from lcc_rl.results.platoons import COUNTS, case_table
+from lcc_rl.results.windows import DRIVE
 
 LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
 # What the paper prints in Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.

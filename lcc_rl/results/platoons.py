@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from rich.console import Group
 
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import bootstrap
-from lcc_rl.results.headline import Shown
-from lcc_rl.results.names import in_words
-from lcc_rl.results.tables import strategies_side_by_side
+from lcc_rl.results.measures import Shown
 
 COUNTS = ("switches", "clamps", "cap_interventions")
 
@@ -95,17 +92,3 @@ COLUMNS = (
     Shown("collisions", "colli-\nsions"),
 )
 CAPTION = "sums over followers and frames, means over runs"
-
-
-def headline(table: pd.DataFrame) -> pd.DataFrame:
-    """Shorten a case's table, as :func:`lcc_rl.results.headline.headline`."""
-    found = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
-    found = found[["strategy", *(column.key for column in COLUMNS)]]
-    caption = f"{CAPTION}; all measures: table=all or --all."
-    found.attrs |= {"caption": caption, "shown": COLUMNS}
-    return found
-
-
-def in_full(table: pd.DataFrame, title: str) -> Group:
-    """Return all that a case's table holds, a column per strategy."""
-    return strategies_side_by_side(table, ROWS, title, CAPTION)
