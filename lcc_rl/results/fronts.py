@@ -132,18 +132,6 @@ def saved_at_flow(point: Curve, rule: Curve) -> float:
     return float(share_saved(per_distance(point)[0], rival))
 
 
-def gained_at_energy(point: Curve, rule: Curve) -> float:
-    """Return the share of the flow that a fleet gains on a front, at its energy per distance.
-
-    The front's flow is the largest at which it needs no more energy; NaN if it always needs more.
-    """
-    order = np.argsort(rule[FLOW])
-    spent, flow = per_distance(rule)[order], rule[FLOW][order]
-    fine = np.linspace(flow[0], flow[-1], 1001)
-    enough = fine[np.interp(fine, flow, spent) <= per_distance(point)[0]]
-    return float(point[FLOW][0] / enough.max() - 1.0) if len(enough) else np.nan
-
-
 def points(windows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per kind of controller and limit: means over windows and seeds."""
     rows = windows.groupby([*KINDS, "limit"], sort=False)

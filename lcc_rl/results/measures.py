@@ -20,7 +20,9 @@ FASTER, BROKEN = "share_leader_faster", "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 FLOW = "flow_vph"
 TTC, LONG = "share_ttc_unsafe", "share_time_gap_long_moving"
-LEAST, SHARE = "≥", "share_"
+BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
+SPEED_STD, SPREAD = "speed_std_mps", "final_speed_spread_mps"
+LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
 
 
 class Shown(NamedTuple):
@@ -28,6 +30,10 @@ class Shown(NamedTuple):
 
     key: str
     heading: str
+
+
+UNSAFE = Shown("unsafe_ttc_pct", "TTC\n< 4 s\n[%]")
+LONG_GAPS = Shown("long_time_gap_pct", "long\ngap\n[%]")
 
 
 @dataclass(frozen=True)
@@ -38,23 +44,23 @@ class Measure:
         key: its name in files; the column of episodes.parquet, if ``of`` names no other.
         label: its row in tables of every measure, with the unit; without one it is in files only.
         form: format of its number.
+        limit: heading of a limit that a task may set, with ``≤ {:g}`` or ``≥ {:g}`` in place of the
+            bound.
         short: its column of short tables; a share is in per cent there.
         of: the column of episodes.parquet.
         per: a column; the measure is then the ratio of both totals.
         factor: what a ratio is multiplied by.
-        limit: heading of a limit that a task may set, with ``≤ {:g}`` or ``≥ {:g}`` in place of the
-            bound.
         score: its name as a task's score.
     """
 
     key: str
     label: str = ""
     form: str = "{:.2f}"
+    limit: str = ""
     short: Shown | None = None
     of: str = ""
     per: str = ""
     factor: float = 1.0
-    limit: str = ""
     score: str = ""
 
     @property
@@ -111,12 +117,8 @@ MEASURES = [
     _energy("net_energy_", score="net_energy"),
     *(Measure(f"{group}_net_energy_kj") for group in ("cav", "hdv", "total")),
     Measure("mean_speed_mps", "mean speed [m/s]"),
-    Measure("speed_std_mps", "deviation of a speed in time [m/s]", score="speed_std_mps"),
-    Measure(
-        "final_speed_spread_mps",
-        "spread of speeds at the end [m/s]",
-        score="final_speed_spread_mps",
-    ),
+    Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
+    Measure(SPREAD, "spread of speeds at the end [m/s]", score=SPREAD),
     Measure(FLOW, "flow [vehicles/h]", "{:.0f}"),
     Measure("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", "{:.0%}"),
@@ -127,47 +129,15 @@ MEASURES = [
     Measure("min_time_gap_s", "shortest time gap [s]", limit="time\ngap\n≥ {:g} s"),
     Measure("max_time_gap_s", limit="time\ngap\n≤ {:g} s"),
     Measure("min_ttc_s", "minimum time-to-collision [s]", limit="TTC\n≥ {:g} s"),
-    Measure(
-        TTC,
-        "time with TTC < 4 s",
-        "{:.2%}",
-        Shown("unsafe_ttc_pct", "TTC\n< 4 s\n[%]"),
-        limit="TTC\n< 4 s\n≤ {:g} %",
-    ),
-    Measure(
-        "share_ttc_unpromised",
-        "  of it outside the filter's promise",
-        "{:.2%}",
-        limit="TTC\nbare\n≤ {:g} %",
-    ),
-    Measure(
-        "share_turned_unsafe",
-        "steps that turn unsafe",
-        "{:.2%}",
-        limit="turned\nunsafe\n≤ {:g} %",
-    ),
-    Measure(BROKEN, "  of them promised by the filter", "{:.2%}"),
+    Measure(TTC, "time with TTC < 4 s", PERCENT, "TTC\n< 4 s\n≤ {:g} %", UNSAFE),
+    Measure(BARE, "  of it outside the filter's promise", PERCENT, "TTC\nbare\n≤ {:g} %"),
+    Measure(TURNED, "steps that turn unsafe", PERCENT, "turned\nunsafe\n≤ {:g} %"),
+    Measure(BROKEN, "  of them promised by the filter", PERCENT),
     Measure("share_filter_acts", "time in which the filter acts", "{:.1%}"),
-    Measure(
-        "share_time_gap_long",
-        "time with time gap > 2.5 s",
-        "{:.2%}",
-        limit="long\ngaps\n≤ {:g} %",
-    ),
-    Measure(
-        LONG,
-        "  above 1 m/s",
-        "{:.2%}",
-        Shown("long_time_gap_pct", "long\ngap\n[%]"),
-        limit="long\ngaps\n≤ {:g} %",
-    ),
+    Measure("share_time_gap_long", "time with time gap > 2.5 s", PERCENT, "long\ngaps\n≤ {:g} %"),
+    Measure(LONG, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", LONG_GAPS),
     Measure("rms_jerk_mps3", "RMS jerk [m/s³]"),
-    Measure(
-        FASTER,
-        "time with a leader faster than v0",
-        "{:.1%}",
-        limit="leader\nfaster\n≤ {:g} %",
-    ),
+    Measure(FASTER, "time with a leader faster than v0", "{:.1%}", "leader\nfaster\n≤ {:g} %"),
     Measure(REACH[0], "CAV beyond the energy model's reach", "{:.1%}"),
     Measure(REACH[1], "HDV beyond the energy model's reach", "{:.1%}"),
     Measure("collisions", "collisions", "{:.0f}"),

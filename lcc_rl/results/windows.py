@@ -114,14 +114,14 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
 def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.DataFrame:
     """Return sums, counts and ends of columns by keys."""
     numbers = [str(name) for name in frame.select_dtypes(["number", "bool"])]
-    names = list(columns) or [name for name in numbers if name not in (*KEYS, SEED)]
+    names = [name for name in columns or numbers if name in numbers and name not in (*KEYS, SEED)]
     if not columns:
         shares = [name for name in names if name.startswith("share_")]
         frame = frame.assign(**{f"worst_{name}": frame[name] for name in shares})
         names += [f"worst_{name}" for name in shares]
     names = list(dict.fromkeys(["episodes", *names]))
     keys = [frame[name] for name in by if name in frame]
-    values = frame.reindex(columns=names).astype(np.float64)
+    values = frame[names].astype(np.float64)
     groups = values.groupby(keys, sort=False, dropna=False, observed=True)
     kinds: dict[str, list[str]] = {kind: [] for kind in ("sum", "count", "min", "max")}
     for name in names:
