@@ -47,18 +47,21 @@ class Run:
     def __str__(self) -> str:
         return self.printed()
 
-    def printed(self, full: bool = False) -> str:
+    def printed(self, full: bool = False, against: str | None = None) -> str:
         """Return the tables that commands print, with ``full`` of every measure."""
         console = Console(width=WIDTH)
         with console.capture() as text:
-            for one in self.reports:
+            for one in self.reports(against):
                 console.print(render.text(one, one.of, full))
         return text.get().rstrip()
 
-    @cached_property
-    def reports(self) -> list[Report]:
-        """The report of each source of leaders, or case of a platoon."""
-        return list(evaluation.reports(self.rows, self.cfg))
+    def reports(self, against: str | None = None) -> list[Report]:
+        """Return the report of each source of leaders, or case of a platoon.
+
+        Args:
+            against: the strategy that savings are against; by default as in tables.
+        """
+        return list(evaluation.reports(self.rows, self.cfg, against))
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -66,7 +69,7 @@ class Run:
 
         Of a task its scores and limits come first. Several sources or cases as below.
         """
-        return together(self.reports).table
+        return together(self.reports()).table
 
     @cached_property
     def headline(self) -> pd.DataFrame:
@@ -74,7 +77,7 @@ class Run:
 
         Of several sources of leaders, or cases of a platoon, the rows of each, named in ``of``.
         """
-        return together(self.reports).short
+        return together(self.reports()).short
 
     @cached_property
     def training(self) -> pd.DataFrame:

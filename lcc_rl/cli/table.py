@@ -2,6 +2,7 @@
 
 lcc-rl table outputs/evaluate/<run>
 lcc-rl table outputs/evaluate/<run> --all               # every measure
+lcc-rl table outputs/evaluate/<run> --against idm       # savings against another strategy
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
 lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
@@ -40,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--format", choices=FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
     parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
+    parser.add_argument("--against", help="strategy that savings are against")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options = parser.parse_args(arguments)
     names = options.columns.split(",") if options.columns else None
@@ -50,9 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run = read_run(options.run, options.trust)
         with reading(run.folder / EPISODES):
             if options.format == "text" and not names:
-                print(run.printed(full=options.all))
+                print(run.printed(options.all, options.against))
                 return
-            report = together(run.reports)
+            report = together(run.reports(options.against))
         if options.all:
             table = chosen(worded(report.table), names or [])
         else:

@@ -401,7 +401,7 @@ def _play_missing(
                 progress.update(done)
 
 
-def reports(rows: Rows, cfg: StudyConfig) -> Iterator[Report]:
+def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
     """Yield the report of each source of leaders, or case of a platoon."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
         for source, part in by_source(rows):
@@ -411,7 +411,7 @@ def reports(rows: Rows, cfg: StudyConfig) -> Iterator[Report]:
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source, part in by_source(windows_for(rows)):
-        yield report(part, task_of(cfg), build_energy(cfg), filtered, source)
+        yield report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:

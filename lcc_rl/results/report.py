@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.energy import Fleet
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures, platoons
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
@@ -121,7 +121,10 @@ def baseline_of(strategies: Iterable[object]) -> str | None:
 
 
 def summary(
-    windows: pd.DataFrame, task: Task | None = None, energy: Fleet | None = None
+    windows: pd.DataFrame,
+    task: Task | None = None,
+    energy: Fleet | None = None,
+    against: str | None = None,
 ) -> pd.DataFrame:
     """Summarise every strategy.
 
@@ -130,6 +133,7 @@ def summary(
         task: score, baseline and limits; by default path energy per km, against the first of
             :data:`AGAINST`, without limits.
         energy: the energy models, for the unit of a task.
+        against: the baseline without a task.
 
     Returns:
         One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
@@ -139,11 +143,16 @@ def summary(
         it keeps them without a collision. Values that a strategy does not have are NaN.
 
     Raises:
-        ConfigError: if the column of a limit, or the strategy ``task.against``, is missing.
+        ConfigError: if the column of a limit, or the baseline, is missing.
     """
     parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
-    _check(task, windows, parts)
-    against = task.against if task else baseline_of(parts)
+    against = task.against if task else against or baseline_of(parts)
+    if against is not None and against not in parts:
+        raise unknown_name("strategy to compare against", against, parts)
+    # Without automated vehicles none has a value that a limit bounds.
+    for column in task.limits if task and WAYS[0] in windows else ():
+        if column not in windows:
+            raise ConfigError(f"task.limits.{column}: episodes.parquet has no such column")
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
     rows = []
     for name, part in parts.items():
@@ -172,17 +181,6 @@ def summary(
     return table
 
 
-def _check(task: Task | None, windows: pd.DataFrame, strategies: Mapping[str, object]) -> None:
-    if task is None:
-        return
-    # Without automated vehicles none has a value that a limit bounds.
-    for column in task.limits if WAYS[0] in windows else ():
-        if column not in windows:
-            raise ConfigError(f"task.limits.{column}: episodes.parquet has no such column")
-    if task.against not in strategies:
-        raise ConfigError(f"task.against={task.against}: it is not among the strategies evaluated")
-
-
 def scored(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
     """Return the score of a strategy's windows in the task's unit."""
     value = task.measure.value(part)
@@ -199,6 +197,7 @@ def report(
     filtered: bool = False,
     of: str = "",
     few: bool = False,
+    against: str | None = None,
 ) -> Report:
     """Return the report of an evaluation.
 
@@ -209,9 +208,12 @@ def report(
         filtered: whether there is a safety filter, for the caption.
         of: name of the source.
         few: whether windows that are too few for a finding have a sentence, too.
+        against: the strategy that savings are against; by default that of the task, or the first
+            of :data:`AGAINST`.
     """
-    task = task and task.among(windows["strategy"])
-    table, said = summary(windows, task, energy), remarks(windows)
+    if task:
+        task = replace(task, against=against) if against else task.among(windows["strategy"])
+    table, said = summary(windows, task, energy, against), remarks(windows)
     make = _of_task(table, task) if task else _of_energy(table, energy, filtered)
     rows = _rows(table, task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
