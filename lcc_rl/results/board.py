@@ -12,7 +12,7 @@ from rich.table import Table
 from lcc_rl.errors import require
 from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
-from lcc_rl.results.measures import FLOW, MEASURES, Shown
+from lcc_rl.results.measures import FLOW, MEASURES, SPREAD, Shown
 from lcc_rl.results.names import in_words
 from lcc_rl.results.render import MISSING, markdown_row, saved, signed
 from lcc_rl.results.report import FLOW_LOST, NAMED
@@ -31,6 +31,7 @@ COLUMNS = (
 )
 HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits not kept"]
 SHARE = ("saving", "saving_low", "saving_high")
+COPIED = ("score", *SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", SPREAD)
 
 
 def row_of(
@@ -46,16 +47,16 @@ def row_of(
         drivers: number of drivers that it met.
 
     Returns:
-        Plain values, numbers that do not exist as None: every measure; ``limits`` contains bound
-        and value of each, ``windows`` and ``drives`` count what the interval is over.
+        Plain values, numbers that do not exist as None: ``limits`` contains bound and value of
+        each, ``measures`` all measures; ``windows`` and ``drives`` count what the interval is over.
     """
     by_name = table.set_index("strategy")
     found = by_name.loc[strategy]
     row: dict[str, Any] = {"task": task.name, "source": source}
     row |= {"measure": task.score, "unit": task.unit if task.measure.per else None}
     row |= {"against": task.against, "baseline": _number(by_name.loc[task.against, "score"])}
-    names = ("score", *SHARE, "distance_lost", FLOW_LOST, *(one.key for one in MEASURES))
-    row |= {name: _number(found[name]) for name in names}
+    row |= {name: _number(found[name]) for name in COPIED}
+    row["measures"] = {measure.key: _number(found[measure.key]) for measure in MEASURES}
     row["limits"] = {
         name: {"bound": bound, "value": _number(found[name])} for name, bound in task.limits.items()
     }

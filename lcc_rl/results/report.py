@@ -313,8 +313,8 @@ def _short(table: pd.DataFrame, shown: Sequence[Shown]) -> dict[str, Any]:
         distance_pct=-100.0 * table["distance_lost"] + 0.0,  # no negative zero
         **{f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")},
     )
-    ends = [f"saved_pct{end}" for end in ("_low", "_high")] if SAVED in shown else []
-    return {"short": table[["strategy", *(one.key for one in shown), *ends]], "shown": shown}
+    names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
+    return {"short": table[["strategy", *(x for x in names if x in table)]], "shown": shown}
 
 
 def compared(found: pd.DataFrame, against: str, always: bool = False) -> str:

@@ -57,4 +57,4 @@ def test_a_score_has_it(tmp_path) -> None:
     words = ["idm_acc", "--task", "i80-follow", "--on", "everyday", "--out", str(tmp_path / "out")]
     assert score.main([*words, *SMALL]) == 0
     (row,) = json.loads((tmp_path / "out" / "score.json").read_text("utf-8"))["results"]
-    assert row[MINE.key] > 0.0
+    assert row["measures"][MINE.key] > 0.0
