@@ -44,6 +44,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
+from lcc_rl.results import platoons
 from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.render import show, text
@@ -52,7 +53,6 @@ from lcc_rl.results.report import (
     counted,
     few_windows,
     leader_too_fast,
-    platoon,
     remarks,
     report,
     several,
@@ -407,7 +407,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
-                yield platoon(part, case, f"{of}{case}")
+                yield platoons.report(part, case, f"{of}{case}")
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source, part in by_source(windows_for(rows)):

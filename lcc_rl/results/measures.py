@@ -20,6 +20,7 @@ FASTER, BROKEN = "share_leader_faster", "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 FLOW = "flow_vph"
 TTC, LONG = "share_ttc_unsafe", "share_time_gap_long_moving"
+NAMES = {TTC: "unsafe_ttc_pct", LONG: "long_time_gap_pct"}  # of columns of short tables
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 SPEED_STD, SPREAD = "speed_std_mps", "final_speed_spread_mps"
 LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
@@ -32,10 +33,6 @@ class Shown(NamedTuple):
     heading: str
 
 
-UNSAFE = Shown("unsafe_ttc_pct", "TTC\n< 4 s\n[%]")
-LONG_GAPS = Shown("long_time_gap_pct", "long\ngap\n[%]")
-
-
 @dataclass(frozen=True)
 class Measure:
     """A measure of a strategy.
@@ -46,7 +43,8 @@ class Measure:
         form: format of its number.
         limit: heading of a limit that a task may set, with ``≤ {:g}`` or ``≥ {:g}`` in place of the
             bound.
-        short: its column of short tables; a share is in per cent there.
+        short: its heading in short tables, where a share is in per cent; without one it is in full
+            tables only.
         of: the column of episodes.parquet.
         per: a column; the measure is then the ratio of both totals.
         factor: what a ratio is multiplied by.
@@ -57,7 +55,7 @@ class Measure:
     label: str = ""
     form: str = "{:.2f}"
     limit: str = ""
-    short: Shown | None = None
+    short: str = ""
     of: str = ""
     per: str = ""
     factor: float = 1.0
@@ -67,6 +65,12 @@ class Measure:
     def columns(self) -> tuple[str, ...]:
         """The columns that it is made of."""
         return tuple(filter(None, (self.of or self.key, self.per)))
+
+    @property
+    def shown(self) -> Shown:
+        """Its column of short tables."""
+        share = f"{self.key.removeprefix(SHARE)}_pct" if self.scale > 1.0 else self.key
+        return Shown(NAMES.get(self.key, share), self.short)
 
     @property
     def scale(self) -> float:
@@ -129,13 +133,13 @@ MEASURES = [
     Measure("min_time_gap_s", "shortest time gap [s]", limit="time\ngap\n≥ {:g} s"),
     Measure("max_time_gap_s", limit="time\ngap\n≤ {:g} s"),
     Measure("min_ttc_s", "minimum time-to-collision [s]", limit="TTC\n≥ {:g} s"),
-    Measure(TTC, "time with TTC < 4 s", PERCENT, "TTC\n< 4 s\n≤ {:g} %", UNSAFE),
+    Measure(TTC, "time with TTC < 4 s", PERCENT, "TTC\n< 4 s\n≤ {:g} %", "TTC\n< 4 s\n[%]"),
     Measure(BARE, "  of it outside the filter's promise", PERCENT, "TTC\nbare\n≤ {:g} %"),
     Measure(TURNED, "steps that turn unsafe", PERCENT, "turned\nunsafe\n≤ {:g} %"),
     Measure(BROKEN, "  of them promised by the filter", PERCENT),
     Measure("share_filter_acts", "time in which the filter acts", "{:.1%}"),
     Measure("share_time_gap_long", "time with time gap > 2.5 s", PERCENT, "long\ngaps\n≤ {:g} %"),
-    Measure(LONG, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", LONG_GAPS),
+    Measure(LONG, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", "long\ngap\n[%]"),
     Measure("rms_jerk_mps3", "RMS jerk [m/s³]"),
     Measure(FASTER, "time with a leader faster than v0", "{:.1%}", "leader\nfaster\n≤ {:g} %"),
     Measure(REACH[0], "CAV beyond the energy model's reach", "{:.1%}"),

@@ -169,12 +169,12 @@ def saved(share: float, low: float, high: float) -> str:
 
 def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
     """Yield label and cells of every measure that any strategy has."""
-    for label, key, form in report.rows:
-        values = report.table[key].astype(float)
+    for one in report.rows:
+        values = report.table[one.key].astype(float)
         if values.notna().any():
-            known = zip(report.table[key], np.isfinite(values), strict=True)
-            cells = (form.format(x) if k else MISSING for x, k in known)
-            yield label, [cell.replace("-", "−") for cell in cells]
+            known = zip(report.table[one.key], np.isfinite(values), strict=True)
+            cells = (one.form.format(x) if k else MISSING for x, k in known)
+            yield one.label, [cell.replace("-", "−") for cell in cells]
 
 
 def _side_by_side(report: Report, title: str) -> Group:

@@ -12,7 +12,7 @@ import pandas as pd
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.io.files import Rows
-from lcc_rl.results import measures, platoons
+from lcc_rl.results import measures
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
 from lcc_rl.results.measures import (
     BROKEN,
@@ -24,6 +24,7 @@ from lcc_rl.results.measures import (
     PATH_PER_KM,
     REACH,
     SHARE,
+    Measure,
     Shown,
 )
 from lcc_rl.results.names import FILTERED, HUMAN, NETWORK, in_words
@@ -42,6 +43,9 @@ UNTRAINED = (
 )
 FEW, SHORT = 5, 150.0  # windows; seconds of them
 SCORE, FLOW_LOST = "score", "flow_lost"
+SAVED = Shown("saved_pct", "saved\n[%]")
+WAY = Shown("distance_pct", "dis-\ntance\n[%]")
+COLLISIONS, KEPT = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
 NAMED = 0.05  # share of the flow from which on a table says that it is lost
 MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
@@ -66,7 +70,7 @@ class Report:
         of: name of the source or case; empty where there is only one.
         table: every measure, a row per strategy.
         short: what a reader asks first; its columns ``shown``.
-        rows: label, column of ``table`` and number format of each measure, for the full table.
+        rows: the measures of the full table.
         caption: what stands below ``short``.
         full_caption: what stands below the full table.
         against: the strategy that savings are against.
@@ -80,7 +84,7 @@ class Report:
     table: pd.DataFrame
     short: pd.DataFrame
     shown: tuple[Shown, ...]
-    rows: Sequence[tuple[str, str, str]]
+    rows: Sequence[Measure]
     caption: str
     full_caption: str
     against: str | None = None
@@ -173,11 +177,10 @@ def summary(
     for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
         table[key] = 1.0 - table[lost] / (whole[lost].iloc[0] if len(whole) else np.nan)
     if task:
-        limits = {measures.limits()[key]: bound for key, bound in task.limits.items()}
         table["kept"] = table["collisions"] == 0
-        for one, bound in limits.items():
+        for one, bound in task.bounds.items():
+            table[f"limit_{one.key}"] = bound
             table["kept"] &= pd.Series([one.keeps(x, bound) for x in table[one.key]])
-        table = table.assign(**{f"limit_{one.key}": bound for one, bound in limits.items()})
     return table
 
 
@@ -214,46 +217,38 @@ def report(
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
     table, said = summary(windows, task, energy, against), remarks(windows)
-    make = _of_task(table, task) if task else _of_energy(table, energy, filtered)
-    rows = _rows(table, task, table["against"].iloc[0])
+    percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
+    percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
+    every = table.assign(**percent)
+    made = _of_task(every, task) if task else _of_energy(every, energy, filtered)
+    short, shown = made.pop("short")
+    rows = _rows(task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
-    return Report(of, table, rows=rows, full_caption=FULL, verdict=words, remarks=said, **make)
+    made |= {"full_caption": FULL, "verdict": words, "remarks": said}
+    return Report(of, table, short, shown, rows, **made)
 
 
-def platoon(rows: pd.DataFrame, case: str, of: str = "") -> Report:
-    """Return the report of a case of a platoon, from rows of episodes.parquet."""
-    table = platoons.case_table(rows, case)
-    short = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
-    short = short[["strategy", *(column.key for column in platoons.COLUMNS)]]
-    caption = f"{platoons.CAPTION}; {ALL}"
-    return Report(of, table, short, platoons.COLUMNS, platoons.ROWS, caption, platoons.CAPTION)
-
-
-def _rows(
-    table: pd.DataFrame, task: Task | None, against: str | None
-) -> Sequence[tuple[str, str, str]]:
+def _rows(task: Task | None, against: str | None) -> list[Measure]:
     """Return the rows of the full table."""
-    whose = in_words(str(against))
-    limits = {measures.limits()[key]: bound for key, bound in (task.limits if task else {}).items()}
-    limited = sorted(limits, key=lambda one: one.key.startswith(SHARE))
-    return (
-        *([(task.label, SCORE, "{:.2f}")] if task else ()),
-        (f"saved against {whose}", "saving", "{:+.2%}"),
-        ("  95 % interval, low", "saving_low", "{:+.2%}"),
-        ("    high", "saving_high", "{:+.2%}"),
-        ("  as drawn, per episode", "drawn_saving", "{:+.1%}"),
-        ("distance lost", "distance_lost", "{:+.2%}"),
-        ("flow lost", FLOW_LOST, "{:+.2%}"),
-        *((one.label, one.key, one.form) for one in MEASURES if one.label),
+    bounds = task.bounds if task else {}
+    kept = [Measure("kept", "keeps the limits (1: yes)", "{:d}")] if task else []
+    counts = {"windows": "windows", "drives": "drives", "seeds": "training seeds"}
+    return [
+        *([Measure(SCORE, task.label)] if task else ()),
+        Measure("saving", f"saved against {in_words(str(against))}", "{:+.2%}"),
+        Measure("saving_low", "  95 % interval, low", "{:+.2%}"),
+        Measure("saving_high", "    high", "{:+.2%}"),
+        Measure("drawn_saving", "  as drawn, per episode", "{:+.1%}"),
+        Measure("distance_lost", "distance lost", "{:+.2%}"),
+        Measure(FLOW_LOST, "flow lost", "{:+.2%}"),
+        *(one for one in MEASURES if one.label),
         *(
-            (f"limit: {' '.join(one.bounded(limits[one]).split())}", one.key, one.form)
-            for one in limited
+            replace(one, label=f"limit: {' '.join(one.bounded(bounds[one]).split())}")
+            for one in sorted(bounds, key=lambda one: one.key.startswith(SHARE))
         ),
-        *([("keeps the limits (1: yes)", "kept", "{:d}")] if task else ()),
-        ("windows", "windows", "{:d}"),
-        ("drives", "drives", "{:d}"),
-        ("training seeds", "seeds", "{:d}"),
-    )
+        *kept,
+        *(Measure(key, label, "{:d}") for key, label in counts.items()),
+    ]
 
 
 def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dict[str, Any]:
@@ -266,55 +261,45 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = cars["against"].iloc[0] if len(cars) > 1 else None
-    score = Shown("energy_kj_per_km", "energy\n[kJ/km]")
-    fuel = Shown("fuel_g_per_km", "fuel\n[g/km]")
-    short = cars.assign(**{score.key: cars[PATH_PER_KM]})
-    shown = [score]
-    if energy is not None and burns_one_fuel(energy):
-        short[fuel.key] = cars[PATH_PER_KM] * per_distance(1.0, "g/km", energy)
-        shown.append(fuel)
-    if against is not None:
-        shown += [SAVED, WAY]
-    for one in MEASURES:
-        if one.short:
-            short[one.short.key] = (one.scale * cars[one.key]).round(2)
-            shown.append(one.short)
     note = "" if against is None else f"{compared(cars, against)}; distance against theirs; "
-    caption = CAPTION.format(note + BEHIND * filtered)
-    made = _short(short, [*shown, COLLISIONS])
-    label = "path energy per km [kJ/km]"
-    return made | {"against": against, "caption": caption, "score": score.key, "label": label}
-
-
-SAVED = Shown("saved_pct", "saved\n[%]")
-WAY = Shown("distance_pct", "dis-\ntance\n[%]")
-COLLISIONS = Shown("collisions", "colli-\nsions")
+    short = [one for one in MEASURES if one.short]
+    columns = {"energy_kj_per_km": cars[PATH_PER_KM]}
+    columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
+    shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")]
+    if energy is not None and burns_one_fuel(energy):
+        columns["fuel_g_per_km"] = cars[PATH_PER_KM] * per_distance(1.0, "g/km", energy)
+        shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
+    shown += [] if against is None else [SAVED, WAY]
+    shown += [*(one.shown for one in short), COLLISIONS]
+    return {
+        "short": shortened(cars.assign(**columns), shown),
+        "caption": CAPTION.format(note + BEHIND * filtered),
+        "against": against,
+        "score": "energy_kj_per_km",
+        "label": "path energy per km [kJ/km]",
+    }
 
 
 def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
     """Return what is specific to the report of a task: its score, and the limits."""
-    flows = table[FLOW].notna().any()
-    limits = {measures.limits()[key]: bound for key, bound in task.limits.items()}
-    shown = [Shown(SCORE, task.label.replace(" ", "\n")), SAVED]
-    shown.append(Shown(FLOW, "flow\n[1/h]") if flows else WAY)
-    shown += [Shown(one.key, one.bounded(bound)) for one, bound in limits.items()]
-    short = table.assign(**{one.key: one.scale * table[one.key] for one in limits})
+    way = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
+    limits = [Shown(one.key, one.bounded(bound)) for one, bound in task.bounds.items()]
+    shown = [Shown(SCORE, task.label.replace(" ", "\n")), SAVED, way, *limits, COLLISIONS, KEPT]
+    columns = {one.key: one.scale * table[one.key] for one in task.bounds}
     saved = f"{compared(table, task.against, always=True)}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL} {flow_note(table)}".strip()
-    made = _short(short, [*shown, COLLISIONS, Shown("kept", "kept")])
-    return made | {"against": task.against, "caption": caption, "label": task.label}
+    short = shortened(table.assign(**columns), shown)
+    return {"short": short, "caption": caption, "against": task.against, "label": task.label}
 
 
-def _short(table: pd.DataFrame, shown: Sequence[Shown]) -> dict[str, Any]:
-    """Return a short table with names in words and savings in per cent, and its columns."""
+def shortened(
+    table: pd.DataFrame, shown: Sequence[Shown]
+) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
+    """Return columns of a table with their intervals and strategies in words, and the columns."""
+    table = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
     shown = (Shown("who", "driven by"), *shown)
-    table = table.assign(
-        who=[in_words(str(name)) for name in table["strategy"]],
-        distance_pct=-100.0 * table["distance_lost"] + 0.0,  # no negative zero
-        **{f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")},
-    )
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
-    return {"short": table[["strategy", *(x for x in names if x in table)]], "shown": shown}
+    return table[["strategy", *(x for x in names if x in table)]], shown
 
 
 def compared(found: pd.DataFrame, against: str, always: bool = False) -> str:

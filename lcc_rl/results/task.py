@@ -41,6 +41,11 @@ class Task(Settings):
         return self if self.against in names else replace(self, against=names[0])
 
     @property
+    def bounds(self) -> dict[Measure, float]:
+        """The limits by measure."""
+        return {measures.limits()[key]: bound for key, bound in self.limits.items()}
+
+    @property
     def measure(self) -> Measure:
         """What is minimised."""
         return measures.scored()[self.score]

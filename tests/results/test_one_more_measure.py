@@ -11,13 +11,13 @@ from lcc_rl.cli import table
 from lcc_rl.commands import evaluation, score
 from lcc_rl.config import load
 from lcc_rl.evaluation.metrics import METRICS
-from lcc_rl.results.measures import MEASURES, Measure, Shown
+from lcc_rl.results.measures import MEASURES, Measure
 
 SMALL = ["scenario.horizon=60", "evaluation.profiles=3", "evaluation.drivers=2"]
 MINE = Measure(
     "max_jerk_mps3",
     "largest jerk [m/s³]",
-    short=Shown("max_jerk_mps3", "most\njerk"),
+    short="most\njerk",
     limit="jerk\n≤ {:g}\n[m/s³]",
 )
 
