@@ -20,8 +20,6 @@ from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results import render
 from lcc_rl.results.report import Report, together
 
-WIDTH = 80  # characters
-
 
 @dataclass(frozen=True)
 class Run:
@@ -49,10 +47,10 @@ class Run:
 
     def printed(self, full: bool = False, against: str | None = None) -> str:
         """Return the tables that commands print, with ``full`` of every measure."""
-        console = Console(width=WIDTH)
+        console = Console(width=render.WIDTH)
         with console.capture() as text:
             for one in self.reports(against):
-                console.print(render.text(one, one.of, full))
+                console.print(render.terminal(one, one.of, full))
         return text.get().rstrip()
 
     def reports(self, against: str | None = None) -> list[Report]:

@@ -15,8 +15,8 @@ from lcc_rl.results.fronts import (
     FLEET,
     FLOW,
     NET,
-    Measure,
-    compared,
+    Statistic,
+    compare_fronts,
     flow_gained,
     saved,
     saved_at_flow,
@@ -85,9 +85,9 @@ def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
     return saving, own[FLOW]
 
 
-def against(part: pd.DataFrame, name: str, measure: Measure) -> Estimate:
+def against(part: pd.DataFrame, name: str, measure: Statistic) -> Estimate:
     """Return a measure of the learned fleet against another."""
-    return compared(part, (LEARNED, "fleet"), (name, "fleet"), FLEET, measure)
+    return compare_fronts(part, (LEARNED, "fleet"), (name, "fleet"), FLEET, measure)
 
 
 def percent(found: Estimate) -> str:

@@ -37,7 +37,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.results.measures import FLOW, LEAST, Measure, limits
+from lcc_rl.results.measures import FLOW, LEAST, Measure
 from lcc_rl.results.measures import SHARE as IS_SHARE
 from lcc_rl.results.names import in_words, worded
 from lcc_rl.results.render import as_markdown, markdown_row, saved, signed
@@ -108,7 +108,7 @@ def tasks(reference: Path, docs: Path) -> None:
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
     with reading(reference / "scores"):
-        table = board.as_markdown(documents)
+        table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
 
 
@@ -134,7 +134,7 @@ def task_table(name: str, table: pd.DataFrame) -> str:
         ]
         lines.append(cells)
     head, *others = map(markdown_row, lines)
-    bounds = ", ".join(bounded(limits()[column], bound) for column, bound in task.limits.items())
+    bounds = ", ".join(bounded(one, bound) for one, bound in task.bounds.items())
     words = f"Saved against {in_words(task.against)}. Limits: {bounds or 'no collision'}."
     title = f"### {name}\n\n{first['windows']} windows. {words}"
     return "\n".join([title, "", head, "|" + "---|" * len(lines[0]), *others])
@@ -149,9 +149,9 @@ def bounded(measure: Measure, bound: float) -> str:
 def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
     """Return the limits that are not kept with their values, or the collisions."""
     found = [
-        f"{limits()[column].limited} {measured(limits()[column], row[column])}"
-        for column, bound in task.limits.items()
-        if not limits()[column].keeps(row[column], bound)
+        f"{one.limited} {measured(one, row[one.key])}"
+        for one, bound in task.bounds.items()
+        if not one.keeps(row[one.key], bound)
     ]
     return "; ".join(found) or f"{row['collisions']} collisions"
 

@@ -44,10 +44,10 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
-from lcc_rl.results import platoons
 from lcc_rl.results.names import FILTERED, in_words
+from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
-from lcc_rl.results.render import show, text
+from lcc_rl.results.render import show, terminal
 from lcc_rl.results.report import (
     Report,
     counted,
@@ -407,7 +407,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
-                yield platoons.report(part, case, f"{of}{case}")
+                yield case_report(part, case, f"{of}{case}")
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     for source, part in by_source(windows_for(rows)):
@@ -428,7 +428,7 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
             windows = counted(counts[one.of], "held-out " * bool(len(inputs.training)))
             size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
-        show(text(one, title, cfg.table == "all"))
+        show(terminal(one, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
     if words := few_windows(plan.profiles, seconds):
         log.info(words)

@@ -41,7 +41,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
-from lcc_rl.results.render import show, text
+from lcc_rl.results.render import show, terminal
 from lcc_rl.results.report import RULE, report, sample_of, windows_for
 from lcc_rl.results.runs import (
     EPISODES,
@@ -171,7 +171,7 @@ def _run(
         one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])
         write_figures(folder / FINAL, reports=[one])
         page = write_page(folder, [command], one, size)
-        show(text(one, f"Leader, car, human behind it: {size}"))
+        show(terminal(one, f"Leader, car, human behind it: {size}"))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

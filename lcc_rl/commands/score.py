@@ -51,7 +51,7 @@ from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, basel
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.board import as_rich, row_of
+from lcc_rl.results.board import row_of, score_table
 from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.policies import load_policy, policy_file
 from lcc_rl.results.render import show
@@ -307,7 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check_overrides(further, GIVEN, "each task has its own; --task and --source choose")
     logging.basicConfig(level=HEADLINE, format="%(message)s")  # no detail of every task
     document = run(options, further)
-    show(as_rich(document["name"], document["results"]))
+    show(score_table(document["name"], document["results"]))
     for line in document["left_out"]:
         Console().print(f"left out: {line}", highlight=False, markup=False)
     return 0

@@ -83,7 +83,7 @@ def measured_ttc(ttc: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Episodes:
+class Reductions:
     """Reductions of the series of a batch of episodes, ``[time, *batch, A, 1]`` to ``[*batch, 1]``.
 
     Args:
@@ -118,7 +118,7 @@ def _moving(time_gap: Tensor, speed: Tensor) -> Tensor:
     return (time_gap > LONG_TIME_GAP) & (speed[1:] > PACE)
 
 
-def _turned(over: Episodes, safe: Tensor) -> Tensor:
+def _turned(over: Reductions, safe: Tensor) -> Tensor:
     """Whether a safe step is followed by an unsafe one; that after the last step is not known."""
     turned = torch.zeros_like(safe, dtype=torch.bool)
     turned[:-1] = (safe[:-1] > 0.0) & (safe[1:] <= 0.0) & over.alive[1:]
@@ -168,7 +168,7 @@ def safety_measures(
         Minima and maxima over the vehicles, shares of time and root mean squares averaged over
         them, each ``[*batch, 1]``; the least time-to-collision is NaN where no gap ever closed.
     """
-    over, found = Episodes(alive, time_step), {}
+    over, found = Reductions(alive, time_step), {}
     for name, metric in METRICS.items():
         _, *entries = signature(metric).parameters
         if all(entry in series for entry in entries):

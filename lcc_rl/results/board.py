@@ -12,10 +12,10 @@ from rich.table import Table
 from lcc_rl.errors import require
 from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
-from lcc_rl.results.measures import FLOW, MEASURES, SPREAD, Shown
+from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown
 from lcc_rl.results.names import in_words
 from lcc_rl.results.render import MISSING, markdown_row, saved, signed
-from lcc_rl.results.report import FLOW_LOST, NAMED
+from lcc_rl.results.report import FLOW_LOST, FLOW_NAMED
 from lcc_rl.results.task import Task
 
 Row = Mapping[str, Any]
@@ -31,7 +31,7 @@ COLUMNS = (
 )
 HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits not kept"]
 SHARE = ("saving", "saving_low", "saving_high")
-COPIED = ("score", *SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", SPREAD)
+COPIED = ("score", *SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
 
 
 def row_of(
@@ -69,7 +69,7 @@ def _number(value: Any) -> float | None:
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def as_rich(who: str, rows: Sequence[Row]) -> Table:
+def score_table(who: str, rows: Sequence[Row]) -> Table:
     """Return rows as a table for the terminal, within 80 characters."""
     lines: list[dict[str, str]] = []
     for row in rows:
@@ -107,7 +107,7 @@ def _cells(row: Row) -> dict[str, str]:
     }
 
 
-def as_markdown(documents: Mapping[str, Mapping[str, Any]]) -> str:
+def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a Markdown table for each task: on each source, who was scored and what was saved.
 
     Args:
@@ -190,7 +190,7 @@ def _markdown(row: Row) -> list[str]:
     """
     cells = _cells(row)
     share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
-    much = (row[FLOW_LOST] or 0.0) > NAMED
+    much = (row[FLOW_LOST] or 0.0) > FLOW_NAMED
     flow = f"**{cells['flow_pct']}**" if much else cells["flow_pct"]
     return [share, cells["flow"], flow, ", ".join(broken(row))]
 
@@ -199,7 +199,7 @@ def broken(row: Row) -> list[str]:
     """Return the limits that are not kept, by their first words, and the number of collisions."""
     found = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():
-        measure = measures.limits()[name]
+        measure = measures.limit_measures()[name]
         if limit["value"] is not None and not measure.keeps(limit["value"], limit["bound"]):
             found.append(measure.limited)
     return found

@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import Estimate, Side, estimate, share_saved
-from lcc_rl.results.windows import DRIVE
+from lcc_rl.results.measures import FLOW, LONG_GAPS, PATH
+from lcc_rl.results.windows import DISTANCE, DRIVE
 
 KINDS = ["variant", "policy"]
-ENERGY, SHARE = "total_path_energy_kj", "share_time_gap_long_moving"
+ENERGY, SHARE = PATH, LONG_GAPS
 # Of a fleet.
-FLEET = NET, DISTANCE, FLOW = "total_net_energy_kj", "distance_m", "flow_vph"
+NET = "total_net_energy_kj"
+FLEET = NET, DISTANCE, FLOW
 # Means of columns of one kind of controller, each ``[limits]``.
 Curve = Mapping[str, NDArray[np.float64]]
-Measure = Callable[[Curve, Curve], float]
+Statistic = Callable[[Curve, Curve], float]
 
 
 def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) -> Side:
@@ -53,12 +55,12 @@ def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) ->
     return {column: rows[column].to_numpy(float).reshape(sizes) for column in columns}
 
 
-def compared(
+def compare_fronts(
     windows: pd.DataFrame,
     one: Sequence[str],
     other: Sequence[str],
     columns: Sequence[str],
-    measure: Measure,
+    measure: Statistic,
 ) -> Estimate:
     """Return a measure of two kinds of controllers with its interval.
 
@@ -97,13 +99,13 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both spend at most the share ``at`` of the time beyond the limit; see :func:`compared`.
+    Both spend at most the share ``at`` of the time beyond the limit; see :func:`compare_fronts`.
     """
 
     def measure(*curves: Curve) -> float:
         return float(share_saved(*(energy_at(x[ENERGY], x[SHARE], at) for x in curves)))
 
-    return compared(windows, one, other, (ENERGY, SHARE), measure)
+    return compare_fronts(windows, one, other, (ENERGY, SHARE), measure)
 
 
 def per_distance(curve: Curve) -> NDArray[np.float64]:

@@ -12,17 +12,17 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.windows import DAMPING, DISTANCE, WAYS, how, mean
+from lcc_rl.results.windows import DAMPING, DISTANCE, WAYS, episode_mean, how
 
 PATH = "total_path_energy_kj"
 PATH_PER_KM = "path_energy_kj_per_km"  # and vehicle; falling behind does not lower it
 FASTER, BROKEN = "share_leader_faster", "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 FLOW = "flow_vph"
-TTC, LONG = "share_ttc_unsafe", "share_time_gap_long_moving"
-NAMES = {TTC: "unsafe_ttc_pct", LONG: "long_time_gap_pct"}  # of columns of short tables
+TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
+SHORT_NAMES = {TTC: "unsafe_ttc_pct", LONG_GAPS: "long_time_gap_pct"}  # of columns of short tables
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
-SPEED_STD, SPREAD = "speed_std_mps", "final_speed_spread_mps"
+SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
 LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
 
 
@@ -70,7 +70,7 @@ class Measure:
     def shown(self) -> Shown:
         """Its column of short tables."""
         share = f"{self.key.removeprefix(SHARE)}_pct" if self.scale > 1.0 else self.key
-        return Shown(NAMES.get(self.key, share), self.short)
+        return Shown(SHORT_NAMES.get(self.key, share), self.short)
 
     @property
     def scale(self) -> float:
@@ -83,10 +83,12 @@ class Measure:
         if not {column, *per} <= set(part):
             return np.nan
         if per:
-            whole = mean(part, per[0])
-            return self.factor * mean(part, column) / whole if whole else np.nan
+            whole = episode_mean(part, per[0])
+            return self.factor * episode_mean(part, column) / whole if whole else np.nan
         kind = how(column)
-        return mean(part, column) if kind == "mean" else float(getattr(part[column], kind)())
+        return (
+            episode_mean(part, column) if kind == "mean" else float(getattr(part[column], kind)())
+        )
 
     def keeps(self, value: float, bound: float) -> bool:
         """Whether a limit is kept; NaN, the value of a vehicle that does not exist, keeps it."""
@@ -122,7 +124,7 @@ MEASURES = [
     *(Measure(f"{group}_net_energy_kj") for group in ("cav", "hdv", "total")),
     Measure("mean_speed_mps", "mean speed [m/s]"),
     Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
-    Measure(SPREAD, "spread of speeds at the end [m/s]", score=SPREAD),
+    Measure(FINAL_SPREAD, "spread of speeds at the end [m/s]", score=FINAL_SPREAD),
     Measure(FLOW, "flow [vehicles/h]", "{:.0f}"),
     Measure("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", "{:.0%}"),
@@ -139,7 +141,7 @@ MEASURES = [
     Measure(BROKEN, "  of them promised by the filter", PERCENT),
     Measure("share_filter_acts", "time in which the filter acts", "{:.1%}"),
     Measure("share_time_gap_long", "time with time gap > 2.5 s", PERCENT, "long\ngaps\n≤ {:g} %"),
-    Measure(LONG, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", "long\ngap\n[%]"),
+    Measure(LONG_GAPS, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", "long\ngap\n[%]"),
     Measure("rms_jerk_mps3", "RMS jerk [m/s³]"),
     Measure(FASTER, "time with a leader faster than v0", "{:.1%}", "leader\nfaster\n≤ {:g} %"),
     Measure(REACH[0], "CAV beyond the energy model's reach", "{:.1%}"),
@@ -149,12 +151,12 @@ MEASURES = [
 ]
 
 
-def limits() -> dict[str, Measure]:
+def limit_measures() -> dict[str, Measure]:
     """Return the measures that may have a limit, by key."""
     return {measure.key: measure for measure in MEASURES if measure.limit}
 
 
-def scored() -> dict[str, Measure]:
+def score_measures() -> dict[str, Measure]:
     """Return the measures that may be a task's score, by its name there."""
     return {measure.score: measure for measure in MEASURES if measure.score}
 

@@ -65,7 +65,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
     return row
 
 
-MEASURES = (
+PLATOON = (
     Measure("speed_error_sum_mps", "Σ|e_v| [m/s]", short="Σ|e_v|\n[m/s]"),
     Measure("speed_error_std_mps", "std |e_v| [m/s]", "{:.3f}"),
     Measure("jerk_sum_mps3", "Σ|jerk| [m/s³]", "{:.1f}", short="Σ|jerk|\n[m/s³]"),
@@ -81,13 +81,13 @@ MEASURES = (
     Measure("clamps", "jerk clamps", "{:.1f}"),
     Measure("cap_interventions", "safe-cap interventions", "{:.1f}"),
 )
-CAPTION = "sums over followers and frames, means over runs"
+BELOW = "sums over followers and frames, means over runs"
 
 
-def report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
+def case_report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
     """Return the report of a case of a platoon, from rows of episodes.parquet."""
     table = case_table(rows, case)
-    shown = [Shown(one.key, one.short) for one in MEASURES if one.short]
+    shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
     short = shortened(table.drop(columns=["reward_low", "reward_high"]), shown)
-    caption = f"{CAPTION}; {ALL}"
-    return Report(of, table, *short, MEASURES, caption, CAPTION)
+    caption = f"{BELOW}; {ALL}"
+    return Report(of, table, *short, PLATOON, caption, BELOW)

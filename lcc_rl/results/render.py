@@ -125,7 +125,7 @@ def _cell(value: object, places: int) -> str:
     return value if isinstance(value, str) else MISSING
 
 
-def text(report: Report, title: str = "", full: bool = False) -> RenderableType:
+def terminal(report: Report, title: str = "", full: bool = False) -> RenderableType:
     """Return a report for the terminal, within 80 characters: a row per strategy.
 
     Args:

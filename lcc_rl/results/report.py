@@ -18,7 +18,7 @@ from lcc_rl.results.measures import (
     BROKEN,
     FASTER,
     FLOW,
-    LONG,
+    LONG_GAPS,
     MEASURES,
     PATH,
     PATH_PER_KM,
@@ -30,7 +30,7 @@ from lcc_rl.results.measures import (
 from lcc_rl.results.names import FILTERED, HUMAN, NETWORK, in_words
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, per_distance
-from lcc_rl.results.windows import DISTANCE, DRIVE, SEED, WAYS, savings, windows_of
+from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
 
 # Whom tables compare with, and whom the verdict compares a network with: the first that there is.
 AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
@@ -41,12 +41,12 @@ UNTRAINED = (
     *("direct", "idm", HUMAN, "recorded", "constant_filtered", RULE),
     *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
-FEW, SHORT = 5, 150.0  # windows; seconds of them
+FEW_WINDOWS, SHORT = 5, 150.0  # windows; seconds of them
 SCORE, FLOW_LOST = "score", "flow_lost"
 SAVED = Shown("saved_pct", "saved\n[%]")
 WAY = Shown("distance_pct", "dis-\ntance\n[%]")
-COLLISIONS, KEPT = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
-NAMED = 0.05  # share of the flow from which on a table says that it is lost
+COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
+FLOW_NAMED = 0.05  # share of the flow from which on a table says that it is lost
 MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 ALL = "all measures: table=all or --all."
@@ -54,7 +54,7 @@ CAPTION = (
     "Energy per vehicle and km, without what motion stores; {}shares of the time: "
     f"TTC < 4 s; time gap > 2.5 s above 1 m/s; {ALL}"
 )
-BEHIND = "networks, and those called filtered, drive behind the safety filter; "
+BEHIND_FILTER = "networks, and those called filtered, drive behind the safety filter; "
 FULL = (
     "energies: mean per episode; path energy: without what the motion stores; saved: of path "
     "energy per km, of a task of its score; intervals: over held-out windows (drives, if five or "
@@ -161,10 +161,10 @@ def summary(
     rows = []
     for name, part in parts.items():
         row: dict[str, Any] = {"strategy": name, "against": against}
-        kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": SEED}
+        kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
         row |= {key: part.get(of, part["profile_id"]).nunique() for key, of in kinds.items()}
         if task:
-            row |= {SCORE: scored(task, part, energy)}
+            row |= {SCORE: score_of(task, part, energy)}
         for key, of in {"saving": (column, per), "drawn_saving": ("total_energy_kj", [])}.items():
             known = against not in (None, name) and of[0] in windows
             share = savings(windows, of[0], name, str(against), of[1]) if known else NOTHING
@@ -184,7 +184,7 @@ def summary(
     return table
 
 
-def scored(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
+def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
     """Return the score of a strategy's windows in the task's unit."""
     value = task.measure.value(part)
     if not task.measure.per or energy is None:
@@ -261,7 +261,7 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = cars["against"].iloc[0] if len(cars) > 1 else None
-    note = "" if against is None else f"{compared(cars, against)}; distance against theirs; "
+    note = "" if against is None else f"{saved_against(cars, against)}; distance against theirs; "
     short = [one for one in MEASURES if one.short]
     columns = {"energy_kj_per_km": cars[PATH_PER_KM]}
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
@@ -273,7 +273,7 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     shown += [*(one.shown for one in short), COLLISIONS]
     return {
         "short": shortened(cars.assign(**columns), shown),
-        "caption": CAPTION.format(note + BEHIND * filtered),
+        "caption": CAPTION.format(note + BEHIND_FILTER * filtered),
         "against": against,
         "score": "energy_kj_per_km",
         "label": "path energy per km [kJ/km]",
@@ -284,9 +284,16 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
     """Return what is specific to the report of a task: its score, and the limits."""
     way = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
     limits = [Shown(one.key, one.bounded(bound)) for one, bound in task.bounds.items()]
-    shown = [Shown(SCORE, task.label.replace(" ", "\n")), SAVED, way, *limits, COLLISIONS, KEPT]
+    shown = [
+        Shown(SCORE, task.label.replace(" ", "\n")),
+        SAVED,
+        way,
+        *limits,
+        COLLISIONS,
+        KEEPS,
+    ]
     columns = {one.key: one.scale * table[one.key] for one in task.bounds}
-    saved = f"{compared(table, task.against, always=True)}; " * (len(table) > 1)
+    saved = f"{saved_against(table, task.against, always=True)}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL} {flow_note(table)}".strip()
     short = shortened(table.assign(**columns), shown)
     return {"short": short, "caption": caption, "against": task.against, "label": task.label}
@@ -302,7 +309,7 @@ def shortened(
     return table[["strategy", *(x for x in names if x in table)]], shown
 
 
-def compared(found: pd.DataFrame, against: str, always: bool = False) -> str:
+def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> str:
     """Return what savings are against, what their intervals are over, and if they are too narrow.
 
     Args:
@@ -325,7 +332,7 @@ def compared(found: pd.DataFrame, against: str, always: bool = False) -> str:
 
 def flow_note(table: pd.DataFrame) -> str:
     """Return in a sentence which strategies lose much of the flow; empty if none does."""
-    lost = table[table[FLOW_LOST] > NAMED]
+    lost = table[table[FLOW_LOST] > FLOW_NAMED]
     named = zip(lost["strategy"], lost[FLOW_LOST], strict=True)
     parts = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
     against = in_words(str(table["against"].iloc[0]))
@@ -351,7 +358,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
     names = [NETWORK] if NETWORK in rows else learned
     words = []
     for name in names:
-        if (count := rows[name]["windows"]) >= FEW:
+        if (count := rows[name]["windows"]) >= FEW_WINDOWS:
             words.append(_sentence(windows, rows, name, other))
         elif of_few:
             both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
@@ -359,7 +366,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
             words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
     # It may be a rule of the user's own.
-    if words and rows[least]["windows"] >= FEW and least not in (*names, other):
+    if words and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
         words.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
     return "\n".join(words)
 
@@ -372,7 +379,7 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
     if saved < 0.0:
         less, saved, low, high = "more", -saved, -high, -low
     within = "" if low > 0.0 else ", within the uncertainty"
-    own, theirs = (100.0 * rows[x][LONG] for x in (name, other))
+    own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
     article = "the " if in_words(name) != name else ""
     interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
     return (
@@ -460,7 +467,7 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
         windows: how many windows were evaluated.
         seconds: how long each of them is, if that is known.
     """
-    if windows >= FEW or windows * (seconds or 0.0) >= SHORT:
+    if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
         return ""
     found = counted(windows) + (f" of {seconds:g} s" if seconds else "")
     return f"{found}: these numbers show that everything runs, and mean nothing else"

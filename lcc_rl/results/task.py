@@ -26,11 +26,11 @@ class Task(Settings):
     limits: Mapping[str, NonNegative] = field(default_factory=dict)
 
     def settled(self) -> None:
-        if self.score not in measures.scored():
-            raise unknown_name("score (task.score)", self.score, measures.scored())
+        if self.score not in measures.score_measures():
+            raise unknown_name("score (task.score)", self.score, measures.score_measures())
         for column in self.limits:
-            if column not in measures.limits():
-                raise unknown_name("column of task.limits", column, measures.limits())
+            if column not in measures.limit_measures():
+                raise unknown_name("column of task.limits", column, measures.limit_measures())
 
     def among(self, strategies: Iterable[str]) -> Task:
         """Return the task for an evaluation of these strategies.
@@ -43,12 +43,12 @@ class Task(Settings):
     @property
     def bounds(self) -> dict[Measure, float]:
         """The limits by measure."""
-        return {measures.limits()[key]: bound for key, bound in self.limits.items()}
+        return {measures.limit_measures()[key]: bound for key, bound in self.limits.items()}
 
     @property
     def measure(self) -> Measure:
         """What is minimised."""
-        return measures.scored()[self.score]
+        return measures.score_measures()[self.score]
 
     @property
     def label(self) -> str:

@@ -21,9 +21,9 @@ REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is 
 DRIVE = "drive"  # what a row's window is cut from; windows of one are alike
 SOURCE = "source"  # of a row's leader, if a mixture has several
 LEADER = ("leader_path_energy_kj", "leader_speed_mps")
-STRATEGY, SEED = "strategy", "training_seed"
-WINDOW = [STRATEGY, SEED, "profile_id"]
-NAMED = ["profile", SOURCE, DRIVE]  # the same in all rows of a window
+STRATEGY, TRAINED = "strategy", "training_seed"
+WINDOW = [STRATEGY, TRAINED, "profile_id"]
+PER_WINDOW = ["profile", SOURCE, DRIVE]  # the same in all rows of a window
 WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
 DISTANCE, DAMPING = "distance_m", "damping_time_s"
 ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj")
@@ -52,7 +52,7 @@ def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
         contain the least or the largest value. ``episodes`` is the number of rows, ``collisions``
         of those that collided, ``worst_share_…`` the largest share of an episode.
     """
-    return fold(rows, [*WINDOW, *NAMED], columns)
+    return fold(rows, [*WINDOW, *PER_WINDOW], columns)
 
 
 def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataFrame:
@@ -96,8 +96,8 @@ def _frames(rows: Rows, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
 
 def _derived(rows: pd.DataFrame) -> pd.DataFrame:
     """Add numbers, distances and energies of all vehicles, and whether an episode is damped."""
-    seed = pd.to_numeric(rows.get(SEED, pd.Series(np.nan, rows.index))).astype("Int64")
-    found: dict[str, Any] = {SEED: seed, "episodes": 1.0}
+    seed = pd.to_numeric(rows.get(TRAINED, pd.Series(np.nan, rows.index))).astype("Int64")
+    found: dict[str, Any] = {TRAINED: seed, "episodes": 1.0}
     if "collided" in rows:
         found |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
     if ways := [name for name in WAYS if name in rows]:
@@ -114,7 +114,9 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
 def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.DataFrame:
     """Return sums, counts and ends of columns by keys."""
     numbers = [str(name) for name in frame.select_dtypes(["number", "bool"])]
-    names = [name for name in columns or numbers if name in numbers and name not in (*KEYS, SEED)]
+    names = [
+        name for name in columns or numbers if name in numbers and name not in (*KEYS, TRAINED)
+    ]
     if not columns:
         shares = [name for name in names if name.startswith("share_")]
         frame = frame.assign(**{f"worst_{name}": frame[name] for name in shares})
@@ -205,15 +207,15 @@ def savings(
         NaN if one of them is missing.
     """
     chosen = rows[rows[STRATEGY].isin([strategy, baseline])]
-    if SEED not in chosen:
-        chosen = chosen.assign(**{SEED: np.nan})
+    if TRAINED not in chosen:
+        chosen = chosen.assign(**{TRAINED: np.nan})
     ways = [name for name in per if name in rows]
     groups = chosen.groupby([*WINDOW[:2], "profile_id"], dropna=False, sort=False)
     means = groups[list(dict.fromkeys([column, *ways]))].mean().reset_index()
-    means[SEED] = means[SEED].astype(object).fillna(-1)
+    means[TRAINED] = means[TRAINED].astype(object).fillna(-1)
     means["way"] = means[ways].sum(axis=1) if ways else 1.0
     energy, way = (
-        means.pivot(index="profile_id", columns=[STRATEGY, SEED], values=name)
+        means.pivot(index="profile_id", columns=[STRATEGY, TRAINED], values=name)
         for name in (column, "way")
     )
     energy = energy.dropna(axis=1, how="all").dropna()
@@ -227,7 +229,7 @@ def savings(
     return saving(ours[0], theirs[0], drives=drives, ways=(ours[1], theirs[1]))
 
 
-def mean(part: pd.DataFrame, column: str) -> float:
+def episode_mean(part: pd.DataFrame, column: str) -> float:
     """Return the mean of a column of :func:`windows_of` over episodes; NaN without any."""
     episodes = part["episodes"][part[column].notna()]
     return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
@@ -247,7 +249,7 @@ def driver_savings(drivers: pd.DataFrame, column: str, strategy: str, baseline: 
 def per_seed(windows: pd.DataFrame, column: str) -> dict[str, pd.Series]:
     """Return, for each strategy, the mean of a column over the windows of each training seed."""
     found = {
-        str(strategy): rows.groupby(SEED, dropna=False)[column].mean()
+        str(strategy): rows.groupby(TRAINED, dropna=False)[column].mean()
         for strategy, rows in windows.groupby(STRATEGY, sort=False)
     }
     return {strategy: values for strategy, values in found.items() if values.notna().any()}

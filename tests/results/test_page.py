@@ -20,7 +20,7 @@ from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.names import heading, in_words, worded
-from lcc_rl.results.render import as_markdown, text
+from lcc_rl.results.render import as_markdown, terminal
 from lcc_rl.results.report import Report, report, sample_of, windows_for
 from lcc_rl.results.windows import Means
 from lcc_rl.studies.results import StudyResults
@@ -137,7 +137,7 @@ def test_every_table_of_strategies_fits_80_columns() -> None:
     console = Console(width=200)
     with console.capture() as shown:
         one = replace(found, short=found.short.assign(**ends), verdict="")
-        console.print(text(one, "title [x]"))
+        console.print(terminal(one, "title [x]"))
     lines = shown.get().splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
     assert "title [x]" in lines[0]

@@ -14,7 +14,7 @@ from lcc_rl.energy import CirclesFuel, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measure
 from lcc_rl.results.platoons import case_table
-from lcc_rl.results.render import as_latex, as_markdown, show, text
+from lcc_rl.results.render import as_latex, as_markdown, show, terminal
 from lcc_rl.results.report import report, summary, windows_for
 from lcc_rl.results.task import Task
 from lcc_rl.studies.hcfs.tables import win_rates
@@ -172,7 +172,7 @@ def test_a_score_is_energy_over_distance_and_falling_behind_gains_nothing() -> N
 def test_all_scores_of_a_ring_name_the_damped_episodes_and_their_mean_time(capsys) -> None:
     never = driven("human", 1.0, 1.0).assign(damping_time_s=np.nan)
     own = driven("own", 1.0, 1.0, 1.0).assign(damping_time_s=[30.0, 40.0, np.nan])
-    show(text(report(windows_for(pd.concat([never, own])), TASK, MOTOR), full=True))
+    show(terminal(report(windows_for(pd.concat([never, own])), TASK, MOTOR), full=True))
     lines = capsys.readouterr().out.splitlines()
     rows = [line.split()[-2:] for line in lines if "calm" in line or "from when on" in line]
     assert rows == [["0%", "67%"], ["–", "35"]]
@@ -202,7 +202,7 @@ def test_all_scores_name_limits_in_words_and_wrap_names_at_spaces_only(capsys) -
     others = ("follower_stopper", "pi_saturation", "constant", "mpc_far")
     rows = pd.concat(driven(name, 1.0, share_ttc_unsafe=0.001) for name in ("human", *others))
     task = Task(name="mine", limits={**TASK.limits, "share_ttc_unsafe": 0.0005})
-    show(text(report(windows_for(rows), task, MOTOR), full=True))
+    show(terminal(report(windows_for(rows), task, MOTOR), full=True))
     printed = capsys.readouterr().out
     words = printed.split()
     assert {"FollowerStopper", "saturation", "simulated"} <= set(words)

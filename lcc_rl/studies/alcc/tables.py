@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.results.bootstrap import NOTHING, mean, share_saved
+from lcc_rl.results.measures import PATH
 from lcc_rl.results.names import heading
 from lcc_rl.results.render import MISSING
 from lcc_rl.results.report import UNTRAINED
 from lcc_rl.results.windows import LEADER, SOURCE, by_source, per_seed, savings
 
-PATH = "total_path_energy_kj"
 PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
 BASELINES = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
 COMPARED = (*BASELINES, "own_energy")

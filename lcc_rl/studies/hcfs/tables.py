@@ -47,8 +47,8 @@ SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "r
 SUMS += ["collided", *COUNTS]
 LARGEST = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
 # What is kept of runs behind other sources of leaders, and of which strategies.
-MEASURES = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
-MEASURES += ["energy_kj_per_km"]
+COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
+COMPARED_BY += ["energy_kj_per_km"]
 STABLE = ("cacc tuned", "deadbeat", LEARNED, "hcfs", "hcfs between", "hcfs first")
 LEADERS = {  # sources of leaders, for readers
     "traffic": "I-80",
