@@ -6,6 +6,8 @@ windows and drivers. Intervals of savings are over windows and seeds, all others
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 
@@ -71,55 +73,47 @@ def headline(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def strata(windows: pd.DataFrame) -> pd.DataFrame:
-    """Savings of path energy in the terciles of windows by what their leader does.
+    """Savings of path energy in thirds of the windows by what their leader does.
 
-    Rows of :func:`stratified` for ``alcc``, or every trained strategy
-    without it, against each baseline.
+    Returns:
+        For ``alcc``, or every trained strategy without it, against each baseline: a row per
+        property of the leader and third, the lowest first, with its windows, the range of the
+        property and the share saved [%]; and a row per source of leaders, if there are several,
+        by its name in the column ``tercile``, without a range.
     """
     names = [name for name in per_seed(windows, PATH) if name not in UNTRAINED]
-    parts = [
-        stratified(windows, PATH, name, baseline).assign(strategy=name, against=baseline)
+    parts = list(_thirds(windows))
+    rows = [
+        {
+            "strategy": name,
+            "against": baseline,
+            "by": heading(by),
+            "tercile": third,
+            "windows": inside["profile_id"].nunique(),
+            "least": least,
+            "most": most,
+            **savings(inside, PATH, name, baseline).columns("saving_pct", 100.0),
+        }
         for name in (["alcc"] if "alcc" in names else names)
         for baseline in COMPARED
         if baseline != name and (windows["strategy"] == baseline).any()
+        for by, third, least, most, inside in parts
     ]
-    table = pd.concat(parts, ignore_index=True)
-    table["by"] = table["by"].map(heading)
-    return table[["strategy", "against", *table.columns.drop(["strategy", "against"])]]
+    return pd.DataFrame(rows)
 
 
-def stratified(episodes: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.DataFrame:
-    """Return savings in the terciles of windows by their leader, and in each source of leaders.
-
-    Args:
-        episodes: windows of an evaluation.
-        column: the energy.
-        strategy: the strategy that saves.
-        baseline: the strategy that it is compared with.
-
-    Returns:
-        One row per measure and tercile, the lowest first: its windows, the range of the measure
-        and the share saved [%] with its interval; and one per source, if there are several, by
-        its name in the column ``tercile``, without a range.
-    """
-    strata: list[tuple[str, str, object, object, pd.DataFrame]] = []
-    if SOURCE in episodes:
-        strata += [(SOURCE, name, np.nan, np.nan, rows) for name, rows in by_source(episodes)]
-    for measure in LEADER:
-        windows = episodes.groupby("profile_id")[measure].first().sort_values()
-        parts = np.array_split(np.arange(len(windows)), len(TERCILES))
-        for name, part in zip(TERCILES, (windows.iloc[chosen] for chosen in parts), strict=True):
+def _thirds(windows: pd.DataFrame) -> Iterator[tuple[str, str, float, float, pd.DataFrame]]:
+    """Yield property, name, range and rows of each source and third of the windows."""
+    if SOURCE in windows:
+        for source, rows in by_source(windows):
+            yield SOURCE, source, np.nan, np.nan, rows
+    for column in LEADER:
+        values = windows.groupby("profile_id")[column].first().sort_values()
+        parts = np.array_split(np.arange(len(values)), len(TERCILES))
+        for name, part in zip(TERCILES, (values.iloc[chosen] for chosen in parts), strict=True):
             if len(part):
-                inside = episodes[episodes["profile_id"].isin(part.index)]
-                strata.append((measure, name, part.iloc[0], part.iloc[-1], inside))
-    return pd.DataFrame(
-        [
-            {"by": measure, "tercile": name, "windows": inside["profile_id"].nunique()}
-            | {"least": least, "most": most}
-            | savings(inside, column, strategy, baseline).columns("saving_pct", 100.0)
-            for measure, name, least, most, inside in strata
-        ]
-    )
+                inside = windows[windows["profile_id"].isin(part.index)]
+                yield column, name, part.iloc[0], part.iloc[-1], inside
 
 
 def _seeds(rows: pd.DataFrame) -> str:
