@@ -108,7 +108,9 @@ def weights(count: int, stream: int) -> Array:
     """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
     if stream == ALONE:
         drawn = np.random.default_rng(SEED).integers(0, count, (RESAMPLES, count))
-        return np.asarray((drawn[..., None] == np.arange(count)).mean(1))
+        drawn += count * np.arange(RESAMPLES)[:, None]
+        times = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
+        return times.reshape(RESAMPLES, count) / count
     draws, generator = max(count - 1, 1), np.random.default_rng([SEED, stream])
     return generator.multinomial(draws, np.full(count, 1.0 / count), RESAMPLES) / draws
 
