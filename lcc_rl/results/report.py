@@ -160,7 +160,7 @@ def summary(
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
     rows = []
     for name, part in parts.items():
-        row: dict[str, Any] = {"strategy": name, "against": against}
+        row: dict[str, Any] = {"strategy": name, "against": against or ""}
         kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
         row |= {key: part.get(of, part["profile_id"]).nunique() for key, of in kinds.items()}
         if task:
@@ -260,7 +260,7 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     # Beside others, a string without controlled cars is of fewer vehicles, and not to be compared.
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
-    against = cars["against"].iloc[0] if len(cars) > 1 else None
+    against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
     note = "" if against is None else f"{saved_against(cars, against)}; distance against theirs; "
     short = [one for one in MEASURES if one.short]
     columns = {"energy_kj_per_km": cars[PATH_PER_KM]}
