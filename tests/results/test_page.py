@@ -16,13 +16,14 @@ from study_frames import episodes
 
 from lcc_rl.api import Run
 from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
 from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.names import heading, in_words, worded
 from lcc_rl.results.render import as_markdown, terminal
 from lcc_rl.results.report import Report, report, sample_of, windows_for
-from lcc_rl.results.windows import Means
+from lcc_rl.results.windows import WAYS, Means, savings
 from lcc_rl.studies.results import StudyResults
 
 TABLE = pd.DataFrame(
@@ -210,3 +211,14 @@ def test_one_strategy_is_compared_with_nobody_and_one_window_has_no_interval() -
     one = report(windows_for(frame[seed & (frame["profile_id"] == 0)])).caption
     assert "saved: against" in one
     assert "interval" not in one
+
+
+def test_savings_are_against_the_strategy_that_is_asked_for() -> None:
+    windows = windows_for(episodes(profiles=12))
+    found = report(windows, against="reference")
+    alcc = found.table.set_index("strategy").loc["alcc"]
+    assert alcc["against"] == found.against == "reference"
+    expected = savings(windows, "total_path_energy_kj", "alcc", "reference", WAYS)
+    assert (alcc["saving"], alcc["saving_low"]) == pytest.approx((expected.value, expected.low))
+    with pytest.raises(ConfigError, match="Did you mean 'reference'"):
+        report(windows, against="referenc")
