@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -17,9 +17,8 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.evaluation.named import setting_of
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.headline import Shown
-
-WIDTH = 80  # characters
+from lcc_rl.results import render
+from lcc_rl.results.report import Report, together
 
 
 @dataclass(frozen=True)
@@ -46,13 +45,21 @@ class Run:
     def __str__(self) -> str:
         return self.printed()
 
-    def printed(self, full: bool = False) -> str:
+    def printed(self, full: bool = False, against: str | None = None) -> str:
         """Return the tables that commands print, with ``full`` of every measure."""
-        console = Console(width=WIDTH)
+        console = Console(width=render.WIDTH)
         with console.capture() as text:
-            for one in evaluation.found(self.rows, self.cfg):
-                console.print(one.drawn(one.of, full))
+            for one in self.reports(against):
+                console.print(render.terminal(one, one.of, full))
         return text.get().rstrip()
+
+    def reports(self, against: str | None = None) -> list[Report]:
+        """Return the report of each source of leaders, or case of a platoon.
+
+        Args:
+            against: the strategy that savings are against; by default as in tables.
+        """
+        return list(evaluation.reports(self.rows, self.cfg, against))
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -60,7 +67,7 @@ class Run:
 
         Of a task its scores and limits come first. Several sources or cases as below.
         """
-        return self._together(lambda one: one.table)
+        return together(self.reports()).table
 
     @cached_property
     def headline(self) -> pd.DataFrame:
@@ -68,18 +75,7 @@ class Run:
 
         Of several sources of leaders, or cases of a platoon, the rows of each, named in ``of``.
         """
-        return self._together(lambda one: one.short)
-
-    def _together(self, kind: Callable[[evaluation.Found], pd.DataFrame]) -> pd.DataFrame:
-        """Return one table of all sources or cases."""
-        tables = {one.of: kind(one) for one in evaluation.found(self.rows, self.cfg)}
-        first, *others = tables.values()
-        if not others:
-            return first
-        together = pd.concat([table.assign(of=of) for of, table in tables.items()])
-        if "shown" in first.attrs:
-            together.attrs["shown"] = (Shown("of", "of"), *first.attrs["shown"])
-        return together
+        return together(self.reports()).short
 
     @cached_property
     def training(self) -> pd.DataFrame:

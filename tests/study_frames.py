@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.means import Means
+from lcc_rl.results.windows import Means
 
 # Mean energies of the controlled car [kJ]: by training seed, the same for every driver.
 CARS = {"idm": {None: 100.0}, "reference": {0: 80.0, 1: 90.0}, "alcc": {0: 88.0, 1: 84.0}}

@@ -9,19 +9,19 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, style
-from lcc_rl.results.cells import markdown_row
+from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import (
     DISTANCE,
     FLEET,
     FLOW,
     NET,
-    Measure,
-    compared,
+    Statistic,
+    compare_fronts,
     flow_gained,
     saved,
     saved_at_flow,
 )
-from lcc_rl.results.intervals import Estimate
+from lcc_rl.results.render import markdown_row
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
@@ -85,9 +85,9 @@ def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
     return saving, own[FLOW]
 
 
-def against(part: pd.DataFrame, name: str, measure: Measure) -> Estimate:
+def against(part: pd.DataFrame, name: str, measure: Statistic) -> Estimate:
     """Return a measure of the learned fleet against another."""
-    return compared(part, (LEARNED, "fleet"), (name, "fleet"), FLEET, measure)
+    return compare_fronts(part, (LEARNED, "fleet"), (name, "fleet"), FLEET, measure)
 
 
 def percent(found: Estimate) -> str:

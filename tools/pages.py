@@ -36,13 +36,13 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
-from lcc_rl.results.cells import as_markdown, markdown_row, signed
 from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.results.headline import saved
+from lcc_rl.results.measures import FLOW, LEAST, Measure
+from lcc_rl.results.measures import SHARE as IS_SHARE
 from lcc_rl.results.names import in_words, worded
+from lcc_rl.results.render import as_markdown, markdown_row, saved, signed
 from lcc_rl.results.runs import reading
-from lcc_rl.results.scores import FLOW, LEAST, Task, keeps, limited
-from lcc_rl.results.scores import SHARE as IS_SHARE
+from lcc_rl.results.task import Task
 from lcc_rl.studies.alcc.results import narrow
 from lcc_rl.studies.reproduce import RESULTS
 
@@ -108,16 +108,16 @@ def tasks(reference: Path, docs: Path) -> None:
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
     with reading(reference / "scores"):
-        table = board.as_markdown(documents)
+        table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
 
 
 def task_table(name: str, table: pd.DataFrame) -> str:
     """Return the Markdown table of a task below its name; the kept scores hold every measure."""
     first = {str(key): value for key, value in table.iloc[0].items()}
-    limits = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
+    kept = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
     given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
-    task = Task(name=name, limits=limits, **given)
+    task = Task(name=name, limits=kept, **given)
     names = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h] (%)", "limits"]
     lines = [[*names, "decision [ms]"]]
     whole = table.set_index("strategy").loc[task.against, FLOW]
@@ -134,32 +134,33 @@ def task_table(name: str, table: pd.DataFrame) -> str:
         ]
         lines.append(cells)
     head, *others = map(markdown_row, lines)
-    bounds = ", ".join(bounded(column, bound) for column, bound in task.limits.items())
+    bounds = ", ".join(bounded(one, bound) for one, bound in task.bounds.items())
     words = f"Saved against {in_words(task.against)}. Limits: {bounds or 'no collision'}."
     title = f"### {name}\n\n{first['windows']} windows. {words}"
     return "\n".join([title, "", head, "|" + "---|" * len(lines[0]), *others])
 
 
-def bounded(column: str, bound: float) -> str:
-    """Return a column and its limit in words."""
-    return f"{limited(column)} {'≥' if column.startswith(LEAST) else '≤'} {measured(column, bound)}"
+def bounded(measure: Measure, bound: float) -> str:
+    """Return a measure and its limit in words."""
+    sign = LEAST if LEAST in measure.limit else "≤"
+    return f"{measure.limited} {sign} {measured(measure, bound)}"
 
 
 def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
     """Return the limits that are not kept with their values, or the collisions."""
     found = [
-        f"{limited(column)} {measured(column, row[column])}"
-        for column, bound in task.limits.items()
-        if not keeps(column, row[column], bound)
+        f"{one.limited} {measured(one, row[one.key])}"
+        for one, bound in task.bounds.items()
+        if not one.keeps(row[one.key], bound)
     ]
     return "; ".join(found) or f"{row['collisions']} collisions"
 
 
-def measured(column: str, value: float) -> str:
-    """Return a value of a limited column with its unit."""
-    if column.startswith(IS_SHARE):
-        return f"{100.0 * value:.2f} %"
-    return f"{value:.0f} m" if column.endswith("_m") else f"{value:.2f} s"
+def measured(measure: Measure, value: float) -> str:
+    """Return a value of a limited measure with its unit."""
+    if measure.key.startswith(IS_SHARE):
+        return f"{measure.scale * value:.2f} %"
+    return f"{value:.0f} m" if measure.key.endswith("_m") else f"{value:.2f} s"
 
 
 def figure_of_record() -> Figure:

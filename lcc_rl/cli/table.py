@@ -2,6 +2,7 @@
 
 lcc-rl table outputs/evaluate/<run>
 lcc-rl table outputs/evaluate/<run> --all               # every measure
+lcc-rl table outputs/evaluate/<run> --against idm       # savings against another strategy
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
 lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
@@ -17,9 +18,9 @@ import pandas as pd
 from lcc_rl.api import Run
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.io.files import as_rows, read_parquet
-from lcc_rl.results.cells import as_latex, as_markdown
-from lcc_rl.results.headline import for_print
 from lcc_rl.results.names import worded
+from lcc_rl.results.render import as_latex, as_markdown, chosen, for_print
+from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, reading
 from lcc_rl.runs.arguments import Arguments
 
@@ -40,21 +41,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--format", choices=FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
     parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
+    parser.add_argument("--against", help="strategy that savings are against")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options = parser.parse_args(arguments)
     names = options.columns.split(",") if options.columns else None
+    note, numbers = "", options.format == "csv" and not names
     if options.run.suffix == ".parquet":
-        table = worded(read_parquet(options.run))
+        table = chosen(worded(read_parquet(options.run)), names or [])
     else:
         run = read_run(options.run, options.trust)
         with reading(run.folder / EPISODES):
             if options.format == "text" and not names:
-                print(run.printed(full=options.all))
+                print(run.printed(options.all, options.against))
                 return
-            table = worded(run.table) if options.all else run.headline
-    note = table.attrs.get("caption", "")
-    if names or options.format != "csv":
-        table = for_print(table, names)
+            report = together(run.reports(options.against))
+        if options.all:
+            table = chosen(worded(report.table), names or [])
+        else:
+            note = report.note
+            table = report.short if numbers else for_print(report, names or [])
     print(FORMATS[options.format](table))
     if note and options.format != "csv":
         print(f"% {note}" if options.format == "latex" else f"\n{note}")

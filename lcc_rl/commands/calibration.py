@@ -25,7 +25,7 @@ from lcc_rl.envs.inputs import load_episodes
 from lcc_rl.figures.calibration import calibration_figure, joint_figure, twins_figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.cells import MISSING
+from lcc_rl.results.render import MISSING
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.precision import prepare_torch

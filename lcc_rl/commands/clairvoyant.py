@@ -40,7 +40,7 @@ from lcc_rl.io.atomic import own_folder
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import EPISODES
-from lcc_rl.results.savings import savings
+from lcc_rl.results.windows import savings
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter

@@ -5,16 +5,11 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
 
 from lcc_rl.agents.factory import learns
 from lcc_rl.commands.checks import (
@@ -49,16 +44,24 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
-from lcc_rl.results import headline, scores, string_tables
-from lcc_rl.results.headline import show
 from lcc_rl.results.names import FILTERED, in_words
+from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
+from lcc_rl.results.render import show, terminal
+from lcc_rl.results.report import (
+    Report,
+    counted,
+    few_windows,
+    leader_too_fast,
+    remarks,
+    report,
+    several,
+    windows_for,
+)
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
-from lcc_rl.results.savings import SOURCE, by_source
-from lcc_rl.results.scores import Task
-from lcc_rl.results.tables import WIDTH, leader_too_fast, remarks, summary
-from lcc_rl.results.totals import sources_of
+from lcc_rl.results.task import Task
 from lcc_rl.results.units import check_unit
+from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import CONFIG, check_present, claim, forget, run_folders
@@ -149,7 +152,7 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
     # Here: a training, which draws nothing, need not load matplotlib.
     from lcc_rl.figures.evaluation import write_figures
 
-    write_figures(folder, cfg.evaluation.rows, [one.short for one in found(rows, cfg)])
+    write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)))
 
 
 def task_of(cfg: StudyConfig) -> Task | None:
@@ -340,8 +343,10 @@ def evaluate_and_write(
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
-    for line in [*leader_too_fast(rows, cfg.task is not None), *remarks(rows)]:
-        log.warning(line)
+    if cfg.evaluation.rows == "episodes":
+        windows = windows_for(rows)
+        for line in [*leader_too_fast(windows, cfg.task is not None), *remarks(windows)]:
+            log.warning(line)
     if not quiet:
         show_tables(rows, cfg, inputs)
     return rows
@@ -396,88 +401,34 @@ def _play_missing(
                 progress.update(done)
 
 
-class Found(NamedTuple):
-    """All measures of an evaluation behind one source of leaders, or of a case of a platoon.
-
-    Args:
-        of: name of the source or case; empty where there is only one.
-        table: a row per strategy.
-        shorten: returns what a reader asks first.
-        draw_all: draws the whole table under a title.
-        verdict: a sentence below it; empty for none.
-        remarks: sentences on what limits its numbers, for its caption.
-    """
-
-    of: str
-    table: pd.DataFrame
-    shorten: Callable[[pd.DataFrame], pd.DataFrame]
-    draw_all: Callable[[pd.DataFrame, str], Group]
-    verdict: str = ""
-    remarks: Sequence[str] = ()
-
-    @property
-    def short(self) -> pd.DataFrame:
-        """The table that commands print."""
-        table = self.shorten(self.table)
-        table.attrs["caption"] = headline.caption_of(table, " ".join(self.remarks))
-        return table
-
-    def drawn(self, title: str, full: bool = False) -> Table | Group:
-        """Return the table for the terminal, with ``full`` all of it."""
-        said = [self.verdict] if self.verdict else []
-        if full:
-            drawn: Table | Group = self.draw_all(self.table, title)
-            said += [fill(line, WIDTH) for line in self.remarks]
-        else:
-            drawn = headline.as_rich(self.short, title, headline.caption_of(self.short))
-        return Group(drawn, Text("\n".join(said))) if said else drawn
-
-
-def found(rows: Rows, cfg: StudyConfig) -> Iterator[Found]:
-    """Yield what the rows of an evaluation show: of a task its scores."""
+def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
+    """Yield the report of each source of leaders, or case of a platoon."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(part["case"]):
-                table = string_tables.case_table(part, case)
-                yield Found(f"{of}{case}", table, string_tables.headline, string_tables.in_full)
+                yield case_report(part, case, f"{of}{case}")
         return
-    task, energy = task_of(cfg), build_energy(cfg)
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
-    for source in sources_of(rows):
-        limits = remarks(rows, source)
-        if task is not None and isinstance(rows, pd.DataFrame):
-            part = rows[rows[SOURCE] == source] if source else rows
-            task = task.among(part["strategy"])
-            short, full = partial(scores.headline, task=task), partial(scores.in_full, task=task)
-            table = scores.scores(part, task, energy)
-            bounds = {f"limit_{column}": bound for column, bound in task.limits.items()}
-            every = summary(part).set_index("strategy")
-            every = every[every.columns.difference(table.columns, sort=False)]
-            table = table.assign(**bounds).join(every, on="strategy")
-            yield Found(source, table, short, full, "", limits)
-        else:
-            short = partial(headline.headline, energy=energy, filtered=filtered)
-            table = summary(rows, source)
-            said = headline.verdict(table, of_few=False)
-            yield Found(source, table, short, headline.in_full, said, limits)
+    for source, part in by_source(windows_for(rows)):
+        yield report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
     plan = episodes.plan_of(cfg, inputs)
-    drivers = headline.several(len(plan.chosen), "driver")
+    drivers = several(len(plan.chosen), "driver")
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
     drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
     counts = Counter(inputs.evaluation.sources or [""] * plan.profiles)
-    for one in found(rows, cfg):
+    for one in reports(rows, cfg):
         title = one.of
         if one.of in counts:
             of = [x for x in (_task_name(cfg), one.of) if x]
-            windows = headline.counted(counts[one.of], "held-out " * bool(len(inputs.training)))
+            windows = counted(counts[one.of], "held-out " * bool(len(inputs.training)))
             size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
-        show(one.drawn(title, cfg.table == "all"))
+        show(terminal(one, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
-    if words := headline.few_windows(plan.profiles, seconds):
+    if words := few_windows(plan.profiles, seconds):
         log.info(words)

@@ -10,13 +10,12 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from rich.console import Console
-from rich.text import Text
 
 from lcc_rl import results
 from lcc_rl.commands import calibration, evaluation, training
@@ -42,7 +41,8 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows
 from lcc_rl.io.settings import read_text
-from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, show, verdict
+from lcc_rl.results.render import show, terminal
+from lcc_rl.results.report import RULE, report, sample_of, windows_for
 from lcc_rl.results.runs import (
     EPISODES,
     FINAL,
@@ -52,8 +52,6 @@ from lcc_rl.results.runs import (
     resumed_config,
     save_config,
 )
-from lcc_rl.results.savings import RULE
-from lcc_rl.results.tables import remarks, summary
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -167,17 +165,13 @@ def _run(
         place = folder / FINAL / "figures" / "learning_curve.png"
         save(curve, place, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
-        limit, size = held_to(trainings.values()), sample_of(rows)
-        found = summary(rows)
+        size = sample_of(rows)
         filtered = final.scenario.filters.get(AUTOMATED) is not None
-        table = headline(found, build_energy(final), filtered)
-        write_figures(folder / FINAL, tables=[table])
-        limit = " ".join([limit, *remarks(rows)])
-        words = f"{verdict(found)}\n\n{caption_of(table, limit)}"
-        page = write_page(folder, [command], found, words, (size, table))
-        title = f"Leader, car, human behind it: {size}"
-        show(as_rich(table, title, caption_of(table, limit)))
-        show(Text(verdict(found)))
+        one = report(windows_for(rows), None, build_energy(final), filtered, few=True)
+        one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])
+        write_figures(folder / FINAL, reports=[one])
+        page = write_page(folder, [command], one, size)
+        show(terminal(one, f"Leader, car, human behind it: {size}"))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows

@@ -51,12 +51,12 @@ from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, basel
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.board import as_rich, row_of
-from lcc_rl.results.headline import show
+from lcc_rl.results.board import row_of, score_table
 from lcc_rl.results.names import FILTERED, in_words
 from lcc_rl.results.policies import load_policy, policy_file
+from lcc_rl.results.render import show
+from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
-from lcc_rl.results.scores import scores
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
@@ -172,7 +172,9 @@ def play(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[st
     # Whom nobody is compared with here, and what "data" is the hash of.
     settings = identity(cfg, "evaluation.behind_filter", "inputs.data", "inputs.leader")
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
-    return row_of(scores(rows, task, build_energy(cfg)), task, source, strategy.name, rows) | hashes
+    table = summary(windows_for(rows), task, build_energy(cfg))
+    drivers = rows["driver_id"].nunique()
+    return row_of(table, task, source, strategy.name, drivers) | hashes
 
 
 def hash_of(windows: Profiles) -> str:
@@ -305,7 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check_overrides(further, GIVEN, "each task has its own; --task and --source choose")
     logging.basicConfig(level=HEADLINE, format="%(message)s")  # no detail of every task
     document = run(options, further)
-    show(as_rich(document["name"], document["results"]))
+    show(score_table(document["name"], document["results"]))
     for line in document["left_out"]:
         Console().print(f"left out: {line}", highlight=False, markup=False)
     return 0

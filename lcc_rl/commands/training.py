@@ -22,10 +22,10 @@ from lcc_rl.evaluation.cases import WINDOWS, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.io.files import Rows, as_rows
+from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
+from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
-from lcc_rl.results.string_tables import case_table
-from lcc_rl.results.tables import summary
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
@@ -175,5 +175,5 @@ def measured(rows: Rows) -> dict[str, Any]:
     """Return the last row of the summary, that of the strategy trained."""
     # By its rows: a resumed run is not of the variant that the command line composed.
     vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
-    table = case_table(rows, WINDOWS) if vehicles else summary(rows)
+    table = case_table(rows, WINDOWS) if vehicles else summary(windows_for(rows))
     return {str(key): value for key, value in table.iloc[-1].items()}

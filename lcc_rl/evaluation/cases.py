@@ -18,7 +18,7 @@ from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
-from lcc_rl.results.savings import DRIVE, SOURCE
+from lcc_rl.results.windows import DRIVE, SOURCE
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")

@@ -36,7 +36,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.results.tables import FASTER
+from lcc_rl.results.measures import FASTER
 
 # Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
 WORTH_COMPILING = 20_000_000

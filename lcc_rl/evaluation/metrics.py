@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from inspect import signature
 
 import torch
 from torch import Tensor
@@ -79,16 +82,85 @@ def measured_ttc(ttc: Tensor) -> Tensor:
     return torch.where(ttc < NEVER, ttc, torch.nan)
 
 
+@dataclass(frozen=True)
+class Reductions:
+    """Reductions of the series of a batch of episodes, ``[time, *batch, A, 1]`` to ``[*batch, 1]``.
+
+    Args:
+        alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
+        time_step: duration of a step [s].
+    """
+
+    alive: Tensor
+    time_step: float
+
+    @cached_property
+    def steps(self) -> Tensor:
+        """How many steps each episode has."""
+        return self.alive.sum(0).squeeze(-2)
+
+    def mean(self, entry: Tensor) -> Tensor:
+        """Mean over time and vehicles."""
+        count = self.steps.clamp(min=1) * entry.shape[-2]
+        return (entry * self.alive).sum(0).sum(-2) / count
+
+    def lowest(self, entry: Tensor) -> Tensor:
+        """Minimum over time and vehicles."""
+        return torch.where(self.alive, entry, torch.inf).amin(0).amin(-2)
+
+    def highest(self, entry: Tensor) -> Tensor:
+        """Maximum over time and vehicles."""
+        return torch.where(self.alive, entry, -torch.inf).amax(0).amax(-2)
+
+
+def _moving(time_gap: Tensor, speed: Tensor) -> Tensor:
+    """Whether a time gap is long above walking pace."""
+    return (time_gap > LONG_TIME_GAP) & (speed[1:] > PACE)
+
+
+def _turned(over: Reductions, safe: Tensor) -> Tensor:
+    """Whether a safe step is followed by an unsafe one; that after the last step is not known."""
+    turned = torch.zeros_like(safe, dtype=torch.bool)
+    turned[:-1] = (safe[:-1] > 0.0) & (safe[1:] <= 0.0) & over.alive[1:]
+    return turned
+
+
+# Measures of the automated vehicles of a string by column of episodes.parquet. Each is a function
+# of the entries that it names, see :func:`safety_measures`; where one lacks, so does the column.
+METRICS: dict[str, Callable[..., Tensor]] = {
+    "min_gap_m": lambda over, gap: over.lowest(gap),
+    "mean_gap_m": lambda over, gap: over.mean(gap),
+    "max_gap_m": lambda over, gap: over.highest(gap),
+    "min_time_gap_s": lambda over, time_gap: over.lowest(time_gap),
+    "min_ttc_s": lambda over, ttc: measured_ttc(over.lowest(ttc)),
+    "max_time_gap_s": lambda over, time_gap: over.highest(time_gap),
+    "share_ttc_unsafe": lambda over, ttc: over.mean(ttc < UNSAFE_TTC),
+    "share_time_gap_long": lambda over, time_gap: over.mean(time_gap > LONG_TIME_GAP),
+    "share_time_gap_long_moving": lambda over, time_gap, speed: over.mean(_moving(time_gap, speed)),
+    "rms_jerk_mps3": lambda over, jerk: over.mean(jerk**2).sqrt(),
+    "duration_s": lambda over: over.steps * over.time_step,
+    "share_filter_acts": lambda over, command, wanted: over.mean((command - wanted).abs() > ACTS),
+    "share_promised": lambda over, promised: over.mean(promised),
+    "share_ttc_unpromised": lambda over, ttc, promised: over.mean(
+        (ttc < UNSAFE_TTC) & (promised == 0.0)
+    ),
+    "share_turned_unsafe": lambda over, safe: over.mean(_turned(over, safe)),
+    "share_promise_broken": lambda over, safe, promised: over.mean(
+        _turned(over, safe) & (promised > 0.0)
+    ),
+}
+
+
 def safety_measures(
     series: Mapping[str, Tensor], alive: Tensor, time_step: float
 ) -> dict[str, Tensor]:
-    """Safety, efficiency and comfort of the automated vehicles of a string.
+    """Safety, efficiency and comfort of the automated vehicles of a string, by :data:`METRICS`.
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
             each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first one;
-            behind a safety filter, for which steps it answers, ``promised``, which begin
-            ``safe``, what it was told, ``wanted``, and its ``command`` [m/s²].
+            behind a safety filter, which steps its guarantee covers, ``promised``, which begin
+            ``safe``, and the desired and commanded accelerations ``wanted`` and ``command`` [m/s²].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
 
@@ -96,44 +168,11 @@ def safety_measures(
         Minima and maxima over the vehicles, shares of time and root mean squares averaged over
         them, each ``[*batch, 1]``; the least time-to-collision is NaN where no gap ever closed.
     """
-    steps = alive.sum(0).clamp(min=1).squeeze(-2)
-    vehicles = series["gap"].shape[-2]
-
-    def average(entry: Tensor) -> Tensor:
-        return (entry * alive).sum(0).sum(-2) / (steps * vehicles)
-
-    def lowest(entry: Tensor) -> Tensor:
-        return torch.where(alive, entry, torch.inf).amin(0).amin(-2)
-
-    def highest(entry: Tensor) -> Tensor:
-        return torch.where(alive, entry, -torch.inf).amax(0).amax(-2)
-
-    unsafe, long = series["ttc"] < UNSAFE_TTC, series["time_gap"] > LONG_TIME_GAP
-    found = {
-        "min_gap_m": lowest(series["gap"]),
-        "mean_gap_m": average(series["gap"]),
-        "max_gap_m": highest(series["gap"]),
-        "min_time_gap_s": lowest(series["time_gap"]),
-        "min_ttc_s": measured_ttc(lowest(series["ttc"])),
-        "max_time_gap_s": highest(series["time_gap"]),
-        "share_ttc_unsafe": average(unsafe),
-        "share_time_gap_long": average(long),
-        "share_time_gap_long_moving": average(long & (series["speed"][1:] > PACE)),
-        "rms_jerk_mps3": average(series["jerk"] ** 2).sqrt(),
-        "duration_s": alive.sum(0).squeeze(-2) * time_step,
-    }
-    if "wanted" in series:
-        changed = (series["command"] - series["wanted"]).abs() > ACTS
-        found["share_filter_acts"] = average(changed)
-    if "promised" in series:
-        found["share_promised"] = average(series["promised"])
-        found["share_ttc_unpromised"] = average(unsafe & (series["promised"] == 0.0))
-        # Of the last step nobody knows: safety is known when the step after it begins.
-        safe = series["safe"] > 0.0
-        turned = torch.zeros_like(safe)
-        turned[:-1] = safe[:-1] & ~safe[1:] & alive[1:]
-        found["share_turned_unsafe"] = average(turned)
-        found["share_promise_broken"] = average(turned & (series["promised"] > 0.0))
+    over, found = Reductions(alive, time_step), {}
+    for name, metric in METRICS.items():
+        _, *entries = signature(metric).parameters
+        if all(entry in series for entry in entries):
+            found[name] = metric(over, *(series[entry] for entry in entries))
     return found
 
 

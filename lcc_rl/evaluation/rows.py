@@ -31,7 +31,7 @@ from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.results.savings import DRIVE, LEADER, REPEAT, SOURCE
+from lcc_rl.results.windows import DRIVE, LEADER, REPEAT, SOURCE
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 SUMMED = (

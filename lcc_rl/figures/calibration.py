@@ -24,7 +24,7 @@ from lcc_rl.figures.drawing import (
     unbox,
 )
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.results.cells import signed
+from lcc_rl.results.render import signed
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
 DRIVERS = {RECORDED: INK, TWINS: "#d55e00", REACTING: "#0072b2"}

@@ -34,14 +34,13 @@ from lcc_rl.figures.drawing import (
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.cells import column_cells, signed
-from lcc_rl.results.headline import several
-from lcc_rl.results.intervals import Estimate, share_saved
-from lcc_rl.results.means import Means
+from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.motion import telling
 from lcc_rl.results.names import FILTERED, in_words
+from lcc_rl.results.render import column_cells, signed
+from lcc_rl.results.report import AGAINST, RULE, Report, several
 from lcc_rl.results.runs import stored_config
-from lcc_rl.results.savings import BASELINES, RULE, by_driver
+from lcc_rl.results.windows import Means, by_driver
 
 VEHICLES = {
     "leader": ("leader", INK),
@@ -51,14 +50,14 @@ VEHICLES = {
 
 
 def write_figures(
-    folder: str | Path, rows: str = "episodes", tables: Sequence[pd.DataFrame] = ()
+    folder: str | Path, rows: str = "episodes", reports: Sequence[Report] = ()
 ) -> list[Path]:
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
         folder: holds config.yaml, episodes.parquet and steps.parquet.
         rows: what a row of episodes.parquet is of, ``episodes`` or ``vehicles``.
-        tables: the tables that the evaluation printed; of a single one, ``overview`` shows the
+        reports: those that the evaluation printed; of a single one, ``overview`` shows the
             savings.
 
     Returns:
@@ -71,7 +70,7 @@ def write_figures(
     steps, cfg = read_parquet(folder / "steps.parquet"), stored_config(folder)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
-        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, tables)
+        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports)
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
@@ -90,7 +89,7 @@ def study_figures(
     episodes: pd.DataFrame,
     steps: pd.DataFrame,
     cfg: Mapping[str, Any],
-    tables: Sequence[pd.DataFrame] = (),
+    reports: Sequence[Report] = (),
 ) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of all that an evaluation with a row per episode shows.
 
@@ -100,7 +99,7 @@ def study_figures(
         episodes: rows of episodes.parquet.
         steps: rows of steps.parquet; it may have none.
         cfg: the evaluation's configuration.
-        tables: as in :func:`write_figures`.
+        reports: as in :func:`write_figures`.
     """
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     many = episodes["driver_id"].nunique() > 2
@@ -114,8 +113,8 @@ def study_figures(
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and cars and len(tables) == 1 and "saved_pct" in tables[0]:
-        yield "overview", overview(episodes, steps, (own or cars)[-1], tables[0])
+    if len(steps) and cars and len(reports) == 1 and "saved_pct" in reports[0].short:
+        yield "overview", overview(episodes, steps, (own or cars)[-1], reports[0])
     for name in own:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
@@ -123,7 +122,7 @@ def study_figures(
             yield f"human_energy {name}", human_energy(means, name)
         # Who collides, and so drives less of an episode, saves nothing.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
-        for baseline in BASELINES if many and whole else ():
+        for baseline in (*AGAINST, "recorded") if many and whole else ():
             if baseline in names and baseline != name:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure
@@ -150,10 +149,9 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 
 @paper
-def overview(
-    episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, table: pd.DataFrame
-) -> Figure:
-    """Speeds of one episode, and what each strategy of a printed table saves."""
+def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report: Report) -> Figure:
+    """Speeds of one episode, and what each strategy of a report saves."""
+    table = report.short
     lines = max(len(lines_of(str(name)).splitlines()) for name in table["strategy"])
     figure = new_figure(PAGE, max(2.7, 0.9 + 0.13 * lines * len(table)))
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
@@ -162,12 +160,12 @@ def overview(
     whose = shorten(in_words(strategy), 40, placeholder="…")
     left.set_title(f"one episode: {whose}", loc="left", pad=16)
     legend_above(left)
-    against = str(table.attrs["against"])
-    what, _, unit = str(table.attrs["label"]).removesuffix("]").partition(" [")
+    against = str(report.against)
+    what, _, unit = report.label.removesuffix("]").partition(" [")
     dots(right, range(len(table)), table.fillna({"saved_pct": 0.0}), "saved_pct", INK)
     right.axvline(0.0, color=SOFT, lw=0.8, zorder=0)
     rows_of(right, list(table["strategy"]))
-    for place, value in enumerate(column_cells(table, table.attrs["score"])):
+    for place, value in enumerate(column_cells(table, report.score)):
         look: dict[str, Any] = {"va": "center", "ha": "right", "fontsize": 7}
         transform = right.get_yaxis_transform()
         right.annotate(f"{value} {unit}", (1.0, place), xycoords=transform, **look)

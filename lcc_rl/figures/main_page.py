@@ -11,10 +11,9 @@ from lcc_rl.agents.limits import RECORDED
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
-from lcc_rl.results.headline import AGAINST, for_print
 from lcc_rl.results.names import in_words
-from lcc_rl.results.savings import UNTRAINED
-from lcc_rl.results.tables import ROWS
+from lcc_rl.results.render import for_print, full_rows
+from lcc_rl.results.report import AGAINST, UNTRAINED, Report
 
 TITLE = "lcc_rl: data → drivers → policies → results"
 LIMIT = "efficiency"
@@ -50,21 +49,14 @@ def held_to(trainings: Iterable[StudyConfig]) -> str:
     return AS_RECORDED if limits == [RECORDED] else HELD_TO.format(limit=", ".join(limits))
 
 
-def write_page(
-    folder: str | Path,
-    commands: Sequence[str],
-    found: pd.DataFrame,
-    words: str,
-    headline: tuple[str, pd.DataFrame],
-) -> Path:
+def write_page(folder: str | Path, commands: Sequence[str], report: Report, size: str) -> Path:
     """Write ``report.html`` of a job: the headline, figures, drivers, and how it was made.
 
     Args:
         folder: the job's folder, with ``evaluation``, ``calibration`` and a folder per training.
         commands: what was typed.
-        found: the summary of its evaluation.
-        words: what came out.
-        headline: the table that the command prints, and what it is of.
+        report: of its evaluation.
+        size: how many windows and drivers that is of.
 
     Returns:
         The page's path.
@@ -73,14 +65,14 @@ def write_page(
         ResultsError: if the page cannot be written.
     """
     page = Page(folder)
-    size, table = headline
 
     def figures(names: dict[str, str]) -> list[tuple[str, Path]]:
         paths = {page.folder / f"{name}.png": caption for name, caption in names.items()}
         return [(caption, path) for path, caption in paths.items() if path.exists()]
 
-    page.add("Results", words, [(size, for_print(table))], figures(RESULTS))
-    learned = [str(name) for name in table["strategy"] if name not in UNTRAINED]
+    words = f"{report.verdict}\n\n{report.note}"
+    page.add("Results", words, [(size, for_print(report))], figures(RESULTS))
+    learned = [str(name) for name in report.short["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
             f"{in_words(own)} against {in_words(name)}, driver by driver"
@@ -91,16 +83,8 @@ def write_page(
     for heading, names in {"By driver": improvements, "Drivers": DRIVERS}.items():
         if drawn := figures(names):
             page.add(heading, figures=drawn)
-    page.add("All measures", tables=[("Means per strategy", _transposed(found))])
+    cells = [[label.strip(), *row] for label, row in full_rows(report)]
+    columns = ["measure", *(in_words(str(name)) for name in report.table["strategy"])]
+    every = pd.DataFrame(cells, columns=columns)
+    page.add("All measures", tables=[("Means per strategy", every)])
     return page.write(TITLE, commands)
-
-
-def _transposed(found: pd.DataFrame) -> pd.DataFrame:
-    """Return a summary with a column per strategy and a row per measure, as on the terminal."""
-    rows = [(label, key, form) for label, key, form in ROWS if found[key].notna().any()]
-    names = [in_words(str(name)) for name in found["strategy"]]
-    cells = [
-        [label.strip(), *(form.format(x) if pd.notna(x) else None for x in found[key])]
-        for label, key, form in rows
-    ]
-    return pd.DataFrame(cells, columns=["measure", *names])

@@ -18,8 +18,8 @@ from PIL import Image  # comes with matplotlib
 
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import PROCESSOR, parquet_metadata
-from lcc_rl.results.cells import columns
 from lcc_rl.results.names import worded
+from lcc_rl.results.render import columns
 
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")
 
@@ -48,7 +48,7 @@ class Page:
         Args:
             heading: its title.
             text: plain paragraphs, separated by blank lines.
-            tables: caption and rows, see :func:`lcc_rl.results.cells.columns`.
+            tables: caption and rows, see :func:`lcc_rl.results.render.columns`.
             figures: caption and file.
             details: titles and long texts, folded away.
         """

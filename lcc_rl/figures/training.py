@@ -18,9 +18,9 @@ from lcc_rl.figures.drawing import (
     paper,
     style,
 )
-from lcc_rl.results.headline import several
-from lcc_rl.results.intervals import band
+from lcc_rl.results.bootstrap import band
 from lcc_rl.results.names import in_words
+from lcc_rl.results.report import several
 
 WINDOW = 10  # iterations of the rolling mean
 BAND = f"band: 95 % interval over seeds;\nof one seed 5th to 95th percentile of {WINDOW} batches"

@@ -11,13 +11,13 @@ import pandas as pd
 from rich.table import Table
 
 from lcc_rl.errors import require
-from lcc_rl.results import headline
-from lcc_rl.results.cells import markdown_row, signed
-from lcc_rl.results.headline import Shown, saved
-from lcc_rl.results.intervals import LEAST_DRIVES
+from lcc_rl.results import measures, render
+from lcc_rl.results.bootstrap import LEAST_DRIVES
+from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown
 from lcc_rl.results.names import in_words
-from lcc_rl.results.savings import DRIVE
-from lcc_rl.results.scores import FLOW, FLOW_LOST, NAMED, PER_DISTANCE, Task, keeps, limited
+from lcc_rl.results.render import MISSING, markdown_row, saved, signed
+from lcc_rl.results.report import FLOW_LOST, FLOW_NAMED
+from lcc_rl.results.task import Task
 
 Row = Mapping[str, Any]
 COLUMNS = (
@@ -32,48 +32,37 @@ COLUMNS = (
 )
 HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits not kept"]
 SHARE = ("saving", "saving_low", "saving_high")
-COPIED = (
-    "score",
-    *SHARE,
-    "distance_lost",
-    FLOW,
-    FLOW_LOST,
-    "string_ratio",
-    "final_speed_spread_mps",
-)
+COPIED = ("score", *SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
 
 
 def row_of(
-    table: pd.DataFrame, task: Task, source: str, strategy: str, episodes: pd.DataFrame
+    table: pd.DataFrame, task: Task, source: str, strategy: str, drivers: int
 ) -> dict[str, Any]:
     """Return the row of a strategy on a task behind the leaders of a source.
 
     Args:
-        table: of :func:`lcc_rl.results.scores.scores`.
+        table: of :func:`lcc_rl.results.report.summary`.
         task: the task.
         source: name of the leaders.
-        strategy: whose row.
-        episodes: the rows that the table was made of.
+        strategy: the strategy.
+        drivers: number of drivers that it met.
 
     Returns:
-        Plain values, numbers that do not exist as None: ``limits`` holds bound and value of each,
-        ``windows`` and ``drives`` count what the interval is over.
+        Plain values, numbers that do not exist as None: ``limits`` contains bound and value of
+        each, ``measures`` all measures; ``windows`` and ``drives`` count what the interval is over.
     """
     by_name = table.set_index("strategy")
     found = by_name.loc[strategy]
     row: dict[str, Any] = {"task": task.name, "source": source}
-    row |= {"measure": task.score, "unit": task.unit if task.score in PER_DISTANCE else None}
+    row |= {"measure": task.score, "unit": task.unit if task.measure.per else None}
     row |= {"against": task.against, "baseline": _number(by_name.loc[task.against, "score"])}
-    row |= {name: _number(found.get(name, np.nan)) for name in COPIED}
+    row |= {name: _number(found[name]) for name in COPIED}
+    row["measures"] = {measure.key: _number(found[measure.key]) for measure in MEASURES}
     row["limits"] = {
         name: {"bound": bound, "value": _number(found[name])} for name, bound in task.limits.items()
     }
-    row |= {
-        "collisions": int(episodes.loc[episodes["strategy"] == strategy, "collided"].sum()),
-        "kept": bool(found["kept"]),
-    }
-    counts = {"windows": "profile_id", "drives": DRIVE, "drivers": "driver_id"}
-    return row | {name: int(episodes[key].nunique()) for name, key in counts.items()}
+    row |= {name: int(str(found[name])) for name in ("collisions", "windows", "drives")}
+    return row | {"kept": bool(found["kept"]), "drivers": drivers}
 
 
 def _number(value: Any) -> float | None:
@@ -81,7 +70,7 @@ def _number(value: Any) -> float | None:
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def as_rich(who: str, rows: Sequence[Row]) -> Table:
+def score_table(who: str, rows: Sequence[Row]) -> Table:
     """Return rows as a table for the terminal, within 80 characters."""
     lines: list[dict[str, str]] = []
     for row in rows:
@@ -95,7 +84,7 @@ def as_rich(who: str, rows: Sequence[Row]) -> Table:
         "windows where there are fewer than five drives, too narrow if one drive has several; "
         "score.json has every limit and value."
     )
-    return headline.as_rich(pd.DataFrame(lines), in_words(who), caption, COLUMNS)
+    return render.as_rich(pd.DataFrame(lines), COLUMNS, in_words(who), caption)
 
 
 def unit_of(row: Row) -> str:
@@ -111,15 +100,15 @@ def _cells(row: Row) -> dict[str, str]:
         "score": f"{row['score']:.2f}",
         "saved": saved(*share),
         "distance": signed(-100.0 * row["distance_lost"]),
-        "flow": headline.MISSING if flow is None else f"{flow:,.0f}",
-        "flow_pct": headline.MISSING if lost is None else signed(-100.0 * lost),
-        "ratio": headline.MISSING if ratio is None else f"{ratio:.2f}",
+        "flow": MISSING if flow is None else f"{flow:,.0f}",
+        "flow_pct": MISSING if lost is None else signed(-100.0 * lost),
+        "ratio": MISSING if ratio is None else f"{ratio:.2f}",
         "drives": str(row["drives"]),
         "kept": "yes" if row["kept"] else ",\n".join(broken(row)),
     }
 
 
-def as_markdown(documents: Mapping[str, Mapping[str, Any]]) -> str:
+def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a Markdown table for each task: on each source, who was scored and what was saved.
 
     Args:
@@ -207,7 +196,7 @@ def _markdown(row: Row) -> list[str]:
     """
     cells = _cells(row)
     share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
-    much = (row[FLOW_LOST] or 0.0) > NAMED
+    much = (row[FLOW_LOST] or 0.0) > FLOW_NAMED
     flow = f"**{cells['flow_pct']}**" if much else cells["flow_pct"]
     return [share, cells["flow"], flow, ", ".join(broken(row))]
 
@@ -216,6 +205,7 @@ def broken(row: Row) -> list[str]:
     """Return the limits that are not kept, by their first words, and the number of collisions."""
     found = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():
-        if limit["value"] is not None and not keeps(name, limit["value"], limit["bound"]):
-            found.append(limited(name))
+        measure = measures.limit_measures()[name]
+        if limit["value"] is not None and not measure.keeps(limit["value"], limit["bound"]):
+            found.append(measure.limited)
     return found

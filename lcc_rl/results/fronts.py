@@ -7,27 +7,28 @@ read where both cost as much.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.intervals import Estimate, bounds, drawn_windows, share_saved, weights
-from lcc_rl.results.savings import DRIVE
+from lcc_rl.results.bootstrap import Estimate, Side, estimate, share_saved
+from lcc_rl.results.measures import FLOW, LONG_GAPS, PATH
+from lcc_rl.results.windows import DISTANCE, DRIVE
 
 KINDS = ["variant", "policy"]
-ENERGY, SHARE = "total_path_energy_kj", "share_time_gap_long_moving"
+ENERGY, SHARE = PATH, LONG_GAPS
 # Of a fleet.
-FLEET = NET, DISTANCE, FLOW = "total_net_energy_kj", "distance_m", "flow_vph"
-# Columns of one kind of controller, each ``[limits, windows, seeds]``, and their means by limit.
-Front = Mapping[str, NDArray[np.float64]]
+NET = "total_net_energy_kj"
+FLEET = NET, DISTANCE, FLOW
+# Means of columns of one kind of controller, each ``[limits]``.
 Curve = Mapping[str, NDArray[np.float64]]
-Measure = Callable[[Curve, Curve], float]
+Statistic = Callable[[Curve, Curve], float]
 
 
-def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) -> Front:
+def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) -> Side:
     """Return columns of one kind of controller by limit, window and seed.
 
     Args:
@@ -54,18 +55,16 @@ def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) ->
     return {column: rows[column].to_numpy(float).reshape(sizes) for column in columns}
 
 
-def compared(
+def compare_fronts(
     windows: pd.DataFrame,
     one: Sequence[str],
     other: Sequence[str],
     columns: Sequence[str],
-    measure: Measure,
+    measure: Statistic,
 ) -> Estimate:
     """Return a measure of two kinds of controllers with its interval.
 
-    Windows, or drives if the rows name five or more, and seeds are resampled as in
-    :func:`lcc_rl.results.intervals.saving`, without resamples whose measure is not a number;
-    there is no interval where that of all rows is none.
+    Resampled as in :func:`lcc_rl.results.bootstrap.estimate`.
 
     Args:
         windows, columns: see :func:`front`.
@@ -73,23 +72,16 @@ def compared(
         measure: of the means by limit of both.
     """
     fronts = [front(windows, kind, columns) for kind in (one, other)]
-    value = measure(*({name: x.mean((1, 2)) for name, x in each.items()} for each in fronts))
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
-    drawn = [_resampled(each, stream, drives) for stream, each in enumerate(fronts, 1)]
-    found = np.array([measure(*pair) for pair in zip(*drawn, strict=True)])
-    found = found[np.isfinite(found)]
-    return Estimate(value, *bounds(found)) if np.isfinite(value) else Estimate(value)
 
+    def statistic(*sides: Curve) -> NDArray[np.float64]:
+        """Return the measure of means by limit, ``[limits]``, or of each resample of them."""
+        drawn = [{name: np.atleast_2d(x.T) for name, x in side.items()} for side in sides]
+        count = len(next(iter(drawn[0].values())))
+        pairs = ([{name: x[i] for name, x in side.items()} for side in drawn] for i in range(count))
+        return np.squeeze([measure(*pair) for pair in pairs])
 
-def _resampled(front: Front, stream: int, drives: Sequence[object] | None) -> Iterator[Curve]:
-    """Yield the means by limit of every resample; a stream draws its own seeds."""
-    _, windows, seeds = next(iter(front.values())).shape
-    drawn = drawn_windows(windows, drives), weights(seeds, stream)
-    means = [
-        np.einsum("rw,lws,rs->rl", drawn[0], x, drawn[1], optimize=True) for x in front.values()
-    ]
-    for rows in zip(*means, strict=True):
-        yield dict(zip(front, rows, strict=True))
+    return estimate(statistic, *fronts, drives=drives)
 
 
 def energy_at(energy: NDArray[np.float64], share: NDArray[np.float64], at: float) -> float:
@@ -107,13 +99,13 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both spend at most the share ``at`` of the time beyond the limit; see :func:`compared`.
+    Both spend at most the share ``at`` of the time beyond the limit; see :func:`compare_fronts`.
     """
 
     def measure(*curves: Curve) -> float:
         return float(share_saved(*(energy_at(x[ENERGY], x[SHARE], at) for x in curves)))
 
-    return compared(windows, one, other, (ENERGY, SHARE), measure)
+    return compare_fronts(windows, one, other, (ENERGY, SHARE), measure)
 
 
 def per_distance(curve: Curve) -> NDArray[np.float64]:
@@ -140,18 +132,6 @@ def saved_at_flow(point: Curve, rule: Curve) -> float:
     spent, flow = per_distance(rule)[order], rule[FLOW][order]
     rival = np.interp(point[FLOW][0], flow, spent, left=np.nan, right=np.nan)
     return float(share_saved(per_distance(point)[0], rival))
-
-
-def gained_at_energy(point: Curve, rule: Curve) -> float:
-    """Return the share of the flow that a fleet gains on a front, at its energy per distance.
-
-    The front's flow is the largest at which it needs no more energy; NaN if it always needs more.
-    """
-    order = np.argsort(rule[FLOW])
-    spent, flow = per_distance(rule)[order], rule[FLOW][order]
-    fine = np.linspace(flow[0], flow[-1], 1001)
-    enough = fine[np.interp(fine, flow, spent) <= per_distance(point)[0]]
-    return float(point[FLOW][0] / enough.max() - 1.0) if len(enough) else np.nan
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:

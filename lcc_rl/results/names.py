@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import pandas as pd
 
+# A column's unit by the end of its name.
+UNITS = {"kj_per_km": "kJ/km", "mps3": "m/s³", "mps": "m/s", "pct": "%", "kj": "kJ", "ms": "ms"}
+UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
+INITIALS = ("cav", "hdv", "ttc", "sd")
 HUMAN, NETWORK = "human", "alcc"
 ALONE = "constant_filtered"
 # Who learns, or has several gains: further words of a name, if any, say which.
@@ -57,3 +61,16 @@ def worded(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table with the names of strategies, where it has any, in words."""
     names = [name for name in ("strategy", "behind", "against") if name in table]
     return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
+
+
+def heading(column: str) -> str:
+    """Return a column's name for readers.
+
+    Examples:
+        >>> heading("total_energy_kj"), heading("cav_saving_pct")
+        ('total energy [kJ]', 'CAV saving [%]')
+    """
+    suffix = next((end for end in UNITS if column.endswith(f"_{end}")), "")
+    words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
+    text = " ".join(word.upper() if word in INITIALS else word for word in words)
+    return f"{text} [{UNITS[suffix]}]" if suffix else text

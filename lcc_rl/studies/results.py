@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.cells import as_markdown
 from lcc_rl.results.names import worded
+from lcc_rl.results.render import as_markdown
 
 PAGE = "results.md"
 

@@ -14,8 +14,8 @@ from lcc_rl.commands.evaluation import complete
 from lcc_rl.config import load
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.cells import signed
 from lcc_rl.results.names import in_words
+from lcc_rl.results.render import signed
 from lcc_rl.results.runs import EPISODES, STEPS, stored_config
 from lcc_rl.studies.results import StudyResults
 

@@ -16,8 +16,9 @@ from lcc_rl.data.leaders import stretch
 from lcc_rl.data.profiles import from_records
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rows import leader_faster
+from lcc_rl.results.measures import FASTER, REACH
 from lcc_rl.results.names import in_words
-from lcc_rl.results.tables import FASTER, REACH, leader_too_fast, remarks
+from lcc_rl.results.report import leader_too_fast, remarks, windows_for
 
 
 def test_the_share_of_time_by_hand() -> None:
@@ -43,13 +44,13 @@ def test_every_baseline_with_a_desired_speed_is_warned_of() -> None:
     shares = {"direct": 0.3, "human": 0.3, "idm": 0.1, "recorded": np.nan, "alcc": 0.3}
     shares |= {"acc_filtered": 1.0, "mine": 0.9}
     rows = pd.DataFrame({"strategy": shares.keys(), FASTER: shares.values()})
-    said = [line.split("speed of ")[1].split()[0] for line in leader_too_fast(rows)]
+    said = [line.split("speed of ")[1].split()[0] for line in leader_too_fast(windows_for(rows))]
     assert said == ["direct", "human", "mine"]
 
 
 def test_the_remedy_for_a_controller_is_an_option() -> None:
     rows = pd.DataFrame({"strategy": ["human", "acc", "mine"], FASTER: [0.1, 0.9, 0.8]})
-    acc, mine = (line.split("Raise v0: ")[1] for line in leader_too_fast(rows))
+    acc, mine = (line.split("Raise v0: ")[1] for line in leader_too_fast(windows_for(rows)))
     assert acc == "'compare={faster: {_target_: lcc_rl.pieces.LinearACC, desired_speed: 45}}'"
     assert mine == "'compare={faster: {_target_: <its class>, desired_speed: 45}}'"
 
@@ -76,18 +77,18 @@ def test_what_no_truck_can_do_is_said_in_log_and_table(tmp_path, caplog, words) 
     cfg = tiny("evaluate", *words, agent=False)
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
         rows = evaluation.run(cfg, tmp_path, quiet=True)
-    (line,) = remarks(rows)
+    (line,) = remarks(windows_for(rows))
     shares = rows.groupby("strategy")[list(REACH)].mean().max(axis=1)
     assert f"{in_words(shares.idxmax())} {shares.max():.2%}" in line
     assert line in caplog.text
-    (found,) = evaluation.found(rows, cfg)
-    assert found.short.attrs["caption"].endswith(line)
+    (found,) = evaluation.reports(rows, cfg)
+    assert found.note.endswith(line)
     for full in (False, True):
         assert line in " ".join(Run(tmp_path, rows, cfg).printed(full).split())
 
 
 def test_a_hundredth_of_the_time_beyond_reach_needs_no_words() -> None:
     rows = pd.DataFrame({"strategy": ["human", "mine"], "cav_share_infeasible": [0.009, 0.02]})
-    (line,) = remarks(rows)
+    (line,) = remarks(windows_for(rows))
     assert "(mine 2.00%)" in line
-    assert remarks(rows[:1]) == []
+    assert remarks(windows_for(rows[:1])) == []

@@ -21,7 +21,7 @@ from lcc_rl.evaluation.blocks import BLOCKS, Store
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.tables import summary
+from lcc_rl.results.report import summary, windows_for
 
 PROFILES = wavy_profiles().windows(100)
 INPUTS = Inputs(PROFILES, PROFILES, POPULATION)
@@ -191,25 +191,7 @@ def test_a_dataset_is_the_same_table(whole, tmp_path) -> None:
     assert field == "DictionaryType"
 
 
-def test_pairs_are_counted_with_their_repeat(tmp_path) -> None:
-    rows = pd.DataFrame(
-        {
-            "strategy": ["idm"] * 4 + ["alcc"] * 4,
-            "training_seed": pd.array([None] * 4 + [0] * 4, dtype="Int64"),
-            "profile_id": 0,
-            "driver_id": [0, 0, 1, 1] * 2,
-            "repeat": [0, 1] * 4,
-            "total_path_energy_kj": [1.0, 3.0, 1.0, 1.0, 2.0, 1.0, 0.5, 0.5],
-            "cav_distance_m": 1.0,
-            "collided": False,
-        }
-    )
-    row = summary(rows).set_index("strategy").loc["alcc"]
-    assert row["pairs_worse_than_idm"] == 0.25
-    assert row["drivers_worse_than_idm"] == 0.0  # driver 0 draws 4 and 3
-
-
-def test_a_driver_is_worse_off_by_the_sums_over_its_windows_as_savings_are() -> None:
+def test_a_saving_per_km_is_of_the_sums_over_windows() -> None:
     rows = pd.DataFrame(
         {
             "strategy": ["idm"] * 2 + ["alcc"] * 2,
@@ -221,9 +203,8 @@ def test_a_driver_is_worse_off_by_the_sums_over_its_windows_as_savings_are() -> 
             "collided": False,
         }
     )
-    row = summary(rows).set_index("strategy").loc["alcc"]
-    assert row["km_saving_vs_idm"] == pytest.approx(1.0 / 11.0)
-    assert (row["drivers_worse_than_idm"], row["pairs_worse_than_idm"]) == (0.0, 0.5)
+    row = summary(windows_for(rows)).set_index("strategy").loc["alcc"]
+    assert row["saving"] == pytest.approx(1.0 / 11.0)
 
 
 # -- compiled -------------------------------------------------------------------------------------

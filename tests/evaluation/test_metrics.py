@@ -6,7 +6,7 @@ import torch
 from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
 from lcc_rl.evaluation.rows import grouped
 from lcc_rl.functional.pattern import parse_string
-from lcc_rl.results.scores import HEADINGS, LARGEST, LEAST, SHARE
+from lcc_rl.results.measures import limit_measures
 
 ALIVE = torch.tensor([[True, True], [True, False]])  # two steps; the second episode ends early
 
@@ -53,9 +53,9 @@ def test_safety() -> None:
         "duration_s": [0.2, 0.1],
     }
     assert set(measures) == set(expected)
-    named = {name for name in expected if name.startswith((LARGEST, LEAST, SHARE))}
+    named = {name for name in expected if name.startswith(("max_", "min_", "share_"))}
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
-    assert named | {"share_leader_faster"} | filtered == set(HEADINGS)
+    assert named | {"share_leader_faster"} | filtered == set(limit_measures())
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 

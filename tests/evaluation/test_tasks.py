@@ -48,7 +48,7 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     run = Run(tmp_path, rows, cfg)
     for line in str(run).splitlines()[4:8]:
         assert line.strip() in printed
-    assert run.headline.attrs["label"] == task_of(cfg).label
+    assert run.reports()[0].label == task_of(cfg).label
     table_again([str(tmp_path), "--format", "csv"])
     again = pd.read_csv(StringIO(capsys.readouterr().out))
     np.testing.assert_allclose(again["score"], run.headline["score"])

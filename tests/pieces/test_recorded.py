@@ -19,7 +19,7 @@ from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import applies, baseline, baselines
-from lcc_rl.results.tables import FASTER
+from lcc_rl.results.measures import FASTER
 
 
 def drive(*overrides: str):

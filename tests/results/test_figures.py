@@ -25,9 +25,8 @@ from lcc_rl.figures.drawing import COLUMN, PAGE, colour, save
 from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.figures.training import learning_curve, training_figure
-from lcc_rl.results.headline import headline
-from lcc_rl.results.means import Means
-from lcc_rl.results.tables import summary
+from lcc_rl.results.report import report, windows_for
+from lcc_rl.results.windows import Means
 from lcc_rl.studies.alcc import figures as alcc
 
 
@@ -149,9 +148,10 @@ def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
 
 def test_the_overview_has_the_savings_of_the_table_and_colours_are_on_the_image(tmp_path) -> None:
     frame = episodes().assign(strategy=lambda x: x["strategy"].replace("alcc", "own_energy"))
-    table = headline(summary(frame))
+    found = report(windows_for(frame))
+    table = found.short
     own = steps().assign(strategy="own_energy")
-    figure = run_figures.overview(frame, own, "own_energy", table)
+    figure = run_figures.overview(frame, own, "own_energy", found)
     right = figure.axes[1]
     assert [x.get_text().replace("\n", " ") for x in right.get_yticklabels()] == list(table["who"])
     shown = right.lines[0].get_xdata()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -15,14 +16,14 @@ from study_frames import episodes
 
 from lcc_rl.api import Run
 from lcc_rl.config import load
+from lcc_rl.errors import ConfigError
 from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
-from lcc_rl.results.cells import as_markdown, heading
-from lcc_rl.results.headline import as_rich, caption_of, headline, sample_of, verdict
-from lcc_rl.results.means import Means
-from lcc_rl.results.names import in_words, worded
-from lcc_rl.results.tables import summary
+from lcc_rl.results.names import heading, in_words, worded
+from lcc_rl.results.render import as_markdown, terminal
+from lcc_rl.results.report import Report, report, sample_of, windows_for
+from lcc_rl.results.windows import WAYS, Means, savings
 from lcc_rl.studies.results import StudyResults
 
 TABLE = pd.DataFrame(
@@ -101,42 +102,43 @@ def test_a_study_writes_files_and_fills_marked_tables(tmp_path) -> None:
 
 
 def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> None:
-    found = summary(episodes())
-    table = headline(found)
-    cars = found.set_index("strategy").loc[table["strategy"]]
+    found = report(windows_for(episodes()))
+    table = found.short
+    cars = found.table.set_index("strategy").loc[table["strategy"]]
     assert list(table["strategy"]) == ["idm", "alcc", "reference"]
     np.testing.assert_array_equal(table["energy_kj_per_km"], cars["path_energy_kj_per_km"])
-    # Who falls back gains nothing by it: alcc drives 290 m, the others 300 m.
+    # Falling behind gains nothing: alcc drives 290 m, the others 300 m.
     per_km = cars["total_path_energy_kj"] / np.array([0.3, 0.29, 0.3])
     np.testing.assert_allclose(table["energy_kj_per_km"], per_km)
-    saved = 1.0 - per_km["alcc"] / per_km["reference"]
-    assert cars.loc["alcc", "km_saving_vs_reference"] == pytest.approx(saved)
+    saved = 1.0 - per_km["alcc"] / per_km["idm"]
+    assert cars.loc["alcc", "saving"] == pytest.approx(saved)
     means = Means.of(episodes()).per_km()  # of the figures by driver
-    shown = means.saving("total_path_energy_kj", "alcc", "reference")
+    shown = means.saving("total_path_energy_kj", "alcc", "idm")
     assert shown.value == pytest.approx(saved)
     by_driver = means.drivers.groupby("strategy")["total_path_energy_kj"].mean()
     np.testing.assert_allclose(by_driver[table["strategy"]], per_km)
-    assert verdict(found) == ""  # nobody to compare with
-    assert table.attrs["against"] == "idm"
-    own = cars.loc["alcc", "km_saving_vs_idm"]
-    assert table["saved_pct"].tolist()[1] == pytest.approx(100.0 * own)
+    assert found.verdict == ""  # nobody to compare with
+    assert found.against == "idm"
+    assert table["saved_pct"].tolist()[1] == pytest.approx(100.0 * saved)
     assert table["distance_pct"].tolist() == pytest.approx([0.0, -100.0 / 30.0, 0.0])
 
 
 def test_humans_alone_have_a_row_and_none_beside_controlled_cars() -> None:
     humans = episodes()[lambda rows: rows["strategy"] == "direct"].assign(cav_distance_m=np.nan)
-    (row,) = headline(summary(humans)).to_dict("records")
+    (row,) = report(windows_for(humans)).short.to_dict("records")
     assert row["who"] == "no automated car"
     assert row["energy_kj_per_km"] == pytest.approx(humans["hdv_path_energy_kj"].mean() / 0.15)
-    assert "direct" not in headline(summary(episodes()))["strategy"].tolist()
+    assert "direct" not in report(windows_for(episodes())).short["strategy"].tolist()
 
 
 def test_every_table_of_strategies_fits_80_columns() -> None:
-    table = headline(summary(episodes(profiles=8).replace({"strategy": {"idm": "human"}})))
-    table["saved_pct"], table["saved_pct_low"], table["saved_pct_high"] = -9.3, -10.8, -8.1
+    rows = episodes(profiles=8).replace({"strategy": {"idm": "human"}})
+    found = report(windows_for(rows))
+    ends = {"saved_pct": -9.3, "saved_pct_low": -10.8, "saved_pct_high": -8.1}
     console = Console(width=200)
     with console.capture() as shown:
-        console.print(as_rich(table, "title [x]", caption_of(table)))
+        one = replace(found, short=found.short.assign(**ends), verdict="")
+        console.print(terminal(one, "title [x]"))
     lines = shown.get().splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
     assert "title [x]" in lines[0]
@@ -156,32 +158,37 @@ def test_names_are_words_in_tables_and_figures() -> None:
     assert {name: in_words(name) for name in words} == words
 
 
+def said(frame: pd.DataFrame) -> Report:
+    return report(windows_for(frame), few=True)
+
+
 def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})
     frame["total_path_energy_kj"] += np.random.default_rng(0).normal(size=len(frame))
-    found = summary(frame)
-    own, rule = (found.set_index("strategy").loc[x] for x in ("alcc", "rule"))
-    saved = 100.0 * (1.0 - own["path_energy_kj_per_km"] / rule["path_energy_kj_per_km"])
-    words = verdict(found)
+    found = said(frame)
+    cars = found.table.set_index("strategy")["path_energy_kj_per_km"]
+    saved = 100.0 * (1.0 - cars["alcc"] / cars["rule"])
+    words = found.verdict
     assert words.startswith(
         f"With the network, for all, energy per vehicle and km is {saved:.1f} % ("
     )
     assert "less than with IDM, tuned on these data; long time gaps: 0.40 % of" in words
-    assert "within the uncertainty" in verdict(found.assign(km_saving_vs_rule_low=-1.0))
+    near = frame.copy()  # as much as the rule but for the noise
+    near.loc[near["strategy"] == "alcc", "total_path_energy_kj"] *= cars["rule"] / cars["alcc"]
+    assert "within the uncertainty" in said(near).verdict
     # So has a network of any name, and each of several.
     frame.loc[frame["strategy"] == "human", "training_seed"] = np.nan
     both = [frame.replace({"strategy": {"alcc": name}}) for name in ("near", "far")]
-    found = summary(pd.concat(both).drop_duplicates())
-    first, second, least = verdict(found).splitlines()
-    most = headline(found).iloc[-1]
+    found = said(pd.concat(both).drop_duplicates())
+    first, second, least = found.verdict.splitlines()
+    most = found.short.iloc[-1]
     assert least == f"Least energy: {most['who']}, {most['energy_kj_per_km']:,.1f} kJ/km."
     assert first == words.splitlines()[0].replace("the network, for all", "near", 1)
     assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
-    few = verdict(summary(frame[frame["profile_id"] < 4]))
+    few = said(frame[frame["profile_id"] < 4]).verdict
     assert few.endswith("; 4 windows allow no finding.")
     assert "%" not in few
-    assert verdict(summary(frame[frame["profile_id"] < 4]), of_few=False) == ""
 
 
 def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> None:
@@ -195,12 +202,23 @@ def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> N
 
 def test_one_strategy_is_compared_with_nobody_and_one_window_has_no_interval() -> None:
     frame = episodes(profiles=12)
-    alone = headline(summary(frame[frame["strategy"] == "idm"]))
-    assert alone.attrs["against"] is None
-    assert not {"saved_pct", "distance_pct"} & set(alone)
-    assert "saved" not in alone.attrs["caption"]
-    assert "with the 95 % interval" in headline(summary(frame)).attrs["caption"]
+    alone = report(windows_for(frame[frame["strategy"] == "idm"]))
+    assert alone.against is None
+    assert not {"saved_pct", "distance_pct"} & set(alone.short)
+    assert "saved" not in alone.caption
+    assert "with the 95 % interval" in report(windows_for(frame)).caption
     seed = frame["training_seed"].isna() | (frame["training_seed"] == frame["training_seed"].min())
-    one = headline(summary(frame[seed & (frame["profile_id"] == 0)])).attrs["caption"]
+    one = report(windows_for(frame[seed & (frame["profile_id"] == 0)])).caption
     assert "saved: against" in one
     assert "interval" not in one
+
+
+def test_savings_are_against_the_strategy_that_is_asked_for() -> None:
+    windows = windows_for(episodes(profiles=12))
+    found = report(windows, against="reference")
+    alcc = found.table.set_index("strategy").loc["alcc"]
+    assert alcc["against"] == found.against == "reference"
+    expected = savings(windows, "total_path_energy_kj", "alcc", "reference", WAYS)
+    assert (alcc["saving"], alcc["saving_low"]) == pytest.approx((expected.value, expected.low))
+    with pytest.raises(ConfigError, match="Did you mean 'reference'"):
+        report(windows, against="referenc")

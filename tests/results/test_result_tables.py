@@ -13,11 +13,10 @@ from rich.table import Table
 from lcc_rl.energy import CirclesFuel, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measure
-from lcc_rl.results.cells import as_latex, as_markdown
-from lcc_rl.results.headline import show
-from lcc_rl.results.scores import Task, headline, in_full, scores
-from lcc_rl.results.string_tables import case_table
-from lcc_rl.results.tables import summary
+from lcc_rl.results.platoons import case_table
+from lcc_rl.results.render import as_latex, as_markdown, show, terminal
+from lcc_rl.results.report import report, summary, windows_for
+from lcc_rl.results.task import Task
 from lcc_rl.studies.hcfs.tables import win_rates
 
 CARS = {"direct": [np.nan] * 2, "idm": [100.0, 100.0], "reference": [90.0, 100.0]}
@@ -46,29 +45,26 @@ def episodes() -> pd.DataFrame:
 
 
 def test_summary_by_hand() -> None:
-    table = summary(episodes()).set_index("strategy")
+    table = summary(windows_for(episodes())).set_index("strategy")
     alcc = table.loc["alcc"]
     assert alcc["total_energy_kj"] == pytest.approx(137.5)  # (145 + 130)/2
-    assert alcc["saving_vs_idm"] == pytest.approx(1 - 137.5 / 150)
-    assert alcc["km_saving_vs_reference"] == pytest.approx(1 - 127.5 / 135)
-    # Driver 0: 145 against 140 with the reference, worse; driver 1: 130 against 150, better.
-    assert (alcc["drivers_worse_than_reference"], alcc["drivers_worse_than_idm"]) == (0.5, 0.0)
-    assert np.isnan(alcc["km_saving_vs_idm_low"])  # one window, no seeds: nothing to resample
+    assert alcc["against"] == "idm"
+    assert alcc["drawn_saving"] == pytest.approx(1 - 137.5 / 150)
+    assert alcc["saving"] == pytest.approx(1 - 127.5 / 140)
+    assert np.isnan(alcc["saving_low"])  # one window, no seeds: nothing to resample
     assert (alcc["min_ttc_s"], alcc["share_ttc_unsafe"]) == (5.0, pytest.approx(0.05))
     # 275 kJ over two episodes of two vehicles and 0.5 km each: 2 km.
     assert alcc["kj_per_km"] == pytest.approx(137.5)
     assert table.loc["direct", "kj_per_km"] == pytest.approx(100.0)
-    assert np.isnan(table.loc["idm", "saving_vs_idm"])
+    assert np.isnan(table.loc["idm", "drawn_saving"])
 
 
-def test_a_driver_that_gains_in_the_mean_may_lose_in_single_windows() -> None:
+def test_of_two_windows_one_is_drawn() -> None:
     first = episodes()
-    # In the second window alcc costs driver 1 what it gains in the first, and half of it more.
     second = first.assign(profile_id=1)
     second.loc[second.index[-1], "total_path_energy_kj"] += 30.0
-    row = summary(pd.concat([first, second])).set_index("strategy").loc["alcc"]
-    assert (row["drivers_worse_than_idm"], row["pairs_worse_than_idm"]) == (0.0, 0.25)
-    low, high = (row[f"km_saving_vs_idm_{end}"] for end in ("low", "high"))
+    row = summary(windows_for(pd.concat([first, second]))).set_index("strategy").loc["alcc"]
+    low, high = (row[f"saving_{end}"] for end in ("low", "high"))
     # One window of two is drawn: 127.5 or 142.5 kJ against 140.
     assert (low, high) == pytest.approx((1 - 142.5 / 140, 1 - 127.5 / 140))
 
@@ -164,7 +160,7 @@ def driven(strategy: str, *energy: float, metres: float = 1000.0, **more: float)
 def test_a_score_is_energy_over_distance_and_falling_behind_gains_nothing() -> None:
     rows = [driven("human", 100.0, 300.0), driven("good", 90.0, 270.0)]
     rows.append(driven("behind", 90.0, 270.0, metres=900.0))  # a tenth less energy, and road
-    found = scores(pd.concat(rows), TASK, MOTOR).set_index("strategy")
+    found = summary(windows_for(pd.concat(rows)), TASK, MOTOR).set_index("strategy")
     assert found["score"].tolist() == pytest.approx([200.0, 180.0, 200.0])
     assert found.loc["good", "saving"] == pytest.approx(0.1)
     assert found.loc["behind", "saving"] == pytest.approx(0.0, abs=1e-9)
@@ -176,8 +172,7 @@ def test_a_score_is_energy_over_distance_and_falling_behind_gains_nothing() -> N
 def test_all_scores_of_a_ring_name_the_damped_episodes_and_their_mean_time(capsys) -> None:
     never = driven("human", 1.0, 1.0).assign(damping_time_s=np.nan)
     own = driven("own", 1.0, 1.0, 1.0).assign(damping_time_s=[30.0, 40.0, np.nan])
-    found = scores(pd.concat([never, own]), TASK, MOTOR)
-    show(in_full(found, "", TASK))
+    show(terminal(report(windows_for(pd.concat([never, own])), TASK, MOTOR), full=True))
     lines = capsys.readouterr().out.splitlines()
     rows = [line.split()[-2:] for line in lines if "calm" in line or "from when on" in line]
     assert rows == [["0%", "67%"], ["–", "35"]]
@@ -195,9 +190,10 @@ def test_a_table_in_a_pipe_is_as_wide_as_its_content_or_as_columns(monkeypatch, 
 def test_a_table_says_who_loses_more_than_5_percent_of_the_flow() -> None:
     flows = {"human": 2000.0, "idm_acc": 1920.0, "pi_saturation": 1600.0}
     rows = pd.concat(driven(name, 1.0, flow_vph=flow) for name, flow in flows.items())
-    found = scores(rows, TASK, MOTOR)
+    one = report(windows_for(rows), TASK, MOTOR)
+    found = one.table
     assert found["flow_lost"].tolist() == pytest.approx([0.0, 0.04, 0.2])
-    said = headline(found, TASK).attrs["caption"]
+    said = one.caption
     assert said.endswith(" Flow lost against simulated drivers: PI with saturation 20 %.")
     assert found["kept"].all()
 
@@ -206,7 +202,7 @@ def test_all_scores_name_limits_in_words_and_wrap_names_at_spaces_only(capsys) -
     others = ("follower_stopper", "pi_saturation", "constant", "mpc_far")
     rows = pd.concat(driven(name, 1.0, share_ttc_unsafe=0.001) for name in ("human", *others))
     task = Task(name="mine", limits={**TASK.limits, "share_ttc_unsafe": 0.0005})
-    show(in_full(scores(rows, task, MOTOR), "", task))
+    show(terminal(report(windows_for(rows), task, MOTOR), full=True))
     printed = capsys.readouterr().out
     words = printed.split()
     assert {"FollowerStopper", "saturation", "simulated"} <= set(words)
@@ -229,7 +225,7 @@ def test_limits_are_kept_by_the_worst_episode(change, kept) -> None:
     own = driven("own", 1.0, 1.0)
     for column, value in change.items():
         own.loc[1, column] = value
-    found = scores(pd.concat([driven("human", 1.0, 1.0), own]), TASK, MOTOR)
+    found = summary(windows_for(pd.concat([driven("human", 1.0, 1.0), own])), TASK, MOTOR)
     assert found["kept"].tolist() == [True, kept]
 
 
@@ -238,7 +234,7 @@ def test_a_share_is_limited_in_the_mean_and_a_column_may_be_the_score() -> None:
     rows = pd.concat([driven("human", 1.0, 1.0), own]).assign(share_ttc_unsafe=[0, 0, 0, 0.03])
     for bound, kept in ((0.02, True), (0.01, False)):
         task = Task(name="mine", score="final_speed_spread_mps", limits={"share_ttc_unsafe": bound})
-        found = scores(rows, task, MOTOR)
+        found = summary(windows_for(rows), task, MOTOR)
         assert found["kept"].tolist() == [True, kept]
         assert found["score"].tolist() == pytest.approx([0.5, 0.1])
 

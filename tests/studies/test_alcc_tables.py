@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from study_frames import episodes, training, windows
 
-from lcc_rl.results.means import Means
+from lcc_rl.results.windows import Means
 from lcc_rl.studies.alcc import paper_tables
 from lcc_rl.studies.alcc import tables as alcc_tables
 

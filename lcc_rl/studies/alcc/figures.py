@@ -27,9 +27,9 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.training import BAND, draw_curves
 from lcc_rl.functional.power import motor_power
-from lcc_rl.results.cells import signed
 from lcc_rl.results.names import in_words
-from lcc_rl.results.savings import by_driver, savings
+from lcc_rl.results.render import signed
+from lcc_rl.results.windows import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 from lcc_rl.studies.alcc.tables import comparison
 

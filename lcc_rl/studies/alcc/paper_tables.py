@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.intervals import share_saved
-from lcc_rl.results.means import Means
-from lcc_rl.results.savings import KINDS, by_driver, driver_savings, per_seed, savings
+from lcc_rl.results.bootstrap import share_saved
+from lcc_rl.results.windows import Means, by_driver, driver_savings, per_seed, savings
+from lcc_rl.studies.alcc.tables import KINDS
 
 PAPER, OURS = "paper", "this study"
 NAMES = {"path_": "path energy", "": "as drawn"}  # of the keys of KINDS
@@ -44,7 +44,7 @@ def table_iv(
     The best driver is the one with the largest saving of total energy over profiles and seeds.
 
     Args:
-        drivers: of :class:`lcc_rl.results.means.Means`.
+        drivers: of :class:`lcc_rl.results.windows.Means`.
         strategy, baseline: the controllers that are compared.
 
     Returns:

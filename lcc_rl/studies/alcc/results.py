@@ -13,10 +13,10 @@ from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.means import WINDOWS, Means
 from lcc_rl.results.names import in_words
+from lcc_rl.results.report import sample_of
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.results.savings import LEADER
+from lcc_rl.results.windows import LEADER, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS, EVALUATION
 from lcc_rl.studies.results import StudyResults
@@ -76,7 +76,7 @@ def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 
 def add_main(found: StudyResults, means: Means) -> None:
     """Add the tables and figures of the main evaluation."""
-    windows, size = means.windows, means.size()
+    windows, size = means.windows, sample_of(means.windows, means.drivers)
     found.table("headline", f"Energy of both saved, {size}", tables.headline(windows))
     found.table("energies", f"Energy per episode, {size}", tables.energies(windows))
     if set(LEADER) <= set(windows):
@@ -101,7 +101,7 @@ def add_main(found: StudyResults, means: Means) -> None:
 
 
 def _awareness(found: StudyResults, means: Means) -> None:
-    caption = f"Table IV beside this study, {means.size()}"
+    caption = f"Table IV beside this study, {sample_of(means.windows, means.drivers)}"
     found.table("table_iv", caption, paper_tables.table_iv(means.drivers))
     found.table("holistic", "Saving per driver", paper_tables.holistic(means))
     caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"

@@ -1,29 +1,30 @@
 """Tables of energy, safety and learning in the ALCC study, with 95 % intervals.
 
-Their arguments are windows of :class:`lcc_rl.results.means.Means`, every strategy on the same
+Their arguments are windows of :class:`lcc_rl.results.windows.Means`, every strategy on the same
 windows and drivers. Intervals of savings are over windows and seeds, all others over seeds only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.cells import MISSING, heading
-from lcc_rl.results.intervals import mean, share_saved
-from lcc_rl.results.savings import (
-    BASELINES,
-    KINDS,
-    NOTHING,
-    UNTRAINED,
-    per_seed,
-    savings,
-    stratified,
-)
+from lcc_rl.results.bootstrap import NOTHING, mean, share_saved
+from lcc_rl.results.measures import PATH
+from lcc_rl.results.names import heading
+from lcc_rl.results.render import MISSING
+from lcc_rl.results.report import UNTRAINED
+from lcc_rl.results.windows import LEADER, SOURCE, by_source, per_seed, savings
 
-PATH = "total_path_energy_kj"
 PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
+BASELINES = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
 COMPARED = (*BASELINES, "own_energy")
+# Prefix of a saving, and of which energy: the path's, which excludes what the motion stores and so
+# what ending slower saves; and as drawn (A2).
+KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
+TERCILES = ("lower", "middle", "upper")
 LONG, MOVING = "long_time_gap_pct", "long_time_gap_above_1_mps_pct"
 SHARES = {
     "unsafe_ttc_pct": "share_ttc_unsafe",
@@ -72,21 +73,47 @@ def headline(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def strata(windows: pd.DataFrame) -> pd.DataFrame:
-    """Savings of path energy in the terciles of windows by what their leader does.
+    """Savings of path energy in thirds of the windows by what their leader does.
 
-    Rows of :func:`lcc_rl.results.savings.stratified` for ``alcc``, or every trained strategy
-    without it, against each baseline.
+    Returns:
+        For ``alcc``, or every trained strategy without it, against each baseline: a row per
+        property of the leader and third, the lowest first, with its windows, the range of the
+        property and the share saved [%]; and a row per source of leaders, if there are several,
+        by its name in the column ``tercile``, without a range.
     """
     names = [name for name in per_seed(windows, PATH) if name not in UNTRAINED]
-    parts = [
-        stratified(windows, PATH, name, baseline).assign(strategy=name, against=baseline)
+    parts = list(_thirds(windows))
+    rows = [
+        {
+            "strategy": name,
+            "against": baseline,
+            "by": heading(by),
+            "tercile": third,
+            "windows": inside["profile_id"].nunique(),
+            "least": least,
+            "most": most,
+            **savings(inside, PATH, name, baseline).columns("saving_pct", 100.0),
+        }
         for name in (["alcc"] if "alcc" in names else names)
         for baseline in COMPARED
         if baseline != name and (windows["strategy"] == baseline).any()
+        for by, third, least, most, inside in parts
     ]
-    table = pd.concat(parts, ignore_index=True)
-    table["by"] = table["by"].map(heading)
-    return table[["strategy", "against", *table.columns.drop(["strategy", "against"])]]
+    return pd.DataFrame(rows)
+
+
+def _thirds(windows: pd.DataFrame) -> Iterator[tuple[str, str, float, float, pd.DataFrame]]:
+    """Yield property, name, range and rows of each source and third of the windows."""
+    if SOURCE in windows:
+        for source, rows in by_source(windows):
+            yield SOURCE, source, np.nan, np.nan, rows
+    for column in LEADER:
+        values = windows.groupby("profile_id")[column].first().sort_values()
+        parts = np.array_split(np.arange(len(values)), len(TERCILES))
+        for name, part in zip(TERCILES, (values.iloc[chosen] for chosen in parts), strict=True):
+            if len(part):
+                inside = windows[windows["profile_id"].isin(part.index)]
+                yield column, name, part.iloc[0], part.iloc[-1], inside
 
 
 def _seeds(rows: pd.DataFrame) -> str:

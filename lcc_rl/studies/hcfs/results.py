@@ -11,8 +11,8 @@ from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.figures import platoon
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.platoons import case_table
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.results.string_tables import case_table
 from lcc_rl.studies.hcfs import tables
 from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED

@@ -11,9 +11,9 @@ import torch
 from lcc_rl.data.leaders import WHOLE
 from lcc_rl.evaluation.cases import WINDOWS
 from lcc_rl.functional.hcfs import PlatoonReward
-from lcc_rl.results import intervals
-from lcc_rl.results.savings import DRIVE
-from lcc_rl.results.string_tables import COUNTS, case_table
+from lcc_rl.results import bootstrap
+from lcc_rl.results.platoons import COUNTS, case_table
+from lcc_rl.results.windows import DRIVE
 
 LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
 # What the paper prints in Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.
@@ -47,8 +47,8 @@ SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "r
 SUMS += ["collided", *COUNTS]
 LARGEST = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
 # What is kept of runs behind other sources of leaders, and of which strategies.
-MEASURES = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
-MEASURES += ["energy_kj_per_km"]
+COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
+COMPARED_BY += ["energy_kj_per_km"]
 STABLE = ("cacc tuned", "deadbeat", LEARNED, "hcfs", "hcfs between", "hcfs first")
 LEADERS = {  # sources of leaders, for readers
     "traffic": "I-80",
@@ -104,9 +104,9 @@ def per_seed(episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward
     )
 
 
-def crossed(runs: pd.DataFrame) -> intervals.Estimate:
+def crossed(runs: pd.DataFrame) -> bootstrap.Estimate:
     """Return the mean of a table of :func:`per_seed` with its interval over drives and seeds."""
-    return intervals.crossed(runs, drives=_drives(runs))
+    return bootstrap.crossed(runs, drives=_drives(runs))
 
 
 def _drives(runs: pd.DataFrame) -> list[object]:
@@ -143,7 +143,7 @@ def win_rates(
         row |= crossed(difference).columns("reward_gain")
         # Rewards are negative: the share of the loss that is saved.
         both = -own[shared], -other[shared]
-        gain = intervals.saving(*both, paired=True, drives=_drives(own))
+        gain = bootstrap.saving(*both, paired=True, drives=_drives(own))
         row |= gain.columns("gain_pct", 100.0)
         rows.append(row | {"seeds_ahead": int((difference.mean() > 0).sum())})
     return pd.DataFrame(rows)
@@ -245,7 +245,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
         }
         for name, energy in spent.items():
             own = group[group["strategy"] == name]
-            saved = intervals.saving(energy, spent[strategies[0]], drives=_drives(energy))
+            saved = bootstrap.saving(energy, spent[strategies[0]], drives=_drives(energy))
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
             row: dict[str, object] = {"leaders": source, "strategy": NAMES[name]}
             row |= crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")

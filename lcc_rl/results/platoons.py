@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from rich.console import Group
 
 from lcc_rl.errors import unknown_name
-from lcc_rl.results import intervals
-from lcc_rl.results.headline import Shown
-from lcc_rl.results.names import in_words
-from lcc_rl.results.tables import strategies_side_by_side
+from lcc_rl.results import bootstrap
+from lcc_rl.results.measures import Measure, Shown
+from lcc_rl.results.report import ALL, Report, shortened
 
 COUNTS = ("switches", "clamps", "cap_interventions")
 
@@ -54,7 +52,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         spread = rows[f"{name}_squares"].sum() / frames - mean**2
         row[f"{name}_sum_{label}"] = per_run(f"{name}_sum").mean()
         row[f"{name}_std_{label}"] = float(np.sqrt(max(spread, 0.0)))
-    row |= intervals.mean(per_run("reward")).columns("reward")
+    row |= bootstrap.mean(per_run("reward")).columns("reward")
     row["min_gap_m"] = rows["min_gap_m"].min()
     row["max_gap_error_m"] = rows["max_gap_error_m"].max()
     row["collisions"] = int(rows["collided"].sum())
@@ -67,45 +65,29 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
     return row
 
 
-ROWS = (
-    ("Σ|e_v| [m/s]", "speed_error_sum_mps", "{:.2f}"),
-    ("std |e_v| [m/s]", "speed_error_std_mps", "{:.3f}"),
-    ("Σ|jerk| [m/s³]", "jerk_sum_mps3", "{:.1f}"),
-    ("std |jerk| [m/s³]", "jerk_std_mps3", "{:.2f}"),
-    ("Σ reward", "reward", "{:.2f}"),
-    ("smallest gap [m]", "min_gap_m", "{:.2f}"),
-    ("largest gap error [m]", "max_gap_error_m", "{:.2f}"),
-    ("collisions", "collisions", "{:.0f}"),
-    ("peak |jerk| [m/s³]", "peak_jerk_mps3", "{:.1f}"),
-    ("string ratio, worst", "string_ratio", "{:.2f}"),
-    ("share of DDPG", "learned_share", "{:.0%}"),
-    ("switches", "switches", "{:.1f}"),
-    ("jerk clamps", "clamps", "{:.1f}"),
-    ("safe-cap interventions", "cap_interventions", "{:.1f}"),
+PLATOON = (
+    Measure("speed_error_sum_mps", "Σ|e_v| [m/s]", short="Σ|e_v|\n[m/s]"),
+    Measure("speed_error_std_mps", "std |e_v| [m/s]", "{:.3f}"),
+    Measure("jerk_sum_mps3", "Σ|jerk| [m/s³]", "{:.1f}", short="Σ|jerk|\n[m/s³]"),
+    Measure("jerk_std_mps3", "std |jerk| [m/s³]"),
+    Measure("reward", "Σ reward", short="Σ reward"),
+    Measure("min_gap_m", "smallest gap [m]", short="least\ngap [m]"),
+    Measure("max_gap_error_m", "largest gap error [m]"),
+    Measure("string_ratio", "string ratio, worst", short="string\nratio"),
+    Measure("collisions", "collisions", "{:.0f}", short="colli-\nsions"),
+    Measure("peak_jerk_mps3", "peak |jerk| [m/s³]", "{:.1f}"),
+    Measure("learned_share", "share of DDPG", "{:.0%}"),
+    Measure("switches", "switches", "{:.1f}"),
+    Measure("clamps", "jerk clamps", "{:.1f}"),
+    Measure("cap_interventions", "safe-cap interventions", "{:.1f}"),
 )
+BELOW = "sums over followers and frames, means over runs"
 
 
-COLUMNS = (
-    Shown("who", "driven by"),
-    Shown("speed_error_sum_mps", "Σ|e_v|\n[m/s]"),
-    Shown("jerk_sum_mps3", "Σ|jerk|\n[m/s³]"),
-    Shown("reward", "Σ reward"),
-    Shown("min_gap_m", "least\ngap [m]"),
-    Shown("string_ratio", "string\nratio"),
-    Shown("collisions", "colli-\nsions"),
-)
-CAPTION = "sums over followers and frames, means over runs"
-
-
-def headline(table: pd.DataFrame) -> pd.DataFrame:
-    """Shorten a case's table, as :func:`lcc_rl.results.headline.headline`."""
-    found = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
-    found = found[["strategy", *(column.key for column in COLUMNS)]]
-    caption = f"{CAPTION}; all measures: table=all or --all."
-    found.attrs |= {"caption": caption, "shown": COLUMNS}
-    return found
-
-
-def in_full(table: pd.DataFrame, title: str) -> Group:
-    """Return all that a case's table holds, a column per strategy."""
-    return strategies_side_by_side(table, ROWS, title, CAPTION)
+def case_report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
+    """Return the report of a case of a platoon, from rows of episodes.parquet."""
+    table = case_table(rows, case)
+    shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
+    short = shortened(table.drop(columns=["reward_low", "reward_high"]), shown)
+    caption = f"{BELOW}; {ALL}"
+    return Report(of, table, *short, PLATOON, caption, BELOW)

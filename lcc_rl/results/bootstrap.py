@@ -1,0 +1,183 @@
+"""Bootstrap confidence intervals over held-out windows or drives, and training seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CONFIDENCE = 0.95
+RESAMPLES = 9999
+LEAST_DRIVES = 5  # fewer tell too little of how drives differ
+SEED = 0  # of the resampling: the same rows give the same interval
+ALONE = -1  # stream of seeds that are resampled without windows
+
+Array = NDArray[np.float64]
+Side = Mapping[str, Array]  # columns of one side of a comparison, each ``[..., windows, seeds]``
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with the bounds of its 95 % interval; NaN bounds if nothing can be resampled."""
+
+    value: float
+    low: float = np.nan
+    high: float = np.nan
+
+    def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
+        """Return ``name``, ``name_low`` and ``name_high``, scaled."""
+        values = {"": self.value, "_low": self.low, "_high": self.high}
+        return {f"{name}{end}": factor * value for end, value in values.items()}
+
+
+NOTHING = Estimate(np.nan)
+
+
+def estimate(
+    statistic: Callable[..., Any],
+    *sides: Side,
+    drives: Sequence[object] | None = None,
+    paired: bool = False,
+    alone: bool = False,
+) -> Estimate:
+    """Return a statistic of means with its interval.
+
+    The interval is that of a clustered bootstrap: held-out windows and training seeds are
+    resampled crosswise (the pigeonhole bootstrap, Owen 2007). All sides meet the same windows;
+    the seeds of two trainings are independent. From n windows or seeds n − 1 are drawn, which
+    makes the variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 %
+    intervals of eight seeds contain the truth in 90 to 97 % of cases, of four in 80 to 91 %, of two
+    in 61 to 84 %: with few seeds that differ much, the interval is too narrow.
+
+    Args:
+        statistic: function of one mapping per side, which holds the mean of each column,
+            ``[...]``, or its resampled means, ``[..., RESAMPLES]``.
+        sides: columns of each side, in the same windows; one seed if nothing was trained.
+        drives: what each window is cut from; whole drives are resampled if there are at least
+            five, because windows of one drive are alike.
+        paired: seed by seed, all sides come from the same training.
+        alone: resample seeds only, and n of n.
+
+    Returns:
+        The statistic; without an interval if it is NaN, if there is one window and one seed of
+        each side, or if no resample has a value. If a side has one seed, the interval does not
+        cover what another seed would change.
+    """
+    value = float(statistic(*({key: x.mean((-2, -1)) for key, x in one.items()} for one in sides)))
+    if not np.isfinite(value) or max(n for one in sides for n in _sizes(one)) < 2:
+        return Estimate(value)
+    streams = [ALONE if alone else 1 if paired else side for side in range(1, len(sides) + 1)]
+    drawn = (
+        {key: resampled(x, stream, drives) for key, x in one.items()}
+        for one, stream in zip(sides, streams, strict=True)
+    )
+    found = statistic(*drawn)
+    found = found[np.isfinite(found)]
+    if not len(found):
+        return Estimate(value)
+    low, high = bounds(found)
+    # Of two windows one is drawn, and the share of both may lie outside those of either.
+    return Estimate(value, min(float(low), value), max(float(high), value))
+
+
+def _sizes(side: Side) -> tuple[int, ...]:
+    return next(iter(side.values())).shape[-2:]
+
+
+def resampled(table: Array, stream: int, drives: Sequence[object] | None = None) -> Array:
+    """Return the resampled means of ``[..., windows, seeds]``; a stream draws its own seeds."""
+    drawn = drawn_windows(table.shape[-2], drives) @ table
+    return np.asarray((drawn * weights(table.shape[-1], stream)).sum(-1))
+
+
+def drawn_windows(count: int, drives: Sequence[object] | None = None) -> Array:
+    """Return the weights of windows in every resample, ``[RESAMPLES, count]``; of whole drives."""
+    if drives is None or len(set(drives)) < LEAST_DRIVES:
+        return weights(count, 0)
+    names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
+    drawn = weights(len(names), 0)[:, [names[name] for name in drives]]
+    return np.asarray(drawn / drawn.sum(1, keepdims=True))
+
+
+@lru_cache(maxsize=8)  # a table asks for the same ones again and again
+def weights(count: int, stream: int) -> Array:
+    """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
+    if stream == ALONE:
+        drawn = np.random.default_rng(SEED).integers(0, count, (RESAMPLES, count))
+        drawn += count * np.arange(RESAMPLES)[:, None]
+        times = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
+        return times.reshape(RESAMPLES, count) / count
+    draws, generator = max(count - 1, 1), np.random.default_rng([SEED, stream])
+    return generator.multinomial(draws, np.full(count, 1.0 / count), RESAMPLES) / draws
+
+
+def bounds(values: Array) -> Array:
+    """Return the bounds of an interval from resampled values, ``[2, ...]``, by percentiles."""
+    tail = (1.0 - CONFIDENCE) / 2.0
+    return np.asarray(np.quantile(values, [tail, 1.0 - tail], axis=-1))
+
+
+def mean(values: ArrayLike) -> Estimate:
+    """Return the mean of one number per seed with its interval over seeds."""
+    numbers = np.asarray(values, dtype=np.float64).reshape(1, -1)
+    return estimate(_only, {"": numbers}, alone=True) if numbers.size else NOTHING
+
+
+def crossed(values: ArrayLike, drives: Sequence[object] | None = None) -> Estimate:
+    """Return the mean of ``[windows, seeds]`` with its interval, see :func:`estimate`."""
+    return estimate(_only, {"": np.asarray(values, dtype=np.float64)}, drives=drives)
+
+
+def _only(side: Side) -> Any:
+    return side[""]
+
+
+def band(curves: Array) -> Array:
+    """Return the bounds of the mean over seeds at every point of a curve, ``[2, points]``.
+
+    Args:
+        curves: ``[points, seeds]``, at least two seeds.
+    """
+    return bounds(curves @ weights(curves.shape[1], ALONE)[: RESAMPLES // 9].T)
+
+
+def share_saved(value: Any, baseline: Any) -> Any:
+    """Return the saved share of a baseline's energy, also if that is negative (recuperation)."""
+    return (baseline - value) / abs(baseline)
+
+
+def saving(
+    values: ArrayLike,
+    baseline: ArrayLike,
+    paired: bool = False,
+    drives: Sequence[object] | None = None,
+    ways: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Estimate:
+    """Return the share saved by the mean against that of a baseline, see :func:`estimate`.
+
+    Args:
+        values: mean energy over all drivers, ``[windows, seeds]``.
+        baseline: that of the baseline in the same windows, ``[windows, its seeds]``.
+        paired, drives: as of :func:`estimate`.
+        ways: the distances of both sides, as the energies: what is saved is then energy per
+            distance, ratios of totals, in which energy and distance are resampled together.
+
+    Returns:
+        The share; without an interval if resampled baselines are of both signs: then no share of
+        them means anything. The share of a baseline of zero is NaN.
+    """
+    sides = [np.asarray(side, dtype=np.float64) for side in (values, baseline)]
+    driven = [np.asarray(side, dtype=np.float64) for side in ways or map(np.ones_like, sides)]
+    both = ({"energy": x, "way": way} for x, way in zip(sides, driven, strict=True))
+    return estimate(_saved, *both, drives=drives, paired=paired)
+
+
+def _saved(ours: Side, theirs: Side) -> Any:
+    own, other = (side["energy"] / side["way"] for side in (ours, theirs))
+    if other.min() <= 0.0 <= other.max():
+        return np.full_like(own, np.nan)
+    return share_saved(own, other)

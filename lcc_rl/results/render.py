@@ -1,0 +1,239 @@
+"""Tables and reports for readers: on the terminal, in Markdown and in LaTeX."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from textwrap import fill
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from rich.console import Console, Group, RenderableType
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from lcc_rl.errors import unknown_name
+from lcc_rl.results.measures import Shown
+from lcc_rl.results.names import heading, in_words
+from lcc_rl.results.report import Report
+from lcc_rl.runs.output import PLAIN
+
+MISSING = "–"
+WIDTH, WIDEST = 80, 10_000  # characters
+
+
+class Column(NamedTuple):
+    """A column of a table as text: its heading, its cells, and whether it holds numbers."""
+
+    heading: str
+    cells: list[str]
+    number: bool
+
+
+def signed(value: float, form: str = "+z.1f") -> str:
+    """Return a number with its sign, a minus as in print, and no negative zero.
+
+    Examples:
+        >>> signed(-2.34), signed(2.34)
+        ('−2.3', '+2.3')
+    """
+    return f"{value:{form}}".replace("-", "−")
+
+
+def columns(frame: pd.DataFrame) -> list[Column]:
+    """Return the columns of a table as text.
+
+    A column's unit is the end of its name (``energy_kj``, ``saving_pct``), and ``x``, ``x_low``,
+    ``x_high`` become one column. Numbers have about four digits, or as many decimals as
+    ``frame.attrs["decimals"]`` says.
+    """
+    bounds = {f"{name}{end}" for name in frame for end in ("_low", "_high")}
+    return [
+        Column(heading(name), column_cells(frame, name), _is_number(frame[name]))
+        for name in map(str, frame)
+        if name not in bounds
+    ]
+
+
+def as_markdown(frame: pd.DataFrame) -> str:
+    """Return a table for a Markdown page, with the headings and cells of :func:`columns`."""
+    shown = columns(frame)
+    rows = [[column.heading for column in shown], ["---"] * len(shown)]
+    rows += map(list, zip(*(column.cells for column in shown), strict=True))
+    return "\n".join(markdown_row(row) for row in rows)
+
+
+def markdown_row(cells: Iterable[str]) -> str:
+    """Return a row of a Markdown table, whatever its cells hold.
+
+    Examples:
+        >>> print(markdown_row(["a|b", "1"]))
+        | a\\|b | 1 |
+    """
+    escaped = (" ".join(cell.split()).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"
+
+
+def as_latex(frame: pd.DataFrame) -> str:
+    """Return a table for LaTeX (package booktabs), with headings and cells as on a page."""
+    shown = columns(frame)
+    cells = pd.DataFrame({column.heading: column.cells for column in shown})
+    places = "".join("r" if column.number else "l" for column in shown)
+    text = cells.to_latex(index=False, escape=True, column_format=places).rstrip()
+    return text.replace("−", "$-$").replace(" … ", " to ").replace(MISSING, "--")
+
+
+def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
+    """Return the cells of a column as text, with its interval if the table has one."""
+    places = frame.attrs.get("decimals", _places(frame[name]))
+    cells = [_cell(value, places) for value in frame[name]]
+    if f"{name}_low" not in frame:
+        return cells
+    low, high = ([_cell(x, places) for x in frame[f"{name}_{end}"]] for end in ("low", "high"))
+    return [
+        cell if MISSING in ends else f"{cell} ({' … '.join(ends)})"
+        for cell, *ends in zip(cells, low, high, strict=True)
+    ]
+
+
+def _is_number(values: pd.Series) -> bool:
+    kinds = pd.api.types
+    return kinds.is_numeric_dtype(values) and not kinds.is_bool_dtype(values)
+
+
+def _places(values: pd.Series) -> int:
+    """Return the decimals that give a column about four significant digits."""
+    if not pd.api.types.is_float_dtype(values):
+        return 0
+    numbers = values.to_numpy(float)
+    sizes = np.abs(numbers[np.isfinite(numbers) & (numbers != 0.0)])
+    if not len(sizes):
+        return 0
+    typical = float(np.median(sizes))
+    return int(np.clip(3 - np.floor(np.log10(typical)), 0, 2 if typical >= 0.1 else 4))
+
+
+def _cell(value: object, places: int) -> str:
+    if isinstance(value, (bool, np.bool_)):
+        return "yes" if value else "no"
+    if isinstance(value, (int, np.integer)):
+        return f"{value:,}"
+    if isinstance(value, (float, np.floating)) and np.isfinite(value):
+        return signed(float(value), f"z,.{places}f")  # no negative zero
+    return value if isinstance(value, str) else MISSING
+
+
+def terminal(report: Report, title: str = "", full: bool = False) -> RenderableType:
+    """Return a report for the terminal, within 80 characters: a row per strategy.
+
+    Args:
+        report: the report.
+        title: above the table.
+        full: every measure, a column per strategy.
+    """
+    said = [report.verdict] if report.verdict else []
+    if full:
+        drawn: RenderableType = _side_by_side(report, title)
+        said += [fill(line, WIDTH) for line in report.remarks]
+    else:
+        drawn = as_rich(report.short, report.shown, title, report.note)
+    return Group(drawn, Text("\n".join(said))) if said else drawn
+
+
+def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: str) -> Table:
+    """Return columns of a table for the terminal; savings have one decimal, sign and interval."""
+    drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
+    for place, column in enumerate(shown):
+        drawn.add_column(escape(column.heading), justify="right" if place else "left")
+    for row in zip(*(_short_cells(table, column.key) for column in shown), strict=True):
+        drawn.add_row(*map(escape, row))
+    return drawn
+
+
+def _short_cells(table: pd.DataFrame, name: str) -> list[str]:
+    if f"{name}_low" not in table:
+        return column_cells(table, name)
+    bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
+    return [saved(*row) for row in bounds]
+
+
+def saved(share: float, low: float, high: float) -> str:
+    """Return a saving [%] with sign and interval."""
+    if pd.isna(share):
+        return MISSING
+    within = "" if pd.isna(low) else f" ({low:.1f} … {high:.1f})"
+    return f"{share:+.1f}{within}".replace("-", "−")
+
+
+def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
+    """Yield label and cells of every measure that any strategy has."""
+    for one in report.rows:
+        values = report.table[one.key].astype(float)
+        if values.notna().any():
+            known = zip(report.table[one.key], np.isfinite(values), strict=True)
+            cells = (one.form.format(x) if k else MISSING for x, k in known)
+            yield one.label, [cell.replace("-", "−") for cell in cells]
+
+
+def _side_by_side(report: Report, title: str) -> Group:
+    """Return tables with a column per strategy, as many as fit; names are wrapped at spaces."""
+    rows = list(full_rows(report))
+    names = [in_words(str(name)) for name in report.table["strategy"]]
+    room = WIDTH - max(len(label) for label, _ in rows)
+    widths = [max([len("automated"), *map(len, name.split())]) for name in names]
+    drawn: list[Table] = []
+    used = room
+    for name, width in zip(names, widths, strict=True):
+        used += 1 + width
+        if used > room or not drawn:
+            used = 1 + width
+            drawn.append(Table("", **PLAIN))
+        drawn[-1].add_column(escape(name), justify="right", max_width=width, overflow="fold")
+    start = 0
+    for table in drawn:
+        end = start + len(table.columns) - 1
+        for label, cells in rows:
+            table.add_row(escape(label), *cells[start:end])
+        start = end
+    drawn[0].title, drawn[-1].caption = escape(title), escape(report.full_caption)
+    return Group(*drawn)
+
+
+def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
+    """Return columns of a report with their intervals, named for a page or a paper.
+
+    Args:
+        report: the report.
+        names: which; by default those that its short table shows.
+
+    Raises:
+        ConfigError: for a column that is not there, naming the nearest.
+    """
+    table = chosen(report.short, names or [column.key for column in report.shown])
+    return table.rename(columns={"who": "driven by", "score": report.label})
+
+
+def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Return columns of a table with their intervals, all by default.
+
+    Raises:
+        ConfigError: for a column that is not there, naming the nearest.
+    """
+    known = [str(key) for key in table]
+    for name in names:
+        if name not in known:
+            raise unknown_name("column", name, known)
+    keys = names or known
+    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
+    return table[list(dict.fromkeys(kept))]
+
+
+def show(table: RenderableType) -> None:
+    """Print a table or a text, as wide as the terminal or ``COLUMNS``; else as its content."""
+    console = Console()
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width
+        console = Console(width=max(wide, console.width))
+    console.print(table)

@@ -1,0 +1,473 @@
+"""Reports of evaluations: measures, savings and limits by strategy, and what they amount to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lcc_rl.energy import Fleet
+from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.io.files import Rows
+from lcc_rl.results import measures
+from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
+from lcc_rl.results.measures import (
+    BROKEN,
+    FASTER,
+    FLOW,
+    LONG_GAPS,
+    MEASURES,
+    PATH,
+    PATH_PER_KM,
+    REACH,
+    SHARE,
+    Measure,
+    Shown,
+)
+from lcc_rl.results.names import FILTERED, HUMAN, NETWORK, in_words
+from lcc_rl.results.task import Task
+from lcc_rl.results.units import burns_one_fuel, check_unit, per_distance
+from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
+
+# Whom tables compare with, and whom the verdict compares a network with: the first that there is.
+AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
+RULE = "rule"  # the IDM tuned on the same data, by the gradient
+RULES = (RULE, "idm_acc_filtered", "idm_acc")
+# Strategies that networks are compared with. All but the rule learn nothing.
+UNTRAINED = (
+    *("direct", "idm", HUMAN, "recorded", "constant_filtered", RULE),
+    *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
+)
+FEW_WINDOWS, SHORT = 5, 150.0  # windows; seconds of them
+SCORE, FLOW_LOST = "score", "flow_lost"
+SAVED = Shown("saved_pct", "saved\n[%]")
+WAY = Shown("distance_pct", "dis-\ntance\n[%]")
+COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
+FLOW_NAMED = 0.05  # share of the flow from which on a table says that it is lost
+MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
+MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
+ALL = "all measures: table=all or --all."
+CAPTION = (
+    "Energy per vehicle and km, without what motion stores; {}shares of the time: "
+    f"TTC < 4 s; time gap > 2.5 s above 1 m/s; {ALL}"
+)
+BEHIND_FILTER = "networks, and those called filtered, drive behind the safety filter; "
+FULL = (
+    "energies: mean per episode; path energy: without what the motion stores; saved: of path "
+    "energy per km, of a task of its score; intervals: over held-out windows (drives, if five or "
+    "more) and training seeds"
+)
+
+
+@dataclass(frozen=True)
+class Report:
+    """All measures of an evaluation behind one source of leaders, or of a case of a platoon.
+
+    Args:
+        of: name of the source or case; empty where there is only one.
+        table: every measure, a row per strategy.
+        short: what a reader asks first; its columns ``shown``.
+        rows: the measures of the full table.
+        caption: what stands below ``short``.
+        full_caption: what stands below the full table.
+        against: the strategy that savings are against.
+        score: column of ``short`` that is compared.
+        label: its name with unit.
+        verdict: sentences on what came out; empty for none.
+        remarks: sentences on what limits the numbers.
+    """
+
+    of: str
+    table: pd.DataFrame
+    short: pd.DataFrame
+    shown: tuple[Shown, ...]
+    rows: Sequence[Measure]
+    caption: str
+    full_caption: str
+    against: str | None = None
+    score: str = SCORE
+    label: str = SCORE
+    verdict: str = ""
+    remarks: Sequence[str] = ()
+
+    @property
+    def note(self) -> str:
+        """Caption and remarks of the short table."""
+        return " ".join([self.caption, *self.remarks]).strip()
+
+
+def together(reports: Sequence[Report]) -> Report:
+    """Return the rows of several sources or cases as one report, named in ``of``."""
+    first, *others = reports
+    if not others:
+        return first
+    table, short = (
+        pd.concat([getattr(one, name).assign(of=one.of) for one in reports])
+        for name in ("table", "short")
+    )
+    shown = (Shown("of", "of"), *first.shown)
+    caption = first.note if {one.note for one in others} == {first.note} else ""
+    return replace(first, table=table, short=short, shown=shown, caption=caption, remarks=())
+
+
+def windows_for(rows: Rows) -> pd.DataFrame:
+    """Return the windows of an evaluation with all measures of tables."""
+    return windows_of(rows, measures.table_columns())
+
+
+def baseline_of(strategies: Iterable[object]) -> str | None:
+    """Return the strategy that tables and figures compare with; None without one."""
+    known = set(strategies)
+    return next((name for name in AGAINST if name in known), None)
+
+
+def summary(
+    windows: pd.DataFrame,
+    task: Task | None = None,
+    energy: Fleet | None = None,
+    against: str | None = None,
+) -> pd.DataFrame:
+    """Summarise every strategy.
+
+    Args:
+        windows: of :func:`windows_for`, every strategy on the same windows and drivers.
+        task: score, baseline and limits; by default path energy per km, against the first of
+            :data:`AGAINST`, without limits.
+        energy: the energy models, for the unit of a task.
+        against: the baseline without a task.
+
+    Returns:
+        One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
+        the score that it saves ``against`` the baseline, and ``drawn_saving``, of the energy drawn
+        in an episode, with their intervals; the shares of distance and flow lost against it;
+        numbers of windows, drives and training seeds; and, of a task, score, limits and whether
+        it keeps them without a collision. Values that a strategy does not have are NaN.
+
+    Raises:
+        ConfigError: if the column of a limit, or the baseline, is missing.
+    """
+    parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
+    against = task.against if task else against or baseline_of(parts)
+    if against is not None and against not in parts:
+        raise unknown_name("strategy to compare against", against, parts)
+    # Without automated vehicles none has a value that a limit bounds.
+    for column in task.limits if task and WAYS[0] in windows else ():
+        if column not in windows:
+            raise ConfigError(f"task.limits.{column}: episodes.parquet has no such column")
+    column, *per = task.measure.columns if task else (PATH, DISTANCE)
+    rows = []
+    for name, part in parts.items():
+        row: dict[str, Any] = {"strategy": name, "against": against or ""}
+        kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
+        row |= {key: part.get(of, part["profile_id"]).nunique() for key, of in kinds.items()}
+        if task:
+            row |= {SCORE: score_of(task, part, energy)}
+        for key, of in {"saving": (column, per), "drawn_saving": ("total_energy_kj", [])}.items():
+            known = against not in (None, name) and of[0] in windows
+            share = savings(windows, of[0], name, str(against), of[1]) if known else NOTHING
+            row |= share.columns(key)
+        row |= {measure.key: measure.value(part) for measure in MEASURES}
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    table = table.astype({"collisions": int, "episodes": int})
+    whole = table[table["strategy"] == against]
+    for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
+        table[key] = 1.0 - table[lost] / (whole[lost].iloc[0] if len(whole) else np.nan)
+    if task:
+        table["kept"] = table["collisions"] == 0
+        for one, bound in task.bounds.items():
+            table[f"limit_{one.key}"] = bound
+            table["kept"] &= pd.Series([one.keeps(x, bound) for x in table[one.key]])
+    return table
+
+
+def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
+    """Return the score of a strategy's windows in the task's unit."""
+    value = task.measure.value(part)
+    if not task.measure.per or energy is None:
+        return value
+    check_unit(task.unit, energy)
+    return per_distance(value, task.unit, energy)
+
+
+def report(
+    windows: pd.DataFrame,
+    task: Task | None = None,
+    energy: Fleet | None = None,
+    filtered: bool = False,
+    of: str = "",
+    few: bool = False,
+    against: str | None = None,
+) -> Report:
+    """Return the report of an evaluation.
+
+    Args:
+        windows: of :func:`windows_for`, behind one source of leaders.
+        task: the task, if it is one.
+        energy: the energy models, for units; where all burn one fuel, tables have it in g/km, too.
+        filtered: whether there is a safety filter, for the caption.
+        of: name of the source.
+        few: whether windows that are too few for a finding have a sentence, too.
+        against: the strategy that savings are against; by default that of the task, or the first
+            of :data:`AGAINST`.
+    """
+    if task:
+        task = replace(task, against=against) if against else task.among(windows["strategy"])
+    table, said = summary(windows, task, energy, against), remarks(windows)
+    percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
+    percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
+    every = table.assign(**percent)
+    made = _of_task(every, task) if task else _of_energy(every, energy, filtered)
+    short, shown = made.pop("short")
+    rows = _rows(task, table["against"].iloc[0])
+    words = "" if task else verdict(windows, table, few)
+    made |= {"full_caption": FULL, "verdict": words, "remarks": said}
+    return Report(of, table, short, shown, rows, **made)
+
+
+def _rows(task: Task | None, against: str | None) -> list[Measure]:
+    """Return the rows of the full table."""
+    bounds = task.bounds if task else {}
+    kept = [Measure("kept", "keeps the limits (1: yes)", "{:d}")] if task else []
+    counts = {"windows": "windows", "drives": "drives", "seeds": "training seeds"}
+    return [
+        *([Measure(SCORE, task.label)] if task else ()),
+        Measure("saving", f"saved against {in_words(str(against))}", "{:+.2%}"),
+        Measure("saving_low", "  95 % interval, low", "{:+.2%}"),
+        Measure("saving_high", "    high", "{:+.2%}"),
+        Measure("drawn_saving", "  as drawn, per episode", "{:+.1%}"),
+        Measure("distance_lost", "distance lost", "{:+.2%}"),
+        Measure(FLOW_LOST, "flow lost", "{:+.2%}"),
+        *(one for one in MEASURES if one.label),
+        *(
+            replace(one, label=f"limit: {' '.join(one.bounded(bounds[one]).split())}")
+            for one in sorted(bounds, key=lambda one: one.key.startswith(SHARE))
+        ),
+        *kept,
+        *(Measure(key, label, "{:d}") for key, label in counts.items()),
+    ]
+
+
+def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dict[str, Any]:
+    """Return what is specific to a report without a task.
+
+    Of several strategies those with a controlled car have a row in the short table, those that
+    draw most first.
+    """
+    # Beside others, a string without controlled cars is of fewer vehicles, and not to be compared.
+    cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
+    cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
+    against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
+    note = "" if against is None else f"{saved_against(cars, against)}; distance against theirs; "
+    short = [one for one in MEASURES if one.short]
+    columns = {"energy_kj_per_km": cars[PATH_PER_KM]}
+    columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
+    shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")]
+    if energy is not None and burns_one_fuel(energy):
+        columns["fuel_g_per_km"] = cars[PATH_PER_KM] * per_distance(1.0, "g/km", energy)
+        shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
+    shown += [] if against is None else [SAVED, WAY]
+    shown += [*(one.shown for one in short), COLLISIONS]
+    return {
+        "short": shortened(cars.assign(**columns), shown),
+        "caption": CAPTION.format(note + BEHIND_FILTER * filtered),
+        "against": against,
+        "score": "energy_kj_per_km",
+        "label": "path energy per km [kJ/km]",
+    }
+
+
+def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
+    """Return what is specific to the report of a task: its score, and the limits."""
+    way = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
+    limits = [Shown(one.key, one.bounded(bound)) for one, bound in task.bounds.items()]
+    shown = [
+        Shown(SCORE, task.label.replace(" ", "\n")),
+        SAVED,
+        way,
+        *limits,
+        COLLISIONS,
+        KEEPS,
+    ]
+    columns = {one.key: one.scale * table[one.key] for one in task.bounds}
+    saved = f"{saved_against(table, task.against, always=True)}; " * (len(table) > 1)
+    caption = f"{saved}kept: all limits, without a collision; {ALL} {flow_note(table)}".strip()
+    short = shortened(table.assign(**columns), shown)
+    return {"short": short, "caption": caption, "against": task.against, "label": task.label}
+
+
+def shortened(
+    table: pd.DataFrame, shown: Sequence[Shown]
+) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
+    """Return columns of a table with their intervals and strategies in words, and the columns."""
+    table = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
+    shown = (Shown("who", "driven by"), *shown)
+    names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
+    return table[["strategy", *(x for x in names if x in table)]], shown
+
+
+def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> str:
+    """Return what savings are against, what their intervals are over, and if they are too narrow.
+
+    Args:
+        found: a row per strategy with its numbers of ``windows``, ``drives`` and ``seeds``.
+        against: the baseline.
+        always: name intervals also if there is none.
+    """
+    words = f"saved: against {in_words(against)}"
+    if not always and found["saving_low"].isna().all():
+        return words
+    windows, drives, seeds = (int(found[name].max()) for name in ("windows", "drives", "seeds"))
+    over = "windows" if drives < LEAST_DRIVES else f"{drives} drives"
+    if seeds > 1:
+        up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
+        over += f" and {up_to}{seeds} training seeds"
+    if drives < min(LEAST_DRIVES, windows):
+        over += f" (too narrow: windows of {several(drives, 'drive')} are alike)"
+    return f"{words}, with the 95 % interval over {over}"
+
+
+def flow_note(table: pd.DataFrame) -> str:
+    """Return in a sentence which strategies lose much of the flow; empty if none does."""
+    lost = table[table[FLOW_LOST] > FLOW_NAMED]
+    named = zip(lost["strategy"], lost[FLOW_LOST], strict=True)
+    parts = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
+    against = in_words(str(table["against"].iloc[0]))
+    return f"Flow lost against {against}: {'; '.join(parts)}." if len(lost) else ""
+
+
+def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
+    """Return in a sentence what came out for the network; empty without one.
+
+    Without one that goes by its variant's name, each network has a sentence.
+
+    Args:
+        windows: of :func:`windows_for`.
+        found: their :func:`summary`.
+        of_few: whether windows that are too few for a finding have a sentence, too.
+    """
+    cars = found[found[PATH].notna()].to_dict("records")
+    rows: dict[str, Any] = {str(row["strategy"]): row for row in cars}
+    other = next((name for name in (*RULES, HUMAN) if name in rows), None)
+    if other is None:
+        return ""
+    learned = [name for name, row in rows.items() if row["seeds"] and name not in RULES]
+    names = [NETWORK] if NETWORK in rows else learned
+    words = []
+    for name in names:
+        if (count := rows[name]["windows"]) >= FEW_WINDOWS:
+            words.append(_sentence(windows, rows, name, other))
+        elif of_few:
+            both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
+            few = f"{counted(count)} allow no finding."
+            words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
+    least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
+    # It may be a rule of the user's own.
+    if words and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
+        words.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
+    return "\n".join(words)
+
+
+def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: str) -> str:
+    """Return what came out for one network beside another strategy."""
+    share = savings(windows, PATH, name, other, [DISTANCE])
+    saved, low, high = (100.0 * x for x in (share.value, share.low, share.high))
+    less = "less"
+    if saved < 0.0:
+        less, saved, low, high = "more", -saved, -high, -low
+    within = "" if low > 0.0 else ", within the uncertainty"
+    own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
+    article = "the " if in_words(name) != name else ""
+    interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
+    return (
+        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % {interval} "
+        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
+        f"the time against {theirs:.2f} %."
+    )
+
+
+def remarks(windows: pd.DataFrame) -> list[str]:
+    """Return sentences on what limits the numbers of an evaluation."""
+    means, found = measures.means(windows, (*REACH, BROKEN)), []
+
+    def named(shares: pd.Series, least: float) -> str:
+        large = shares[shares > least].items()
+        return ", ".join(f"{in_words(str(name))} {share:.2%}" for name, share in large)
+
+    if names := named(means[list(REACH)].max(axis=1), MUCH):
+        found.append(
+            "Vehicles accelerate harder, or hold a higher speed, than their energy model allows "
+            f"for more than {MUCH:.0%} of the time ({names}): their energies are lower bounds."
+        )
+    if names := named(means[BROKEN], 0.0):
+        found.append(
+            f"Steps turn unsafe though the safety filter promises them ({names}): brakes, delays "
+            "or sensors are not as scenario.actuators and scenario.sensors declare."
+        )
+    return found
+
+
+def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
+    """Return a warning for every driver whose desired speed the leaders mostly exceed.
+
+    Such a driver drops back, whoever drives ahead: energies then compare distances, not ways of
+    driving. Behind a safety filter a desired speed means other things; networks have none of
+    their own, and the share of the drivers behind them.
+
+    Args:
+        windows: of :func:`windows_for`.
+        of_task: whether a task is evaluated, which chooses the strategies to compare.
+    """
+    remedies = {
+        "direct": "drivers=highway, or drivers calibrated on such traffic",
+        "idm": "variant=idm scenario.controllers.automated.desired_speed=45 'compare=[<run>]'",
+    }
+    remedies[HUMAN] = remedies["direct"]
+    if of_task:
+        remedies["idm"] = "compare with human, whose v0 is that of drivers=…"
+    shares = measures.means(windows, (FASTER,))[FASTER]
+    people = [shares[name] for name in (HUMAN, "direct") if name in shares]
+    for name in shares.index if people else ():
+        if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
+            kind = "lcc_rl.pieces.LinearACC" if name == "acc" else "<its class>"
+            option = f"'compare={{faster: {{_target_: {kind}, desired_speed: 45}}}}'"
+            remedies.setdefault(name, option)
+    return [
+        f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
+        f"time (more than {MOSTLY:.0%}): savings against it mean little. Raise v0: {remedy}"
+        for name, remedy in remedies.items()
+        if shares.get(name, 0.0) > MOSTLY
+    ]
+
+
+def several(count: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def counted(windows: int, which: str = "") -> str:
+    """Return a number of windows in words, ``which`` such as ``"held-out "``."""
+    return several(windows, f"{which}window")
+
+
+def sample_of(rows: pd.DataFrame, drivers: pd.DataFrame | None = None) -> str:
+    """Return how many windows and drivers rows are of, for a title."""
+    windows, people = rows["profile_id"].nunique(), (rows if drivers is None else drivers)
+    size = several(people["driver_id"].nunique(), "driver")
+    return f"{counted(windows, 'held-out ')} × {size}"
+
+
+def few_windows(windows: int, seconds: float | None = None) -> str:
+    """Return what an evaluation of few windows means; empty for one of enough, or of long ones.
+
+    Args:
+        windows: how many windows were evaluated.
+        seconds: how long each of them is, if that is known.
+    """
+    if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
+        return ""
+    found = counted(windows) + (f" of {seconds:g} s" if seconds else "")
+    return f"{found}: these numbers show that everything runs, and mean nothing else"

@@ -1,0 +1,57 @@
+"""What a task asks for: score, baseline and limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import field, replace
+
+from lcc_rl.errors import unknown_name
+from lcc_rl.results import measures
+from lcc_rl.results.measures import Measure
+from lcc_rl.results.names import HUMAN, heading
+from lcc_rl.settings import NonNegative, Settings
+
+
+class Task(Settings):
+    """What a task asks for."""
+
+    name: str
+    # What is minimised: energy, net_energy or path_energy of all vehicles over their distance, or
+    # a column of episodes.parquet.
+    score: str = "net_energy"
+    unit: str = "kJ/km"  # of an energy over a distance, see lcc_rl.results.units
+    against: str = HUMAN  # the strategy that the others are compared with
+    # Bounds by column: the largest value of max_… and the smallest of min_… in any episode, and
+    # the largest mean of share_… over all episodes.
+    limits: Mapping[str, NonNegative] = field(default_factory=dict)
+
+    def settled(self) -> None:
+        if self.score not in measures.score_measures():
+            raise unknown_name("score (task.score)", self.score, measures.score_measures())
+        for column in self.limits:
+            if column not in measures.limit_measures():
+                raise unknown_name("column of task.limits", column, measures.limit_measures())
+
+    def among(self, strategies: Iterable[str]) -> Task:
+        """Return the task for an evaluation of these strategies.
+
+        If the strategy to compare against was not evaluated, the first that was is used.
+        """
+        names = list(dict.fromkeys(map(str, strategies)))
+        return self if self.against in names else replace(self, against=names[0])
+
+    @property
+    def bounds(self) -> dict[Measure, float]:
+        """The limits by measure."""
+        return {measures.limit_measures()[key]: bound for key, bound in self.limits.items()}
+
+    @property
+    def measure(self) -> Measure:
+        """What is minimised."""
+        return measures.score_measures()[self.score]
+
+    @property
+    def label(self) -> str:
+        """The score with its unit, for tables."""
+        named = heading(self.score)
+        return f"{named} [{self.unit}]" if self.measure.per else named

@@ -1,0 +1,264 @@
+"""Windows of an evaluation: means by strategy, training seed and held-out window, and savings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from lcc_rl.io.files import Rows, read_parquet
+from lcc_rl.results.bootstrap import NOTHING, Estimate, saving, share_saved
+from lcc_rl.results.runs import EPISODES
+
+WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
+KEYS = ["profile_id", "driver_id"]
+REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
+DRIVE = "drive"  # what a row's window is cut from; windows of one are alike
+SOURCE = "source"  # of a row's leader, if a mixture has several
+LEADER = ("leader_path_energy_kj", "leader_speed_mps")
+STRATEGY, TRAINED = "strategy", "training_seed"
+WINDOW = [STRATEGY, TRAINED, "profile_id"]
+PER_WINDOW = ["profile", SOURCE, DRIVE]  # the same in all rows of a window
+WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
+DISTANCE, DAMPING = "distance_m", "damping_time_s"
+ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj")
+FOLDED = 100_000  # rows of partial sums that are kept before they are added up
+PER_KM = "vehicle and km"
+# What the energies of each group of vehicles are divided by.
+DRIVEN = {"cav": WAYS[:1], "hdv": WAYS[1:], "total": WAYS}
+# Of columns that are not averaged: by their first word, and whole names.
+HOW = {"min": "min", "max": "max", "worst": "max", "episodes": "sum", "collisions": "sum"}
+
+
+def how(column: str) -> str:
+    """Return how values of a column are put together: ``mean``, ``sum``, ``min`` or ``max``."""
+    return HOW.get(column, HOW.get(column.partition("_")[0], "mean"))
+
+
+def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
+    """Fold the rows of an evaluation to means over drivers and repeats.
+
+    Args:
+        rows: rows of episodes.parquet; of a dataset one block is in memory at a time.
+        columns: which; by default all measures.
+
+    Returns:
+        A row per strategy, training seed and window; columns that begin with ``min_`` or ``max_``
+        contain the least or the largest value. ``episodes`` is the number of rows, ``collisions``
+        of those that collided, ``worst_share_…`` the largest share of an episode.
+    """
+    return fold(rows, [*WINDOW, *PER_WINDOW], columns)
+
+
+def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataFrame:
+    """Fold rows by keys, block by block; :func:`how` says how. Keys that do not exist are left out.
+
+    Memory grows with the groups, not with the rows.
+    """
+    parts: list[pd.DataFrame] = []
+    for frame in _frames(rows, [*by, *columns] if columns else []):
+        parts.append(_sums(_derived(frame), by, columns))
+        if sum(map(len, parts)) > FOLDED + 2 * len(parts[0]):
+            parts = [_added(parts)]
+    total = _added(parts)
+    found = {}
+    for kind, name in zip(*map(total.columns.get_level_values, (0, 1)), strict=True):
+        if kind != "count":
+            count = total.get(("count", name))
+            values = total[kind, name]
+            found[name] = values if count is None else values / count.replace(0, np.nan)
+    return pd.DataFrame(found).reset_index()
+
+
+def _frames(rows: Rows, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
+    """Yield rows block by block; a data frame is one block."""
+    if isinstance(rows, pd.DataFrame):
+        yield rows
+        return
+    wanted = set(columns) or set(rows.schema.names)
+    wanted |= {"collided", DAMPING, *WAYS}
+    wanted |= {f"{group}_{name}" for group in ("total", "hdv") for name in ENERGIES}
+    known = [name for name in rows.schema.names if name in wanted]
+    for file in rows.get_fragments():
+        for group in file.split_by_row_group():
+            table = group.to_table(schema=rows.schema, columns=known)
+            for place, field in enumerate(table.schema):
+                if pa.types.is_dictionary(field.type):
+                    text = table.column(place).cast(pa.string())
+                    table = table.set_column(place, field.name, text)
+            yield table.to_pandas()
+
+
+def _derived(rows: pd.DataFrame) -> pd.DataFrame:
+    """Add numbers, distances and energies of all vehicles, and whether an episode is damped."""
+    seed = pd.to_numeric(rows.get(TRAINED, pd.Series(np.nan, rows.index))).astype("Int64")
+    found: dict[str, Any] = {TRAINED: seed, "episodes": 1.0}
+    if "collided" in rows:
+        found |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
+    if ways := [name for name in WAYS if name in rows]:
+        found[DISTANCE] = rows[ways].sum(axis=1)
+    for name in ENERGIES:  # where no vehicle is automated, of the others
+        parts = [rows[f"{x}_{name}"] for x in ("total", "hdv") if f"{x}_{name}" in rows]
+        if parts:
+            found[f"all_{name}"] = parts[0].fillna(parts[-1])
+    if DAMPING in rows:
+        found |= {"damped": rows[DAMPING].notna(), "damped_s": rows[DAMPING].fillna(0.0)}
+    return rows.assign(**found)
+
+
+def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.DataFrame:
+    """Return sums, counts and ends of columns by keys."""
+    numbers = [str(name) for name in frame.select_dtypes(["number", "bool"])]
+    names = [
+        name for name in columns or numbers if name in numbers and name not in (*KEYS, TRAINED)
+    ]
+    if not columns:
+        shares = [name for name in names if name.startswith("share_")]
+        frame = frame.assign(**{f"worst_{name}": frame[name] for name in shares})
+        names += [f"worst_{name}" for name in shares]
+    names = list(dict.fromkeys(["episodes", *names]))
+    keys = [frame[name] for name in by if name in frame]
+    values = frame[names].astype(np.float64)
+    groups = values.groupby(keys, sort=False, dropna=False, observed=True)
+    kinds: dict[str, list[str]] = {kind: [] for kind in ("sum", "count", "min", "max")}
+    for name in names:
+        kind = how(name)
+        for part in ("sum", "count") if kind == "mean" else (kind,):
+            kinds[part].append(name)
+    return pd.concat({x: getattr(groups[y], x)() for x, y in kinds.items() if y}, axis=1)
+
+
+def _added(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Add up partial sums of the same groups."""
+    if len(parts) == 1:
+        return parts[0]
+    total = pd.concat(parts)
+    kinds = {column: "sum" if column[0] == "count" else column[0] for column in total.columns}
+    levels = list(range(total.index.nlevels))
+    return total.groupby(level=levels, sort=False, dropna=False).agg(kinds)
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over the episodes of an evaluation in which all windows have the same drivers.
+
+    Args:
+        windows: of :func:`windows_of`.
+        drivers: energies and distances, a row per strategy and driver: means over windows and
+            seeds.
+        per: what energies are per.
+    """
+
+    windows: pd.DataFrame
+    drivers: pd.DataFrame
+    per: str = "episode"
+
+    @classmethod
+    def of(cls, rows: pd.DataFrame) -> Self:
+        """Return the means of the rows of episodes.parquet."""
+        energies = [str(name) for name in rows if str(name).endswith("energy_kj") or name in WAYS]
+        return cls(windows_of(rows), fold(rows, [STRATEGY, "driver_id"], energies))
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Return the means of an evaluation: as kept in its folder, else of its episodes."""
+        if (folder / WINDOWS).exists():
+            return cls(read_parquet(folder / WINDOWS), read_parquet(folder / DRIVERS))
+        return cls.of(read_parquet(folder / EPISODES))
+
+    def per_km(self) -> Self:
+        """Return the means whose drivers' energies, and whose savings, are per vehicle and km."""
+        drivers = self.drivers.copy()
+        for group, names in DRIVEN.items():
+            way = drivers[[name for name in names if name in drivers]].sum(axis=1) / 1e3
+            energies = drivers.columns[drivers.columns.str.fullmatch(f"{group}_.*energy_kj")]
+            drivers[energies] = drivers[energies].div(way, axis=0)
+        return replace(self, drivers=drivers, per=PER_KM)
+
+    def saving(self, column: str, strategy: str, baseline: str) -> Estimate:
+        """Return what a strategy saves over windows, see :func:`savings`."""
+        per = DRIVEN[column.partition("_")[0]] if self.per == PER_KM else ()
+        return savings(self.windows, column, strategy, baseline, per)
+
+
+def savings(
+    rows: pd.DataFrame, column: str, strategy: str, baseline: str, per: Sequence[str] = ()
+) -> Estimate:
+    """Return the share of the baseline's mean energy that a strategy saves.
+
+    ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)`` is what tables show.
+
+    Args:
+        rows: of an evaluation, or of :func:`windows_of`.
+        column: the energy.
+        strategy: the strategy that saves.
+        baseline: the strategy that it is compared with.
+        per: columns of distances, by whose sum the energy is divided, total by total; without,
+            the energies of whole episodes are compared, and falling behind lowers them.
+
+    Returns:
+        The share with its interval over windows or drives, and seeds
+        (:func:`lcc_rl.results.bootstrap.estimate`), on the windows that both were evaluated on;
+        NaN if one of them is missing.
+    """
+    chosen = rows[rows[STRATEGY].isin([strategy, baseline])]
+    if TRAINED not in chosen:
+        chosen = chosen.assign(**{TRAINED: np.nan})
+    ways = [name for name in per if name in rows]
+    groups = chosen.groupby([*WINDOW[:2], "profile_id"], dropna=False, sort=False)
+    means = groups[list(dict.fromkeys([column, *ways]))].mean().reset_index()
+    means[TRAINED] = means[TRAINED].astype(object).fillna(-1)
+    means["way"] = means[ways].sum(axis=1) if ways else 1.0
+    energy, way = (
+        means.pivot(index="profile_id", columns=[STRATEGY, TRAINED], values=name)
+        for name in (column, "way")
+    )
+    energy = energy.dropna(axis=1, how="all").dropna()
+    if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
+        return NOTHING
+    way = way.loc[energy.index, energy.columns]
+    drives = None
+    if DRIVE in rows:
+        drives = chosen.groupby("profile_id")[DRIVE].first().reindex(energy.index).tolist()
+    ours, theirs = ((energy[x].to_numpy(), way[x].to_numpy()) for x in (strategy, baseline))
+    return saving(ours[0], theirs[0], drives=drives, ways=(ours[1], theirs[1]))
+
+
+def episode_mean(part: pd.DataFrame, column: str) -> float:
+    """Return the mean of a column of :func:`windows_of` over episodes; NaN without any."""
+    episodes = part["episodes"][part[column].notna()]
+    return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
+
+
+def by_driver(drivers: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return a column per strategy and a row per driver, from the drivers of :class:`Means`."""
+    return drivers.pivot_table(index="driver_id", columns=STRATEGY, values=column, aggfunc="mean")
+
+
+def driver_savings(drivers: pd.DataFrame, column: str, strategy: str, baseline: str) -> pd.Series:
+    """Return the share of a baseline's mean energy that a strategy saves, by driver."""
+    energy = by_driver(drivers, column)
+    return share_saved(energy[strategy], energy[baseline])
+
+
+def per_seed(windows: pd.DataFrame, column: str) -> dict[str, pd.Series]:
+    """Return, for each strategy, the mean of a column over the windows of each training seed."""
+    found = {
+        str(strategy): rows.groupby(TRAINED, dropna=False)[column].mean()
+        for strategy, rows in windows.groupby(STRATEGY, sort=False)
+    }
+    return {strategy: values for strategy, values in found.items() if values.notna().any()}
+
+
+def by_source(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the rows of each source of leaders with its name; without one, all rows and ""."""
+    if SOURCE not in rows:
+        yield "", rows
+        return
+    for source, part in rows.groupby(SOURCE, sort=False):
+        yield str(source), part
