@@ -16,7 +16,7 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import check_like, read_torch, write_torch
 from lcc_rl.results.trust import trusted
-from lcc_rl.runs.states import CONFIG, no_run
+from lcc_rl.runs.states import CONFIG, no_run, run_folders
 from lcc_rl.settings import Settings, parse
 
 PRETRAINED = "pretrained"
@@ -109,7 +109,7 @@ def policy_file(path: str | Path, variant: str = "") -> Path:
     file = path / "policy.pt" if path.is_dir() else path
     if not file.exists() and (path / "checkpoint.pt").is_file():
         raise ConfigError(f"{path}: its training has not ended: lcc-rl train resume={path}")
-    if path.is_dir() and not (file.exists() or (path / CONFIG).is_file()):
+    if path.is_dir() and not (file.exists() or (path / CONFIG).is_file()) and run_folders(path):
         raise no_run(path)
     if path.suffix == ".onnx":
         raise ConfigError(f"{path} is an ONNX program, a controller: name it in compare=[{path}]")
