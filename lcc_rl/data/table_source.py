@@ -29,19 +29,20 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive, Settings
 
 FIELDS = (
-    Column("vehicle", "text"),
+    Column("vehicle", "text", blank=True),
     Column("time", "time", blank=True),
     Column("speed", "speed", blank=True),
     Column("position", "length", blank=True, required=False),
-    Column("lane", "text", required=False),
+    Column("lane", "text", blank=True, required=False),
     Column("leader", "text", blank=True, required=False),
     Column("gap", "length", blank=True, required=False),
     Column("length", "length", least=0.0, blank=True, required=False),
-    Column("recording", "text", required=False),
+    Column("recording", "text", blank=True, required=False),
 )
 COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
 NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
 MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
+IDENTIFYING = ("vehicle", "lane", "recording")  # of the rows that are left none may be blank
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
 JUMP = 10.0  # m between samples, more than driven: positions begin anew
 Whole = NDArray[np.int64]
@@ -109,6 +110,9 @@ class TableSource(Settings):
             table = TableFile(name)
             part = table.read(FIELDS, self.columns, self.units, "data.columns", MEASURED)
             report.rows_read += table.count
+            for key in (key for key in IDENTIFYING if key in part):
+                if (blank := part[key] == "").any():
+                    raise table.fault(int(part["row"][np.argmax(blank)]), key, "is blank")
             _report_blank_gaps(table, part)
             rows = len(part["row"])
             file, recording = np.full(rows, number), np.full(rows, label)
