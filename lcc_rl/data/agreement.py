@@ -57,20 +57,7 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     gap, *speeds = (episodes[name].to_numpy(np.float64) for name in SIGNALS.values())
     series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
 
-    def fit(late: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-        """Coefficients and slope, what they leave unexplained, and sums of products."""
-        shifted, at = [rows + k for k in late.astype(int)], pair[rows]
-        grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
-        terms = ahead, -own, np.ones(len(rows)), grown
-        sums = np.array([[np.bincount(at, x * y, pairs) for x in terms] for y in terms])
-        sums = np.append(sums, sums.sum(axis=-1, keepdims=True), axis=-1)  # of all
-        known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
-        found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
-        rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
-        rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
-        found[2] = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
-        return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
-
+    fit = partial(_fit, series, pair, pairs, width)
     shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
     lags = np.stack([np.zeros(3), *shifts])
     with np.errstate(all="ignore"):  # of pairs without a change
@@ -94,6 +81,32 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         own=own,
         grown=grown,
     )
+
+
+def _fit(
+    series: Sequence[Floats],
+    pair: NDArray[np.intp],
+    pairs: int,
+    width: int,
+    late: Floats,
+    rows: NDArray[np.intp],
+) -> tuple[Floats, Floats, Floats]:
+    """Coefficients and slope of each pair and of all, what they leave unexplained, and products.
+
+    ``series`` are the gap and the ways of leader and follower, each shifted by ``late``; changes
+    over ``width`` samples begin at ``rows``, of the pair with this number, of so many ``pairs``.
+    """
+    shifted, at = [rows + k for k in late.astype(int)], pair[rows]
+    grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
+    terms = ahead, -own, np.ones(len(rows)), grown
+    sums = np.array([[np.bincount(at, x * y, pairs) for x in terms] for y in terms])
+    sums = np.append(sums, sums.sum(axis=-1, keepdims=True), axis=-1)  # of all
+    known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
+    found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
+    rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
+    rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
+    found[2] = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
+    return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
 
 def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, float]]:
