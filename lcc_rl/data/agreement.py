@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from math import exp, inf, log
 from typing import Any
 
@@ -85,7 +86,7 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
 
 def _fit(
     series: Sequence[Floats],
-    pair: NDArray[np.intp],
+    pair: NDArray[Any],
     pairs: int,
     width: int,
     late: Floats,

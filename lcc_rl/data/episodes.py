@@ -111,38 +111,18 @@ def _table(
     units: Mapping[str, str],
     place: Places,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read one file, the ``number``-th."""
+    """Read one file, the ``number``-th, and bring it to the grid."""
     file = TableFile(path)
     names = _names(file, columns)
-    read = file.read(FIELDS, names, units, "data.columns", MEASURED)
-    if not len(read["time"]):
-        raise DataError(f"{path}: has no episodes; expected at least one row")
-    kept = read.pop("row")
-    rows = len(kept)
+    table, numbers = _rows(file, number, names, units)
     notes = list(file.notes)
-    labels = read.get("episode", np.zeros(rows, dtype=str))
-    codes, found = pd.factorize(labels)
-    numbers = whole_numbers(np.asarray(found))
-    if numbers is None or (np.abs(numbers) >= 2**31).any():
-        numbers = np.arange(len(found))
-    follower = 2 * codes + 2
-    values = {
-        **dict.fromkeys(COLUMNS, np.zeros(rows)),
-        "recording": np.full(rows, stem(path)),
-        **{OWN[key]: cells for key, cells in read.items()},
-        "follower_id": read.get("follower_id", follower),
-        "leader_id": read.get("leader_id", follower - 1),
-    }
     for name, words in (
         ("recording", f"no column recording: all of {path} is one"),
         ("leader_length", "no column leader_length_m: lengths are not known"),
     ):
         if names.get(name) is None:
             notes.append(words)
-    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
-    table = table.assign(file=number, row=kept, label=labels, episode=codes)
     report = ReadReport([path])
-    _check_pairs(table, file)
     table = continuous(table, "episode", place, report)
     start = table.groupby("episode")["time_s"].transform("min").to_numpy()
     table, _ = on_grid(table, start, MOTION, place, report)
@@ -153,6 +133,34 @@ def _table(
         derive_positions(table)
         notes.append(DERIVED)
     return table, [*notes, *(f"{path}: {line}" for line in (*report.left_out(), *report.notes))]
+
+
+def _rows(
+    file: TableFile, number: int, names: Mapping[str, str | None], units: Mapping[str, str]
+) -> tuple[pd.DataFrame, NDArray[np.int64]]:
+    """Rows of a file with episodes counted from 0, and the file's numbers of these."""
+    read = file.read(FIELDS, names, units, "data.columns", MEASURED)
+    if not len(read["time"]):
+        raise DataError(f"{file.path}: has no episodes; expected at least one row")
+    kept = read.pop("row")
+    rows = len(kept)
+    labels = read.get("episode", np.zeros(rows, dtype=str))
+    codes, found = pd.factorize(labels)
+    numbers = whole_numbers(np.asarray(found))
+    if numbers is None or (np.abs(numbers) >= 2**31).any():
+        numbers = np.arange(len(found))
+    follower = 2 * codes + 2
+    values = {
+        **dict.fromkeys(COLUMNS, np.zeros(rows)),
+        "recording": np.full(rows, stem(str(file.path))),
+        **{OWN[key]: cells for key, cells in read.items()},
+        "follower_id": read.get("follower_id", follower),
+        "leader_id": read.get("leader_id", follower - 1),
+    }
+    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
+    table = table.assign(file=number, row=kept, label=labels, episode=codes)
+    _check_pairs(table, file)
+    return table, numbers
 
 
 def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
