@@ -242,10 +242,12 @@ def on_grid(
             "another unit?"
         )
     frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
-    steps = np.diff(samples["time_s"])[np.diff(episode) == 0]
+    same = np.diff(episode) == 0
+    steps, skipped = np.diff(samples["time_s"])[same], (np.diff(frame)[same] > 1).any()
     step = float(np.median(steps))
     samples = samples.assign(origin=origin)
-    if abs(step - FRAME) > UNEVEN * FRAME or np.abs(at - frame).max() > REGULAR:
+    uneven = abs(step - FRAME) > UNEVEN * FRAME or np.abs(at - frame).max() > REGULAR
+    if uneven or skipped:
         odd = int((np.abs(steps - step) > UNEVEN * step).sum())
         irregular = f", {odd:,} of them irregular," * bool(odd)
         report.notes.append(f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s")

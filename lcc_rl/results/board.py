@@ -168,7 +168,7 @@ def check_row(row: Row, where: str) -> None:
     Raises:
         ConfigError: saying what does not.
     """
-    numbers = [row["score"], *(row[key] for key in SHARE)]
+    numbers = [row.get("score"), *(row[key] for key in SHARE)]
     numbers += [limit[key] for limit in row["limits"].values() for key in ("bound", "value")]
     for number in numbers:
         good = number is None or (isinstance(number, int | float) and isfinite(number))
