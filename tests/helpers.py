@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -15,11 +16,13 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent
+from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.config import load
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.io.files import read_parquet
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
 VARIANTS = ("alcc", "reference", "own_energy", "rule", "cbf", "idm", "direct", *PLATOON)
@@ -120,6 +123,35 @@ def single_env(
 def make_agent(cfg: TrainConfig) -> Agent:
     """Build the agent of a configuration for the shipped drivers."""
     return build_agent(cfg, POPULATION)
+
+
+def weights(loop: TrainingLoop[Any]) -> torch.Tensor:
+    """All numbers that a policy has learned."""
+    return torch.cat([p.detach().flatten() for p in loop.agent.policy.parameters()])
+
+
+def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> None:
+    """Check that a training of checkpoints every 2 iterations, killed in its fourth, resumes."""
+    whole = make(folder / "whole")
+    expected = whole.run()
+    first = make(folder / "parts")
+    iterate = first._iterate
+
+    def dies(source):
+        if first.iteration == 3:
+            raise MemoryError  # as sudden as SIGKILL: nothing is saved on the way out
+        return iterate(source)
+
+    first._iterate = dies
+    with pytest.raises(MemoryError):
+        first.run()
+    second = make(folder / "parts")
+    second.load()
+    assert second.iteration == 2  # the last checkpoint
+    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
+    assert torch.equal(weights(second), weights(whole))
+    stored = read_parquet(folder / "parts" / "training.parquet")
+    pd.testing.assert_frame_equal(stored, expected, check_exact=True)
 
 
 def network(cfg: TrainConfig) -> TensorDictBase:

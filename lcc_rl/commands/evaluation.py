@@ -22,6 +22,7 @@ from lcc_rl.commands.checks import (
 from lcc_rl.config import identity, with_inputs
 from lcc_rl.config.nodes import TARGET, build
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
+from lcc_rl.config.words import FILTERED
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, require
@@ -44,7 +45,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
-from lcc_rl.results.names import FILTERED, in_words
+from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.render import show, terminal

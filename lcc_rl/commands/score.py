@@ -34,6 +34,7 @@ from lcc_rl.config import check_overrides, choices, identity, load, root_key
 from lcc_rl.config.inputs import compared_files
 from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import EvaluateConfig
+from lcc_rl.config.words import FILTERED
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
@@ -52,7 +53,7 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.board import row_of, score_table
-from lcc_rl.results.names import FILTERED, in_words
+from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, policy_file
 from lcc_rl.results.render import show
 from lcc_rl.results.report import summary, windows_for

@@ -19,13 +19,14 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import TARGET, find_target, is_node, settings_at
+from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml, read_text
 
 Inputs = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMES = ("compare", "policy")  # sections that name policies, controllers and classes
-FILTERED, OURS = "_filtered", "lcc_rl."
+OURS = "lcc_rl."
 PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # of what is installed
 INSTALLED = [Path(sysconfig.get_path(x)) for x in PLACES] + [Path(__file__).parents[1]]
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from lcc_rl.errors import ConfigError
 
+FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
+
 
 def key_of(override: str) -> str:
     """Return the dotted key that an override changes."""

@@ -197,11 +197,9 @@ class Traffic(TransformedEnv):
             if found is None:
                 continue
             # A transform may take any size, −1, of several actions in a row.
-            size = [x if y < 0 else y for x, y in zip(found.shape, wanted.shape, strict=False)]
-            if (list(found.shape), found.ndim) == (
-                size,
-                wanted.ndim,
-            ) and found.dtype == wanted.dtype:
+            sizes = zip(found.shape, wanted.shape, strict=False)
+            fits = found.ndim == wanted.ndim and all(x == y or y < 0 for x, y in sizes)
+            if fits and found.dtype == wanted.dtype:
                 continue
             expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")

@@ -16,11 +16,11 @@ from hydra.core.global_hydra import GlobalHydra
 from lcc_rl.config import choices, load, own_file
 from lcc_rl.config.nodes import TARGET, build, find_target, path_of
 from lcc_rl.config.schemas import AUTO
+from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import ConfigError, require, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
-from lcc_rl.results.names import FILTERED
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.settings import values
 

@@ -21,6 +21,7 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import TARGET, short_name
 from lcc_rl.config.schemas import StudyConfig, as_plain
+from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
@@ -33,7 +34,6 @@ from lcc_rl.evaluation.named import (
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.names import FILTERED
 from lcc_rl.results.runs import differing, flatten
 
 log = logging.getLogger("lcc_rl")

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from lcc_rl.config.words import FILTERED
 from lcc_rl.evaluation.named import is_shipped
 from lcc_rl.figures.drawing import (
     COLUMN,
@@ -36,7 +37,7 @@ from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.motion import telling
-from lcc_rl.results.names import FILTERED, in_words
+from lcc_rl.results.names import in_words
 from lcc_rl.results.render import column_cells, signed
 from lcc_rl.results.report import AGAINST, RULE, Report, several
 from lcc_rl.results.runs import stored_config

@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from lcc_rl.config.nodes import build
+from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
 from lcc_rl.errors import ConfigError, require
@@ -24,7 +25,6 @@ from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
 from lcc_rl.pieces.world import World
-from lcc_rl.results.names import FILTERED
 from lcc_rl.results.policies import load_policy
 
 # Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.

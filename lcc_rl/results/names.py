@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pandas as pd
 
+from lcc_rl.config.words import FILTERED
+
 # A column's unit by the end of its name.
 UNITS = {"kj_per_km": "kJ/km", "mps3": "m/s³", "mps": "m/s", "pct": "%", "kj": "kJ", "ms": "ms"}
 UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
@@ -37,7 +39,6 @@ WHO = SEVERAL | {
     "constant": "constant speed",
     "direct": "no automated car",
 }
-FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
 
 
 def in_words(name: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lcc_rl.config.words import FILTERED
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.io.files import Rows
@@ -27,7 +28,7 @@ from lcc_rl.results.measures import (
     Measure,
     Shown,
 )
-from lcc_rl.results.names import FILTERED, HUMAN, NETWORK, in_words
+from lcc_rl.results.names import HUMAN, NETWORK, in_words
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, per_distance
 from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of

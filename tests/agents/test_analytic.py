@@ -8,7 +8,17 @@ import signal
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, REWARD, TERMS, compose, make_agent, slow_but, string, wavy_profiles
+from helpers import (
+    POPULATION,
+    REWARD,
+    TERMS,
+    compose,
+    make_agent,
+    slow_but,
+    string,
+    wavy_profiles,
+    weights,
+)
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
@@ -35,10 +45,6 @@ def make(folder, *overrides: str, variant: str = "alcc") -> GradientLoop:
     env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
     agent = make_agent(cfg)
     return GradientLoop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
-
-
-def weights(trainer: GradientLoop) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
 
 
 PAIR, PLATOON = "automated human", "(automated human*5)*2"

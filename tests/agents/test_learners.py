@@ -8,7 +8,15 @@ from types import ModuleType
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, compose, make_agent, small_env, wavy_profiles
+from helpers import (
+    POPULATION,
+    check_resuming,
+    compose,
+    make_agent,
+    small_env,
+    wavy_profiles,
+    weights,
+)
 from page_blocks import ROOT, blocks
 from tensordict import TensorDict
 
@@ -45,10 +53,6 @@ def make(folder, agent: str, *overrides: str) -> TrainingLoop:
     return made.loop(made, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
-def weights(loop: TrainingLoop) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in loop.agent.policy.parameters()])
-
-
 @EACH
 def test_same_seed_same_rows_and_weights(tmp_path, agent) -> None:
     one, two = (make(tmp_path / name, agent) for name in "ab")
@@ -63,24 +67,7 @@ def test_same_seed_same_rows_and_weights(tmp_path, agent) -> None:
 
 @EACH
 def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
-    whole = make(tmp_path / "whole", agent)
-    expected = whole.run()
-    first = make(tmp_path / "parts", agent)
-    iterate = first._iterate
-
-    def dies(source):
-        if first.iteration == 3:
-            raise MemoryError  # as sudden as SIGKILL: nothing is saved on the way out
-        return iterate(source)
-
-    first._iterate = dies
-    with pytest.raises(MemoryError):
-        first.run()
-    second = make(tmp_path / "parts", agent)
-    second.load()
-    assert second.iteration == 2  # the last checkpoint
-    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
-    assert torch.equal(weights(second), weights(whole))
+    check_resuming(lambda place: make(place, agent), tmp_path)
 
 
 def test_every_vehicle_is_a_trajectory_of_its_own(tmp_path, monkeypatch) -> None:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 import torch
-from helpers import ACTION, POPULATION, compose, make_agent, slow_but, wavy_profiles
+from helpers import (
+    ACTION,
+    POPULATION,
+    check_resuming,
+    compose,
+    make_agent,
+    slow_but,
+    wavy_profiles,
+    weights,
+)
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
@@ -34,10 +43,6 @@ def make(folder, agent: str, *overrides: str, variant: str = "alcc") -> ReplayLo
     return ReplayLoop(make_agent(cfg), env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
-def weights(trainer: ReplayLoop) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
-
-
 @EACH
 @pytest.mark.parametrize("variant", slow_but(["alcc"], ["alcc", "reference"]))
 def test_same_seed_same_rows_and_weights(tmp_path, agent, variant) -> None:
@@ -50,23 +55,7 @@ def test_same_seed_same_rows_and_weights(tmp_path, agent, variant) -> None:
 
 @EACH
 def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
-    whole = make(tmp_path / "whole", agent)
-    expected = whole.run()
-    first = make(tmp_path / "parts", agent)
-    iterate = first._iterate
-
-    def dies(source):
-        if first.iteration == 3:
-            raise MemoryError
-        return iterate(source)
-
-    first._iterate = dies
-    with pytest.raises(MemoryError):
-        first.run()
-    second = make(tmp_path / "parts", agent)
-    second.load()
-    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
-    assert torch.equal(weights(second), weights(whole))
+    check_resuming(lambda place: make(place, agent), tmp_path)
 
 
 def batch(size: int = 64, seed: int = 0) -> TensorDict:

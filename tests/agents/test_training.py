@@ -7,7 +7,17 @@ import signal
 import pandas as pd
 import pytest
 import torch
-from helpers import ACTION, POPULATION, compose, make_agent, small_env, string, wavy_profiles
+from helpers import (
+    ACTION,
+    POPULATION,
+    check_resuming,
+    compose,
+    make_agent,
+    small_env,
+    string,
+    wavy_profiles,
+    weights,
+)
 
 from lcc_rl.agents.collecting import transitions
 from lcc_rl.agents.loop import episode_statistics
@@ -15,7 +25,6 @@ from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.config import identity
 from lcc_rl.envs import build_env
 from lcc_rl.errors import Interrupted, ResultsError
-from lcc_rl.io.files import read_parquet
 
 SMALL = (
     "training.episodes=20",
@@ -35,10 +44,6 @@ def make(folder, *overrides: str) -> ReplayLoop:
     return ReplayLoop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
-def weights(trainer: ReplayLoop) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in trainer.agent.policy.parameters()])
-
-
 def test_same_seed_same_rows_and_weights(tmp_path) -> None:
     one, two = make(tmp_path / "a"), make(tmp_path / "b")
     pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
@@ -49,26 +54,7 @@ def test_same_seed_same_rows_and_weights(tmp_path) -> None:
 
 
 def test_resuming_equals_never_having_stopped(tmp_path) -> None:
-    whole = make(tmp_path / "whole")
-    expected = whole.run()
-    first = make(tmp_path / "parts")
-    iterate = first._iterate
-
-    def dies(collector):
-        if first.iteration == 3:
-            raise MemoryError  # as sudden as SIGKILL: nothing is saved on the way out
-        return iterate(collector)
-
-    first._iterate = dies
-    with pytest.raises(MemoryError):
-        first.run()
-    second = make(tmp_path / "parts")
-    second.load()
-    assert second.iteration == 2  # the last checkpoint
-    pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
-    assert torch.equal(weights(second), weights(whole))
-    stored = read_parquet(tmp_path / "parts" / "training.parquet")
-    pd.testing.assert_frame_equal(stored, expected, check_exact=True)
+    check_resuming(make, tmp_path)
 
 
 # Everything that the paper's learner as printed differs in, at the size of a test.
